@@ -1,0 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
+if(WIW_SANITIZE STREQUAL "address")
+  add_compile_options(-fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer -g1)
+  add_link_options(-fsanitize=address,undefined)
+elseif(WIW_SANITIZE STREQUAL "thread")
+  add_compile_options(-fsanitize=thread -fno-omit-frame-pointer -g1)
+  add_link_options(-fsanitize=thread)
+elseif(NOT WIW_SANITIZE STREQUAL "")
+  message(FATAL_ERROR "WIW_SANITIZE is '${WIW_SANITIZE}'; expected '', 'address' or 'thread'")
+endif()

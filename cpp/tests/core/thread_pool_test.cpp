@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/core/thread_pool.hpp"
+
+#include <doctest/doctest.h>
+
+#include <atomic>
+#include <stdexcept>
+#include <thread>
+
+using namespace wiw;
+
+TEST_CASE("every index is visited exactly once, from any number of threads") {
+  for (const int threads : {1, 2, 4}) {
+    ThreadPool pool(threads);
+    for (const std::size_t count : {0u, 1u, 2u, 1000u}) {
+      std::vector<std::atomic<int>> visits(count);
+      pool.parallel_for(count, [&](std::size_t i) { ++visits[i]; });
+      for (const auto& n : visits) CHECK(n == 1);
+    }
+  }
+}
+
+TEST_CASE("nested calls run inline and errors reach the caller after all work is done") {
+  ThreadPool pool(3);
+  std::atomic<int> inner{0};
+  pool.parallel_for(4, [&](std::size_t) { pool.parallel_for(5, [&](std::size_t) { ++inner; }); });
+  CHECK(inner == 20);
+  std::atomic<int> done{0};
+  CHECK_THROWS_AS(pool.parallel_for(100, [&](std::size_t i) {
+    ++done;
+    if (i == 3) throw std::runtime_error("three");
+  }), std::runtime_error);
+  CHECK(done == 100);
+}
+
+TEST_CASE("callers from several threads take turns") {
+  ThreadPool pool(2);
+  std::atomic<int> total{0};
+  std::vector<std::thread> callers;
+  for (int t = 0; t < 4; ++t) {
+    callers.emplace_back([&] {
+      for (int i = 0; i < 200; ++i) pool.parallel_for(8, [&](std::size_t) { ++total; });
+    });
+  }
+  for (auto& caller : callers) caller.join();
+  CHECK(total == 4 * 200 * 8);
+}

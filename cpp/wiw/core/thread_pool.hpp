@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <condition_variable>
+#include <cstddef>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace wiw {
+
+/// Fixed set of threads that sleep between jobs. Waits block on a condition variable: on a machine whose cores are
+/// shared, spinning at a barrier costs more than the work. The caller takes part in the work.
+class ThreadPool {
+ public:
+  /// `threads` counts the caller; 1 runs everything inline.
+  explicit ThreadPool(int threads);
+  ~ThreadPool();
+  ThreadPool(const ThreadPool&) = delete;
+  ThreadPool& operator=(const ThreadPool&) = delete;
+
+  [[nodiscard]] int size() const { return static_cast<int>(workers_.size()) + 1; }
+
+  /// Calls body(i) for every i in [0, count), in any order, and returns when all are done. The first exception is
+  /// rethrown here after the others have finished. A call from inside a body runs inline.
+  void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body);
+
+  /// The pool all rooms share; its size is the machine's cores, or WIW_NUM_THREADS.
+  static ThreadPool& shared();
+
+ private:
+  struct Job;
+  void work();
+
+  std::mutex mutex_;
+  std::mutex submit_;
+  std::condition_variable wake_;
+  std::condition_variable finished_;
+  Job* job_ = nullptr;
+  std::size_t generation_ = 0;
+  bool stop_ = false;
+  std::vector<std::thread> workers_;
+};
+
+/// Shorthand for ThreadPool::shared().parallel_for.
+void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body);
+
+}  // namespace wiw
