@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every error `wiw` raises on purpose. Messages say what was expected, what came, and what to do."""
+
+from wiw._core import ArgumentError, BackendError, Error, FileError, NavigationError
+
+__all__ = [
+    "ArgumentError",
+    "BackendError",
+    "ContractError",
+    "Error",
+    "FileError",
+    "InfrastructureError",
+    "NavigationError",
+    "RegistryError",
+    "StoreError",
+]
+
+
+class RegistryError(Error, LookupError):
+    """A name is not registered. The message lists what is, nearest first."""
+
+
+class ContractError(Error, TypeError):
+    """A plugged-in model, policy or metric broke its contract (wrong shape, dtype, count, or NaN)."""
+
+
+class InfrastructureError(Error):
+    """Something around the task failed (a server, a file, memory): the episode is recorded as such, not as a failure."""
+
+
+class StoreError(Error):
+    """A run store is damaged, of another version, or does not fit what is asked of it."""

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The values that travel through the closed loop. All are frozen; arrays follow `docs/conventions.md`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
+View = Literal["perspective", "panorama"]
+
+
+@dataclass(frozen=True)
+class Key:
+    """Names one decision for all randomness: results are functions of it, never of batch size or worker count."""
+
+    seed: int
+    episode: int
+    decision: int = 0
+
+    def at(self, decision: int) -> Key:
+        """The key of another decision of the same episode."""
+        return Key(self.seed, self.episode, decision)
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What the agent perceives: images, odometry since the episode's start, and depth where the run grants it.
+
+    Nothing here tells where in the scene the agent is: poses are relative to the first observation of the episode.
+    """
+
+    panorama: NDArray[np.uint8]
+    """uint8 [576, 1024, 3] equirectangular."""
+    front: NDArray[np.uint8]
+    """uint8 [480, 480, 3], HFOV 90 degrees."""
+    odometry: NDArray[np.float64]
+    """float64 [3]: x forward and y left in metres, azimuth in radians (left positive), in the frame of the start."""
+    depth: NDArray[np.float32] | None = None
+    """float32 [576, 1024] distance along the ray in metres, 0 where nothing is hit; None unless asked for."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The observation as gymnasium spaces see it; `depth` only where present."""
+        values = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
+        return values if self.depth is None else {**values, "depth": self.depth}
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What the task asks of the agent. `image` is set for image goals, `text` for questions and instructions."""
+
+    task: str
+    image: NDArray[np.uint8] | None = None
+    """uint8 [480, 480, 3], HFOV 90 degrees."""
+    text: str | None = None
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """One candidate plan: primitive ids int8 [K], 1 <= K <= horizon."""
+
+    actions: NDArray[np.int8]
+    prior: float = 0.0
+    """The proposing policy's own preference; higher is better."""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "actions", np.asarray(self.actions, np.int8))
+
+
+@dataclass(frozen=True)
+class Control:
+    """One row of a world model's batch: the same plan in every form, of which the model reads what it declared.
+
+    Frame 0 is the observation; frame k is what follows action k. Frames 1..`shared` of this row are answered by an
+    earlier row of the batch and never read, so a model that computes frames one by one may leave them unwritten.
+    """
+
+    actions: NDArray[np.int8]
+    """int8 [K] primitive ids, padded to the model's frames - 1."""
+    trajectory: NDArray[np.float64]
+    """float64 [K, 3]: x forward, y left, azimuth, in the frame of frame 0."""
+    text: str = ""
+    ids: NDArray[np.generic] | None = None
+    """[K] or [K + 1] ids or vectors in the model's own vocabulary, null token in front where it needs one."""
+    length: int = 0
+    """Actions that are the agent's own; the rest is padding."""
+    shared: int = 0
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """What a world model sees, batched over candidates and episodes. Only what `accepts.needs` names is set."""
+
+    image: NDArray[np.uint8]
+    """uint8 [B, H, W, 3] in the model's view and size."""
+    depth: NDArray[np.float32] | None = None
+    """float32 [B, H, W], in the model's view and size: planar z in a perspective view, distance in a panorama."""
+    semantic: NDArray[np.uint32] | None = None
+    history: Sequence[NDArray[np.uint8]] | None = None
+    simulators: Sequence[Any] | None = None
+    """Forks of the environment, one a row; given to `oracle` alone."""
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Imagined future of one candidate, in the views that the revising policy asked for."""
+
+    frames: NDArray[np.uint8]
+    """uint8 [K, H, W, 3] (or [K, V, H, W, 3] for several views): frame k - 1 is what follows action k."""
+    real: NDArray[np.bool_]
+    """bool [K]: True where the frame is the real panorama turned, not imagination."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """The outcome of one pass through propose, imagine, revise, with all evidence kept."""
+
+    actions: NDArray[np.int8]
+    """The plan that was chosen or written anew, int8 [K]."""
+    execute: int
+    """How many of `actions` are carried out before the next decision."""
+    proposals: tuple[Proposal, ...]
+    rollouts: tuple[Rollout, ...] | None = None
+    scores: NDArray[np.float64] | None = None
+    chosen: int | None = None
+    """Index into `proposals`; None when the reviser wrote a new plan."""
+    observation: Observation | None = None
+    goal: Goal | None = None
+    key: Key | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    """Wall time by stage: propose, platform, world_model, revise."""
+    calls: Mapping[str, int] = field(default_factory=dict)
+    """Counts: rows and frames asked of the world model."""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Privileged state of an episode. It reaches metrics, records and reports, never a policy or a world model."""
+
+    position: NDArray[np.float64]
+    """float64 [3] world metres, on the floor."""
+    yaw: float
+    distance_to_goal: float
+    """Straight-line metres to the goal's position."""
+    geodesic_to_goal: float
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Start and goal of one episode in one scene, as stored in the episode file."""
+
+    episode_id: str
+    scene: str
+    """Scene spec of a single scene, e.g. `apartments:val/3` or a path."""
+    start_position: tuple[float, float, float]
+    start_yaw: float
+    """Radians, left positive."""
+    goal_position: tuple[float, float, float]
+    goal_yaw: float
+    geodesic: float
+    """Shortest path from start to goal in metres."""
+    info: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class DecisionRecord:
+    """One row of the run store: what was decided, and what truly happened."""
+
+    episode: int
+    """Index in the run's episode list."""
+    index: int
+    """0 for the first decision of the episode."""
+    decision: Decision
+    executed: NDArray[np.int8]
+    """Primitives that were carried out (fewer than planned when the episode ended on the way)."""
+    before: Truth
+    after: Truth
+    path: NDArray[np.float64]
+    """float64 [len(executed) + 1, 3]: world positions from before the first to after the last primitive."""
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """The end of one episode. `status` is "failed" when infrastructure failed, and then nothing counts as a score."""
+
+    episode: int
+    episode_id: str
+    scene: str
+    status: Literal["done", "failed"]
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal."""
+    seconds: float = 0.0
+    error: str = ""

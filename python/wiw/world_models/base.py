@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a world model is: one class, one method, one declaration of what it accepts."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, ContractError
+from wiw.types import Conditioning, Control, ControlKind, View
+
+CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
+NEEDS = ("depth", "semantic", "history", "simulator")
+
+
+@dataclass(frozen=True)
+class Accepts:
+    """A world model's declaration, read by the loop; made by `wiw.accepts(...)`, which checks it."""
+
+    control: ControlKind
+    space: str
+    view: View
+    size: tuple[int, int]
+    frames: int
+    needs: tuple[str, ...]
+    causal: bool
+    best_batch: int
+    vocabulary: dict[int, Any] | None
+    null_first: bool
+    template: str | None
+
+
+def accepts(
+    control: ControlKind,
+    view: View = "panorama",
+    size: tuple[int, int] | None = None,
+    frames: int = 0,
+    *,
+    space: str = "discrete",
+    needs: Sequence[str] = (),
+    causal: bool = False,
+    best_batch: int = 8,
+    vocabulary: dict[int, Any] | None = None,
+    null_first: bool = False,
+    template: str | None = None,
+) -> Accepts:
+    """Declares what a world model takes and gives (paper, section "Unified Action API").
+
+    Args:
+        control: which member of `Control` the model reads: "image" (none), "text", "trajectory", "viewpoint", "action".
+        view: "perspective" (HFOV 90 front view) or "panorama" (equirectangular).
+        size: (height, width) of its input and output; default 480x480 or 576x1024.
+        frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
+        space: "discrete" primitives or "pose7" poses.
+        needs: any of "depth", "semantic", "history"; "simulator" is for `oracle` alone.
+        causal: frame k depends on controls 1..k only, so shared prefixes are imagined once.
+        best_batch: rows per call at which the model is most efficient.
+        vocabulary: primitive id to the model's own id or vector, for control "action".
+        null_first: the model wants a null token for frame 0 in front of the actions.
+        template: path of a text template, for control "text".
+
+    Raises:
+        ArgumentError: a value is not one of the above.
+    """
+    size = size or ((480, 480) if view == "perspective" else (576, 1024))
+    _check("control", control, CONTROLS)
+    _check("view", view, ("perspective", "panorama"))
+    _check("space", space, ("discrete", "pose7"))
+    for need in needs:
+        _check("needs", need, NEEDS)
+    if frames < 0 or frames == 1:
+        raise ArgumentError(f"accepts: frames counts the observation too: expected 0 (any) or at least 2, got {frames}")
+    if best_batch < 1:
+        raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
+    return Accepts(control, space, view, size, frames, tuple(needs), causal, best_batch, vocabulary, null_first, template)
+
+
+def _check(name: str, value: str, allowed: Sequence[str]) -> None:
+    if value not in allowed:
+        raise ArgumentError(f"accepts: {name} is '{value}', expected one of {', '.join(allowed)}")
+
+
+class WorldModel(ABC):
+    """Predicts what an agent would see. Subclasses set `accepts` and write `rollout`."""
+
+    accepts: Accepts
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts):
+            raise ContractError(f"{cls.__name__}: set the class attribute `accepts = wiw.accepts(...)`")
+
+    @abstractmethod
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Imagines one future per row.
+
+        Args:
+            observations: B rows in the declared view and size.
+            controls: B rows; frame k is what follows action k.
+            seeds: uint64 [B], one per row, so that results do not depend on how rows are batched.
+
+        Returns:
+            uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation.
+        """
+        raise NotImplementedError
+
+
+def checked_rollout(
+    model: WorldModel, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+) -> NDArray[np.uint8]:
+    """`model.rollout` with its answer held to the contract.
+
+    Raises:
+        ContractError: wrong type, dtype or shape, named with what was expected.
+    """
+    frames = model.rollout(observations, controls, seeds)
+    expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
+    if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
+        came = f"{frames.dtype} {frames.shape}" if isinstance(frames, np.ndarray) else type(frames).__name__
+        raise ContractError(f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
+                            f"width, 3), got {came}")
+    return frames
