@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <pybind11/numpy.h>
+
+#include <algorithm>
+#include <vector>
+
+#include "arrays.hpp"
+#include "wiw/action/action.hpp"
+
+namespace wiw::bindings {
+
+/// Checked action ids of any shape, flattened.
+struct ActionArray {
+  std::vector<Action> values;
+  std::vector<py::ssize_t> shape;
+};
+
+inline bool is_integer(const py::array& array) {
+  const char kind = array.dtype().kind();
+  return kind == 'i' || kind == 'u';
+}
+
+inline ActionArray to_actions(const py::array& array) {
+  if (!is_integer(array) && array.size() > 0) {
+    throw ArgumentError("expected discrete action ids (integers), got " + shape_text(array));
+  }
+  const Array<std::int64_t> ids(array);
+  ActionArray actions{.values = std::vector<Action>(static_cast<std::size_t>(ids.size())),
+                      .shape = std::vector<py::ssize_t>(ids.shape(), ids.shape() + ids.ndim())};
+  std::transform(ids.data(), ids.data() + ids.size(), actions.values.begin(),
+                 [](std::int64_t id) { return to_action(id); });
+  return actions;
+}
+
+/// One plan: ids of shape [K].
+inline std::vector<Action> to_plan(const py::array& array) {
+  ActionArray actions = to_actions(array);
+  if (actions.shape.size() != 1) throw ArgumentError("expected one plan of action ids [K], got " + shape_text(array));
+  return std::move(actions.values);
+}
+
+inline py::array_t<std::int8_t> to_ids(std::span<const Action> actions) {
+  py::array_t<std::int8_t> ids(static_cast<py::ssize_t>(actions.size()));
+  std::transform(actions.begin(), actions.end(), ids.mutable_data(),
+                 [](Action a) { return static_cast<std::int8_t>(a); });
+  return ids;
+}
+
+}  // namespace wiw::bindings
