@@ -16,17 +16,6 @@ using namespace wiw::bindings;
 
 namespace {
 
-py::array_t<double> planar_array(std::span<const PlanarPose> poses) {
-  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{3}});
-  double* out = array.mutable_data();
-  for (const PlanarPose& pose : poses) {
-    *out++ = pose.x;
-    *out++ = pose.y;
-    *out++ = pose.azimuth;
-  }
-  return array;
-}
-
 std::vector<PlanarPose> to_planar(const Array<double>& array) {
   expect_shape(array, {-1, 3}, "poses [K, 3] (x, y, azimuth)");
   std::vector<PlanarPose> poses;
@@ -50,16 +39,6 @@ py::array_t<double> gripper_array(std::span<const GripperPose> poses) {
     out = std::copy(pose.position.begin(), pose.position.end(), out);
     out = std::copy(pose.rpy.begin(), pose.rpy.end(), out);
     *out++ = pose.gripper;
-  }
-  return array;
-}
-
-py::array_t<double> matrix_array(std::span<const Pose> poses) {
-  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{4}, py::ssize_t{4}});
-  double* out = array.mutable_data();
-  for (const Pose& pose : poses) {
-    Eigen::Map<Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(out) = pose.matrix();
-    out += 16;
   }
   return array;
 }
@@ -124,6 +103,13 @@ void bind_spaces(py::module_& module) {
       .def_readonly("forward_m", &ActionSpace::forward_m)
       .def_property_readonly("turn_deg", [](const ActionSpace& space) { return degrees(space.turn_rad); })
       .def_readonly("turn_rad", &ActionSpace::turn_rad)
+      .def("__eq__", [](const ActionSpace& a, const ActionSpace& b) { return a == b; }, py::is_operator())
+      .def("__hash__",
+           [](const ActionSpace& space) { return py::hash(py::make_tuple(space.forward_m, space.turn_rad)); })
+      .def(py::pickle([](const ActionSpace& space) { return py::make_tuple(space.forward_m, space.turn_rad); },
+                      [](const py::tuple& state) {
+                        return ActionSpace{.forward_m = state[0].cast<double>(), .turn_rad = state[1].cast<double>()};
+                      }))
       .def("__repr__", [](const ActionSpace& space) {
         return py::str("ActionSpace(forward_m={:g}, turn_deg={:g})").format(space.forward_m, degrees(space.turn_rad));
       });

@@ -4,10 +4,11 @@
 #include <pybind11/numpy.h>
 
 #include <algorithm>
+#include <span>
 #include <vector>
 
 #include "arrays.hpp"
-#include "wiw/action/action.hpp"
+#include "wiw/action/trajectory.hpp"
 
 namespace wiw::bindings {
 
@@ -46,6 +47,30 @@ inline py::array_t<std::int8_t> to_ids(std::span<const Action> actions) {
   std::transform(actions.begin(), actions.end(), ids.mutable_data(),
                  [](Action a) { return static_cast<std::int8_t>(a); });
   return ids;
+}
+
+/// float64 [K, 3].
+inline py::array_t<double> planar_array(std::span<const PlanarPose> poses) {
+  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{3}});
+  double* out = array.mutable_data();
+  for (const PlanarPose& pose : poses) {
+    *out++ = pose.x;
+    *out++ = pose.y;
+    *out++ = pose.azimuth;
+  }
+  return array;
+}
+
+/// float64 [K, 4, 4].
+inline py::array_t<double> matrix_array(std::span<const Pose> poses) {
+  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{4}, py::ssize_t{4}});
+  double* out = array.mutable_data();
+  for (const Pose& pose : poses) {
+    Eigen::Map<Eigen::Matrix<double, 4, 4, Eigen::RowMajor>> matrix(out);
+    matrix = pose.matrix();
+    out += 16;
+  }
+  return array;
 }
 
 }  // namespace wiw::bindings

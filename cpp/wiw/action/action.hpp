@@ -34,6 +34,7 @@ constexpr int turn_sign(Action action) {
 struct ActionSpace {
   double forward_m = 0.2;
   double turn_rad = radians(22.5);
+  bool operator==(const ActionSpace&) const = default;
 
   /// Throws ArgumentError unless both steps are finite and positive and a turn is at most half a circle.
   void check() const;

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The unified action API: one plan as text, camera trajectory, viewpoints or a model's own numbers.
+
+Follows the section "Unified Action API" of the World-in-World paper. A discrete plan is a sequence of primitive ids,
+action k leading from observation k to observation k + 1; a continuous plan is float [K, 7], end-effector poses
+(x, y, z, roll, pitch, yaw, gripper) in metres and radians with R = Rz(yaw) Ry(pitch) Rx(roll) and gripper 1 open.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from wiw._core import action as _core
+from wiw._core.action import Action, ActionSpace, GripperTextTemplate, TextTemplate
+from wiw.errors import ArgumentError
+
+NULL = Action.NULL
+FORWARD = Action.FORWARD
+TURN_LEFT = Action.TURN_LEFT
+TURN_RIGHT = Action.TURN_RIGHT
+STOP = Action.STOP
+
+__all__ = [
+    "FORWARD",
+    "NULL",
+    "STOP",
+    "TURN_LEFT",
+    "TURN_RIGHT",
+    "Action",
+    "ActionSpace",
+    "GripperTextTemplate",
+    "GripperVocabulary",
+    "TextTemplate",
+    "chunk",
+    "frames_of_actions",
+    "pad",
+    "resample",
+    "to_controls",
+    "to_text",
+    "to_trajectory",
+    "to_viewpoints",
+    "with_null",
+]
+
+Padding = Literal["forward", "repeat", "null"]
+RotationCode = Literal["euler", "sin_cos", "matrix_6d", "quaternion_wxyz", "quaternion_xyzw"]
+Vocabulary = Mapping[int, Any] | Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class GripperVocabulary:
+    """A model's numbers for 7-DoF poses: [position, rotation, gripper].
+
+    `bounds` (low, high), each 3 metres, maps the position to [-1, 1]; None leaves it in metres.
+    """
+
+    rotation: RotationCode = "euler"
+    bounds: tuple[Sequence[float], Sequence[float]] | None = None
+
+
+def to_text(
+    actions: ArrayLike,
+    template: TextTemplate | GripperTextTemplate | None = None,
+    space: ActionSpace | None = None,
+) -> str:
+    """The plan as a prompt for image-and-text-to-video models.
+
+    Args:
+        actions: ids [K], or poses float [K, 7].
+        template: words to use; the default is made for the kind of plan. `TextTemplate(prompt=..., phrases={FORWARD:
+            ...}, separator=..., merge_runs=...)` replaces any part of it.
+        space: step sizes that the phrases name; default 0.2 m and 22.5 degrees.
+
+    Raises:
+        ArgumentError: an unknown id, a template of the other kind, or a prompt without `{actions}`.
+    """
+    plan = np.asarray(actions)
+    if plan.ndim == 2:
+        words = template or GripperTextTemplate()
+        if not isinstance(words, GripperTextTemplate):
+            raise ArgumentError("to_text: poses [K, 7] need a GripperTextTemplate, got a TextTemplate")
+        return str(_core.gripper_to_text(_poses(plan), words))
+    words = template or TextTemplate()
+    if not isinstance(words, TextTemplate):
+        raise ArgumentError("to_text: discrete ids need a TextTemplate, got a GripperTextTemplate")
+    return str(_core.to_text(plan, words, space or ActionSpace()))
+
+
+def to_trajectory(
+    actions: ArrayLike, space: ActionSpace | None = None, *, include_start: bool = False
+) -> NDArray[np.float64]:
+    """The plan as a camera trajectory: the pose after each action in the frame of the start.
+
+    Args:
+        actions: ids [K] or a batch [..., K].
+        space: step sizes.
+        include_start: put the start (0, 0, 0) in front, so that row k belongs to frame k.
+
+    Returns:
+        float64 [..., K, 3]: x metres forward, y metres left, azimuth in radians (left positive, full circles counted).
+
+    Raises:
+        ArgumentError: an unknown id.
+    """
+    return np.asarray(_core.to_trajectory(np.asarray(actions), space or ActionSpace(), include_start))
+
+
+def to_viewpoints(
+    actions: ArrayLike, space: ActionSpace | None = None, *, include_start: bool = False
+) -> NDArray[np.float64]:
+    """The trajectory as camera poses T_start_camera, float64 [..., K, 4, 4] (right +X, up +Y, looking down -Z)."""
+    return np.asarray(_core.to_viewpoints(np.asarray(actions), space or ActionSpace(), include_start))
+
+
+def to_controls(
+    actions: ArrayLike, vocabulary: Vocabulary | GripperVocabulary, *, null_first: bool = False
+) -> NDArray[np.int64] | NDArray[np.float64]:
+    """The plan in a model's own vocabulary.
+
+    Args:
+        actions: ids [K] or [..., K]; poses float [K, 7] with a `GripperVocabulary`.
+        vocabulary: for ids, a map from primitive (id, `Action` or name, e.g. "turn_left") to the model's id or vector.
+        null_first: put the null token in front, for models that want one token a frame.
+
+    Returns:
+        int64 [..., K] if all entries are whole numbers, else float64 [..., K] or [..., K, D]; for poses float64 [K, D].
+
+    Raises:
+        ArgumentError: an action the vocabulary does not know, or entries of different widths.
+    """
+    plan = np.asarray(actions)
+    if isinstance(vocabulary, GripperVocabulary):
+        if null_first:
+            raise ArgumentError("to_controls: poses are absolute, one a frame; put the current pose in front instead")
+        rotation = _rotation(vocabulary.rotation)
+        return np.asarray(_core.encode_gripper(_poses(plan), rotation, vocabulary.bounds))
+    entries = {_action(key): value for key, value in vocabulary.items()}
+    scalar = all(np.ndim(value) == 0 for value in entries.values())
+    whole = scalar and all(isinstance(value, int | np.integer) for value in entries.values())
+    vectors = {key: np.atleast_1d(np.asarray(value, np.float64)).tolist() for key, value in entries.items()}
+    encoded = np.asarray(_core.encode(with_null(plan) if null_first else plan, vectors))
+    if scalar:
+        encoded = encoded[..., 0]
+    return encoded.astype(np.int64) if whole else encoded
+
+
+def with_null(actions: ArrayLike) -> NDArray[np.int8]:
+    """Ids [..., K] with the null token in front, [..., K + 1]: entry k then belongs to frame k."""
+    plan = np.asarray(actions)
+    front = np.full((*plan.shape[:-1], 1), int(NULL), plan.dtype if plan.size else np.int8)
+    return np.concatenate([front, plan.astype(front.dtype)], axis=-1)
+
+
+def resample(
+    poses: ArrayLike,
+    length: int,
+    *,
+    start: ArrayLike | None = None,
+    gripper: Literal["step", "nearest"] = "step",
+) -> NDArray[np.float64]:
+    """Brings a plan of poses to the length a model is conditioned on.
+
+    Longer: linear interpolation, rotations by slerp along the shorter arc. Shorter: uniform sampling of the given
+    poses. The last pose is always kept.
+
+    Args:
+        poses: float [K, 3] trajectory, [K, 7] end-effector poses or [K, 4, 4] viewpoints.
+        length: number of poses wanted.
+        start: the pose before the plan. With it the new poses are evenly spaced from there, as the frames after the
+            observation are; without it the first pose is kept as first.
+        gripper: "step" changes the gripper on reaching a waypoint, "nearest" half-way.
+
+    Returns:
+        float64 of the same kind with `length` poses.
+
+    Raises:
+        ArgumentError: discrete ids (use `pad` or `chunk`), another shape, no poses, or length < 1.
+    """
+    given = np.asarray(poses)
+    if given.size and not np.issubdtype(given.dtype, np.floating):
+        raise ArgumentError(
+            f"resample: expected floating-point poses, got {given.dtype} {given.shape}: discrete actions cannot be "
+            "interpolated, use pad() or chunk()"
+        )
+    if length < 1:
+        raise ArgumentError(f"resample: expected a length of at least 1, got {length}")
+    if given.ndim == 3:
+        return np.asarray(_core.resample_viewpoints(given, length, start))
+    first = None if start is None else np.atleast_2d(np.asarray(start, np.float64))
+    if given.ndim == 2 and given.shape[1] == 3:
+        return np.asarray(_core.resample_planar(given, length, first))
+    if given.ndim == 2 and given.shape[1] == 7:
+        return np.asarray(_core.resample_gripper(given, length, first, gripper))
+    raise ArgumentError(f"resample: expected poses [K, 3], [K, 7] or [K, 4, 4], got {given.dtype} {given.shape}")
+
+
+def pad(actions: ArrayLike, length: int, padding: Padding = "forward") -> NDArray[np.int8]:
+    """Ids [K] filled up to int8 [length] with forward steps, the last action again, or the null token.
+
+    Raises:
+        ArgumentError: the plan is longer than `length` (use `chunk`), or empty with padding "repeat".
+    """
+    return np.asarray(_core.pad(np.asarray(actions), length, padding))
+
+
+def chunk(actions: ArrayLike, length: int, padding: Padding = "forward") -> NDArray[np.int8]:
+    """Ids [K] cut into int8 [chunks, length], the last one padded; each is rolled out from the last frame before it."""
+    return np.asarray(_core.chunk(np.asarray(actions), length, padding))
+
+
+def frames_of_actions(count: int, frames: int, fit: Literal["pad", "resample", "chunk"] = "pad") -> NDArray[np.int64]:
+    """Which frame of a model shows the outcome of each action; frame 0 is what a rollout began with.
+
+    Args:
+        count: number of actions in the agent's plan.
+        frames: length of the model's rollout, frame 0 included.
+        fit: how the plan was fitted: "pad" (frame k follows action k), "resample" (the clip covers the plan evenly,
+            the nearest frame is named) or "chunk" (each chunk answers `frames` - 1 actions).
+
+    Returns:
+        int64 [count, 2]: chunk (0 unless chunked) and frame in it.
+
+    Raises:
+        ArgumentError: fewer than 2 frames, or a padded plan that does not fit.
+    """
+    return np.asarray(_core.frames_of_actions(count, frames, fit))
+
+
+def _action(key: int | str) -> Action:
+    if isinstance(key, str):
+        names = {action.name.lower(): action for action in Action}
+        if key.lower() not in names:
+            raise ArgumentError(f"vocabulary: unknown action '{key}', expected one of {', '.join(names)}")
+        return names[key.lower()]
+    try:
+        return Action(key)
+    except ValueError:
+        raise ArgumentError(f"vocabulary: unknown action {key}, expected 0 to {len(Action) - 1}") from None
+
+
+def _poses(plan: NDArray[Any]) -> NDArray[np.float64]:
+    if plan.ndim != 2 or plan.shape[1] != 7:
+        raise ArgumentError(
+            f"expected poses float [K, 7] (x, y, z, roll, pitch, yaw, gripper), got {plan.dtype} {plan.shape}"
+        )
+    return plan.astype(np.float64)
+
+
+def _rotation(name: str) -> _core.RotationCode:
+    codes = {code.name.lower(): code for code in _core.RotationCode}
+    if name not in codes:
+        raise ArgumentError(f"rotation: unknown code '{name}', expected one of {', '.join(codes)}")
+    return codes[name]
