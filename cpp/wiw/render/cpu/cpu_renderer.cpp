@@ -1,0 +1,139 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/cpu/cpu_renderer.hpp"
+
+#include <algorithm>
+#include <mutex>
+#include <optional>
+
+#if defined(__x86_64__)
+#include <xmmintrin.h>
+#endif
+
+#include "wiw/core/error.hpp"
+#include "wiw/core/thread_pool.hpp"
+#include "wiw/render/cpu/embree_scene.hpp"
+#include "wiw/render/cpu/ray_tables.hpp"
+#include "wiw/render/request.hpp"
+
+namespace wiw {
+
+namespace {
+
+using namespace cpu;
+
+/// A tile is one unit of work: whole packets for every instruction set, small enough to balance two cores at the end
+/// of a frame, and its triangles and texels stay in the second-level cache.
+constexpr Size kTile{32, 64};
+
+/// Denormals as zero while kernels run: traversal meets many, and each would cost over a hundred cycles.
+class FlushDenormals {
+ public:
+#if defined(__x86_64__)
+  FlushDenormals() : saved_(_mm_getcsr()) { _mm_setcsr(saved_ | 0x8040u); }  // FTZ | DAZ
+  ~FlushDenormals() { _mm_setcsr(saved_); }
+
+ private:
+  unsigned saved_;
+#endif
+};
+
+TileKernel kernel_for(Isa isa) {
+#if defined(__x86_64__)
+  if (isa == Isa::kAvx512) return render_tile_avx512;
+  if (isa == Isa::kAvx2) return render_tile_avx2;
+#endif
+  return render_tile_scalar;
+}
+
+Image image_of(const RenderTargets& targets, Size size, std::size_t index) {
+  const std::size_t first = index * size.pixels();
+  Image image{};
+  image.height = size.height;
+  image.width = size.width;
+  if (targets.color != nullptr) image.color = targets.color + 3 * first;
+  if (targets.depth != nullptr) image.depth = targets.depth + first;
+  if (targets.instance != nullptr) image.instance = targets.instance + first;
+  return image;
+}
+
+class CpuRenderer final : public Renderer {
+ public:
+  CpuRenderer(ScenePtr scene, const RenderOptions& options, Isa isa)
+      : scene_(std::move(scene)),
+        options_(options),
+        isa_(isa),
+        kernel_(kernel_for(isa)),
+        shading_(*scene_),
+        embree_(*scene_, shading_, isa) {
+    shading_.describe(kernel_scene_);
+  }
+
+  void render(std::span<const Pose> T_world_camera, const Camera& camera, const RenderTargets& targets) override {
+    check_request(T_world_camera, camera);
+    if (targets.color == nullptr && targets.depth == nullptr && targets.instance == nullptr) return;
+    const std::scoped_lock lock(mutex_);
+    if (!tables_ || !tables_->fits(camera)) tables_.emplace(camera, options_.samples);
+    kernel_scene_.fixed = embree_.fixed();
+    kernel_scene_.moved = embree_.moved();
+    const int across = (camera.size.width + kTile.width - 1) / kTile.width;
+    const int down = (camera.size.height + kTile.height - 1) / kTile.height;
+    const auto per_view = static_cast<std::size_t>(across) * static_cast<std::size_t>(down);
+    parallel_for(T_world_camera.size() * per_view, [&](std::size_t i) {
+      const FlushDenormals flush;
+      const std::size_t index = i / per_view;
+      const auto number = static_cast<int>(i % per_view);
+      Tile tile{number % across * kTile.width, number / across * kTile.height, 0, 0};
+      tile.width = std::min(kTile.width, camera.size.width - tile.x);
+      tile.height = std::min(kTile.height, camera.size.height - tile.y);
+      kernel_(kernel_scene_, tables_->view(T_world_camera[index]), image_of(targets, camera.size, index), tile);
+    });
+  }
+
+  void set_poses(std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses) override {
+    check_poses(*scene_, ids, poses);
+    const std::scoped_lock lock(mutex_);
+    const auto parts = shading_.parts();
+    for (std::size_t i = 0; i < ids.size(); ++i) {
+      const std::uint32_t index = ids[i] - 1;
+      // Parts are ordered by instance.
+      auto part = std::lower_bound(parts.begin(), parts.end(), index,
+                                   [](const Part& p, std::uint32_t value) { return p.instance < value; });
+      for (; part != parts.end() && part->instance == index; ++part) {
+        const auto number = static_cast<std::size_t>(part - parts.begin());
+        shading_.place(number, poses[i]);
+        embree_.move(number, poses[i]);
+      }
+    }
+    embree_.commit_moved();
+  }
+
+  [[nodiscard]] const Scene& scene() const override { return *scene_; }
+  [[nodiscard]] std::string description() const override {
+    return "cpu (Embree " + embree_.version() + ", " + isa_name(isa_) + ")";
+  }
+
+ private:
+  ScenePtr scene_;
+  RenderOptions options_;
+  Isa isa_;
+  TileKernel kernel_;
+  ShadingScene shading_;
+  EmbreeScene embree_;
+  KernelScene kernel_scene_{};
+  std::optional<RayTables> tables_;
+  std::mutex mutex_;
+};
+
+}  // namespace
+
+std::shared_ptr<Renderer> make_cpu_renderer(ScenePtr scene, const RenderOptions& options, Isa isa) {
+  check_options(options);
+  if (isa > native_isa()) {
+    throw BackendError("render: this processor has no " + isa_name(isa) + ", only " + isa_name(native_isa()));
+  }
+  scene->validate();
+  if (scene->triangle_count() == 0) throw ArgumentError("render: scene '" + scene->name + "' has no triangles");
+  return std::make_shared<CpuRenderer>(std::move(scene), options, isa);
+}
+
+}  // namespace wiw

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+
+#include "wiw/core/cpu.hpp"
+#include "wiw/render/renderer.hpp"
+
+namespace wiw {
+
+/// Embree ray caster whose packets and shading use `isa`, which the processor must have. Throws ArgumentError for a
+/// scene without triangles.
+std::shared_ptr<Renderer> make_cpu_renderer(ScenePtr scene, const RenderOptions& options, Isa isa = active_isa());
+
+}  // namespace wiw

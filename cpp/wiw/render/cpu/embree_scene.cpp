@@ -1,0 +1,135 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/cpu/embree_scene.hpp"
+
+#include "wiw/core/error.hpp"
+#include "wiw/core/thread_pool.hpp"
+
+namespace wiw::cpu {
+
+namespace {
+
+/// Embree's kernels must match ours in width: a packet wider than its native one is traced ray by ray.
+std::string device_options(Isa isa) {
+  std::string options = "threads=" + std::to_string(ThreadPool::shared().size());
+#if defined(__x86_64__)
+  options += isa == Isa::kAvx512 ? ",isa=avx512" : isa == Isa::kAvx2 ? ",isa=avx2" : ",isa=sse2";
+#endif
+  return options;
+}
+
+RTCDeviceProperty native_packet(Isa isa) {
+  if (isa == Isa::kAvx512) return RTC_DEVICE_PROPERTY_NATIVE_RAY16_SUPPORTED;
+  return isa == Isa::kAvx2 ? RTC_DEVICE_PROPERTY_NATIVE_RAY8_SUPPORTED : RTC_DEVICE_PROPERTY_NATIVE_RAY4_SUPPORTED;
+}
+
+}  // namespace
+
+EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa isa)
+    : scene_(scene), shading_(shading), device_(rtcNewDevice(device_options(isa).c_str())) {
+  if (device_ == nullptr) throw BackendError("render: Embree does not start on this processor; use the GPU back end");
+  // An unknown instruction set in the options is not an error for Embree, it silently takes another one.
+  if (rtcGetDeviceProperty(device_, native_packet(isa)) == 0 ||
+      rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_RAY_MASK_SUPPORTED) == 0) {
+    throw BackendError("render: this Embree lacks ray masks or " + isa_name(isa) +
+                       " packets; set WIW_ISA to a lower one (scalar, avx2)");
+  }
+  for (const Part& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
+  fixed_ = rtcNewScene(device_);
+  moved_ = rtcNewScene(device_);
+  rtcSetSceneFlags(moved_, RTC_SCENE_FLAG_DYNAMIC);
+  for (std::size_t i = 0; i < shading.parts().size(); ++i) {
+    RTCGeometry geometry = make_geometry(i, scene.instances[shading.parts()[i].instance].T_world_instance);
+    rtcAttachGeometryByID(fixed_, geometry, static_cast<unsigned>(i));
+    rtcReleaseGeometry(geometry);
+  }
+  rtcCommitScene(fixed_);
+  check("building the scene");
+}
+
+EmbreeScene::~EmbreeScene() {
+  rtcReleaseScene(fixed_);
+  rtcReleaseScene(moved_);
+  rtcReleaseDevice(device_);
+}
+
+void EmbreeScene::check(const char* what) const {
+  const RTCError error = rtcGetDeviceError(device_);
+  if (error == RTC_ERROR_OUT_OF_MEMORY) throw Error(std::string("render: out of memory while ") + what);
+  if (error != RTC_ERROR_NONE) {
+    throw Error(std::string("render: Embree error ") + std::to_string(error) + " while " + what);
+  }
+}
+
+RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f& T_world_instance) {
+  const Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
+  RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
+  rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, sizeof(Eigen::Vector3f),
+                          mesh.positions.size());
+  rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, mesh.triangles.data(), 0,
+                             sizeof(mesh.triangles[0]), mesh.triangles.size());
+  write_vertices(geometry, number, T_world_instance);
+  if (cutouts_[number].surface->alpha_cutoff >= 0.f) {
+    rtcSetGeometryUserData(geometry, &cutouts_[number]);
+    rtcSetGeometryIntersectFilterFunction(geometry, pierce);
+  }
+  rtcCommitGeometry(geometry);
+  return geometry;
+}
+
+void EmbreeScene::write_vertices(RTCGeometry geometry, std::size_t number,
+                                 const Eigen::Affine3f& T_world_instance) const {
+  const Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
+  if (mesh.positions.empty()) return;
+  auto* vertices = static_cast<Eigen::Vector3f*>(rtcGetGeometryBufferData(geometry, RTC_BUFFER_TYPE_VERTEX, 0));
+  if (vertices == nullptr) throw Error("render: out of memory for the scene's vertices");
+  for (std::size_t i = 0; i < mesh.positions.size(); ++i) vertices[i] = T_world_instance * mesh.positions[i];
+}
+
+void EmbreeScene::pierce(const RTCFilterFunctionNArguments* arguments) {
+  const auto& cutout = *static_cast<const Cutout*>(arguments->geometryUserPtr);
+  for (unsigned lane = 0; lane < arguments->N; ++lane) {
+    if (arguments->valid[lane] != -1) continue;
+    const float* uv = cutout.records[RTCHitN_primID(arguments->hit, arguments->N, lane)].uv;
+    const float b1 = RTCHitN_u(arguments->hit, arguments->N, lane);
+    const float b2 = RTCHitN_v(arguments->hit, arguments->N, lane);
+    float alpha = cutout.surface->base_alpha;
+    if (cutout.surface->texture != nullptr) {
+      alpha *= sample_alpha(*cutout.surface->texture, uv[0] + b1 * uv[2] + b2 * uv[4], uv[1] + b1 * uv[3] + b2 * uv[5]);
+    }
+    if (alpha < cutout.surface->alpha_cutoff) arguments->valid[lane] = 0;
+  }
+}
+
+void EmbreeScene::move(std::size_t number, const Eigen::Affine3f& T_world_instance) {
+  const auto id = static_cast<unsigned>(number);
+  RTCGeometry geometry = rtcGetGeometry(moved_, id);
+  if (geometry == nullptr) {
+    rtcGetDeviceError(device_);  // asking for an id that is not attached yet raises one
+    geometry = make_geometry(number, T_world_instance);
+    rtcSetGeometryBuildQuality(geometry, RTC_BUILD_QUALITY_LOW);  // rebuilt at every move
+    rtcCommitGeometry(geometry);
+    rtcAttachGeometryByID(moved_, geometry, id);
+    rtcReleaseGeometry(geometry);
+    // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
+    rtcSetGeometryMask(rtcGetGeometry(fixed_, id), 0);
+  } else {
+    write_vertices(geometry, number, T_world_instance);
+    rtcUpdateGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0);
+    rtcCommitGeometry(geometry);
+  }
+  any_moved_ = true;
+}
+
+void EmbreeScene::commit_moved() {
+  if (!any_moved_) return;
+  rtcCommitScene(moved_);
+  check("moving instances");
+}
+
+std::string EmbreeScene::version() const {
+  const auto version = rtcGetDeviceProperty(device_, RTC_DEVICE_PROPERTY_VERSION);
+  return std::to_string(version / 10000) + "." + std::to_string(version / 100 % 100) + "." +
+         std::to_string(version % 100);
+}
+
+}  // namespace wiw::cpu

@@ -1,0 +1,54 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <embree3/rtcore.h>
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "wiw/core/cpu.hpp"
+#include "wiw/render/cpu/shading_scene.hpp"
+
+namespace wiw::cpu {
+
+/// The parts' triangles in two Embree scenes: one built once from everything, and a small dynamic one with the parts
+/// that have been moved. A moved part is masked out of the first, so that one is never rebuilt. Geometry ids are part
+/// numbers in both.
+class EmbreeScene {
+ public:
+  EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa isa);
+  ~EmbreeScene();
+  EmbreeScene(const EmbreeScene&) = delete;
+  EmbreeScene& operator=(const EmbreeScene&) = delete;
+
+  /// Takes effect with the next commit_moved.
+  void move(std::size_t part, const Eigen::Affine3f& T_world_instance);
+  void commit_moved();
+
+  [[nodiscard]] RTCScene fixed() const { return fixed_; }
+  /// Null while nothing has moved.
+  [[nodiscard]] RTCScene moved() const { return any_moved_ ? moved_ : nullptr; }
+  [[nodiscard]] std::string version() const;
+
+ private:
+  struct Cutout {
+    const TriangleRecord* records;
+    const Surface* surface;
+  };
+  static void pierce(const RTCFilterFunctionNArguments* arguments);
+
+  RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
+  void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
+  void check(const char* what) const;
+
+  const Scene& scene_;
+  const ShadingScene& shading_;
+  std::vector<Cutout> cutouts_;  // by part
+  RTCDevice device_ = nullptr;
+  RTCScene fixed_ = nullptr;
+  RTCScene moved_ = nullptr;
+  bool any_moved_ = false;
+};
+
+}  // namespace wiw::cpu

@@ -1,0 +1,201 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+/// The ray casting and shading of one tile, written once over the lanes that a simd_*.hpp included before this file
+/// defines. Packets are 4 pixels wide and kLanes / 4 high. Masks are Ints of 0 and -1.
+
+#include "wiw/render/cpu/shade.hpp"
+
+namespace wiw::cpu {
+namespace {
+
+constexpr int kPacketWidth = 4;
+constexpr int kPacketHeight = kLanes / kPacketWidth;
+
+inline Ints lane_numbers() {
+  Ints lanes;
+  for (int lane = 0; lane < kLanes; ++lane) lanes[lane] = lane;
+  return lanes;
+}
+
+inline Directions directions(const View& view, const RayGrid& grid, int x, int y) {
+  const Floats column = columns_of(grid.column + x);
+  const Floats row = rows_of(grid.row + y);
+  Floats right = column;
+  Floats forward = Floats{} + 1.f;
+  if (view.panorama) {
+    const Floats row_cos = rows_of(grid.row_cos + y);
+    right = row_cos * column;
+    forward = row_cos * columns_of(grid.column_forward + x);
+  }
+  return {forward * view.forward[0] + right * view.right[0] + row * view.up[0],
+          forward * view.forward[1] + right * view.right[1] + row * view.up[1],
+          forward * view.forward[2] + right * view.right[2] + row * view.up[2]};
+}
+
+inline void store(float* target, Floats values) { __builtin_memcpy(target, &values, sizeof values); }
+inline void store(unsigned* target, Ints values) { __builtin_memcpy(target, &values, sizeof values); }
+inline Floats load_floats(const float* source) {
+  Floats values;
+  __builtin_memcpy(&values, source, sizeof values);
+  return values;
+}
+inline Ints load_ints(const unsigned* source) {
+  Ints values;
+  __builtin_memcpy(&values, source, sizeof values);
+  return values;
+}
+
+/// What never changes from packet to packet: Embree writes only tfar and the hit.
+inline void start_rays(RayHit& rays, const View& view) {
+  store(rays.ray.org_x, Floats{} + view.origin[0]);
+  store(rays.ray.org_y, Floats{} + view.origin[1]);
+  store(rays.ray.org_z, Floats{} + view.origin[2]);
+  store(rays.ray.tnear, Floats{} + shading::kNearClip);
+  store(rays.ray.time, Floats{});
+  store(rays.ray.mask, Ints{} - 1);
+  store(rays.ray.id, Ints{});
+  store(rays.ray.flags, Ints{});
+}
+
+/// Casts the packet through the scene's two parts; the second only replaces nearer hits. Returns the mask of hits.
+inline Ints cast(const KernelScene& scene, const Directions& d, Ints valid, RayHit& rays) {
+  store(rays.ray.dir_x, d.x);
+  store(rays.ray.dir_y, d.y);
+  store(rays.ray.dir_z, d.z);
+  store(rays.ray.tfar, Floats{} + __builtin_inff());
+  store(rays.hit.geomID, Ints{} - 1);
+  store(rays.hit.instID[0], Ints{} - 1);
+  RTCIntersectContext context;
+  rtcInitIntersectContext(&context);
+  context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
+  alignas(64) int valid_lanes[kLanes];
+  __builtin_memcpy(valid_lanes, &valid, sizeof valid);
+  intersect(valid_lanes, scene.fixed, &context, &rays);
+  if (scene.moved != nullptr) intersect(valid_lanes, scene.moved, &context, &rays);
+  return (load_ints(rays.hit.geomID) != -1) & valid;
+}
+
+/// Index of every lane's triangle record; record 0 for lanes without a hit.
+inline Ints record_numbers(const KernelScene& scene, const RayHit& rays, Ints hit) {
+  Ints numbers{};
+  for (int lane = 0; lane < kLanes; ++lane) {
+    if (hit[lane] == 0) continue;
+    numbers[lane] = static_cast<std::int32_t>(scene.first_record[rays.hit.geomID[lane]] + rays.hit.primID[lane]);
+  }
+  return numbers;
+}
+
+inline Rgb shade_rays(const KernelScene& scene, const Directions& d, const RayHit& rays, Ints hit, Floats spread) {
+  Rgb color{};
+  if (mask_bits(~hit) != 0) color = sky(scene, d);
+  if (mask_bits(hit) == 0) return color;
+  Hits hits;
+  hits.u = load_floats(rays.hit.u);
+  hits.v = load_floats(rays.hit.v);
+  hits.t = load_floats(rays.ray.tfar);
+  hits.nx = load_floats(rays.hit.Ng_x);
+  hits.ny = load_floats(rays.hit.Ng_y);
+  hits.nz = load_floats(rays.hit.Ng_z);
+  hits.d = d;
+  hits.spread = spread;
+  hits.hit = hit;
+  load_lines(scene.records, record_numbers(scene, rays, hit), hits.record);
+  return shade_hits(scene, hits, color);
+}
+
+/// The mean of the pixel's colour samples, each clamped as a display would.
+inline Rgb supersample(const KernelScene& scene, const View& view, int x, int y, Ints valid, RayHit& rays) {
+  Rgb sum{};
+  for (int i = 0; i < view.sample_count; ++i) {
+    const RayGrid& grid = view.samples[i];
+    const Directions d = directions(view, grid, x, y);
+    const Ints hit = cast(scene, d, valid, rays);
+    const Rgb color = shade_rays(scene, d, rays, hit, rows_of(grid.row_spread + y));
+    sum = {sum.r + color.r, sum.g + color.g, sum.b + color.b};
+  }
+  const float weight = 1.f / static_cast<float>(view.sample_count);
+  return {sum.r * weight, sum.g * weight, sum.b * weight};
+}
+
+/// Where a packet lies in the image: `columns` of each of its `rows` rows of 4 lanes are inside.
+struct Place {
+  std::size_t first;   // pixel index of lane 0
+  std::size_t stride;  // image width
+  int columns, rows;
+};
+
+inline void write_color(const Image& image, const Place& place, const Rgb& color) {
+  const auto byte = [](Floats value) { return __builtin_convertvector(value * 255.f + 0.5f, Ints); };
+  const Ints packed = byte(color.r) | (byte(color.g) << 8) | (byte(color.b) << 16);
+  alignas(64) std::uint32_t pixels[kLanes];
+  __builtin_memcpy(pixels, &packed, sizeof packed);
+  for (int row = 0; row < place.rows; ++row) {
+    const std::uint32_t* p = pixels + kPacketWidth * row;
+    std::uint8_t* out = image.color + 3 * (place.first + static_cast<std::size_t>(row) * place.stride);
+    const std::uint32_t words[3] = {p[0] | (p[1] << 24), (p[1] >> 8) | (p[2] << 16), (p[2] >> 16) | (p[3] << 8)};
+    if (place.columns == kPacketWidth) {
+      __builtin_memcpy(out, words, sizeof words);
+    } else {
+      __builtin_memcpy(out, words, 3 * static_cast<std::size_t>(place.columns));
+    }
+  }
+}
+
+template <class Pixels>
+inline void write_words(void* target, const Place& place, Pixels values) {
+  alignas(64) std::uint32_t pixels[kLanes];
+  __builtin_memcpy(pixels, &values, sizeof values);
+  for (int row = 0; row < place.rows; ++row) {
+    auto* out = static_cast<std::uint32_t*>(target) + place.first + static_cast<std::size_t>(row) * place.stride;
+    if (place.columns == kPacketWidth) {
+      __builtin_memcpy(out, pixels + kPacketWidth * row, 4 * kPacketWidth);
+    } else {
+      __builtin_memcpy(out, pixels + kPacketWidth * row, 4 * static_cast<std::size_t>(place.columns));
+    }
+  }
+}
+
+inline Ints instance_ids(const KernelScene& scene, const RayHit& rays, Ints hit) {
+  const Ints numbers = record_numbers(scene, rays, hit);
+  Ints ids{};
+  for (int lane = 0; lane < kLanes; ++lane) {
+    if (hit[lane] != 0) {
+      ids[lane] = static_cast<std::int32_t>(scene.records[static_cast<std::uint32_t>(numbers[lane])].instance);
+    }
+  }
+  return ids;
+}
+
+inline void draw_packet(const KernelScene& scene, const View& view, const Image& image, int x, int y, RayHit& rays) {
+  const int columns = image.width - x < kPacketWidth ? image.width - x : kPacketWidth;
+  const int rows = image.height - y < kPacketHeight ? image.height - y : kPacketHeight;
+  const auto stride = static_cast<std::size_t>(image.width);
+  const Place place{static_cast<std::size_t>(y) * stride + static_cast<std::size_t>(x), stride, columns, rows};
+  const Ints lanes = lane_numbers();
+  const Ints valid = ((lanes & 3) < columns) & ((lanes >> 2) < rows);
+  const bool one_sample = view.sample_count == 1;
+  if (image.depth != nullptr || image.instance != nullptr || one_sample) {
+    const Directions d = directions(view, view.center, x, y);
+    const Ints hit = cast(scene, d, valid, rays);
+    if (image.color != nullptr && one_sample) {
+      write_color(image, place, shade_rays(scene, d, rays, hit, rows_of(view.center.row_spread + y)));
+    }
+    if (image.depth != nullptr) {
+      write_words(image.depth, place, hit ? load_floats(rays.ray.tfar) : Floats{});
+    }
+    if (image.instance != nullptr) write_words(image.instance, place, instance_ids(scene, rays, hit));
+  }
+  if (image.color != nullptr && !one_sample) write_color(image, place, supersample(scene, view, x, y, valid, rays));
+}
+
+inline void draw_tile(const KernelScene& scene, const View& view, const Image& image, const Tile& tile) {
+  alignas(64) RayHit rays;
+  start_rays(rays, view);
+  for (int y = tile.y; y < tile.y + tile.height; y += kPacketHeight) {
+    for (int x = tile.x; x < tile.x + tile.width; x += kPacketWidth) draw_packet(scene, view, image, x, y, rays);
+  }
+}
+
+}  // namespace
+}  // namespace wiw::cpu

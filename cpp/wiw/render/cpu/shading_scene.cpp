@@ -1,0 +1,167 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/cpu/shading_scene.hpp"
+
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "wiw/core/error.hpp"
+#include "wiw/core/thread_pool.hpp"
+#include "wiw/render/texel_density.hpp"
+
+namespace wiw::cpu {
+
+namespace {
+
+using Triangle = Eigen::Matrix<std::uint32_t, 3, 1>;
+
+const Material& material_of(const Scene& scene, const Mesh& mesh) {
+  static const Material plain;
+  return mesh.material == kNone ? plain : scene.materials[static_cast<std::size_t>(mesh.material)];
+}
+
+bool is_textured(const Scene& scene, const Mesh& mesh) {
+  return material_of(scene, mesh).texture != kNone && !mesh.uv.empty();
+}
+
+bool is_lightmapped(const Mesh& mesh) { return mesh.lightmap != kNone && !mesh.lightmap_uv.empty(); }
+
+bool needs_detail(const Scene& scene, const Mesh& mesh) {
+  const bool ambient = !is_lightmapped(mesh) && !material_of(scene, mesh).emissive;
+  return !mesh.colors.empty() || (ambient && !mesh.normals.empty());
+}
+
+/// Value at vertex 0, then the differences that barycentric interpolation needs.
+void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& triangle, float* out) {
+  if (values.empty()) return;
+  const Eigen::Vector2f first = values[triangle[0]];
+  const Eigen::Vector2f to_1 = values[triangle[1]] - first;
+  const Eigen::Vector2f to_2 = values[triangle[2]] - first;
+  for (int c = 0; c < 2; ++c) {
+    out[c] = first[c];
+    out[2 + c] = to_1[c];
+    out[4 + c] = to_2[c];
+  }
+}
+
+void write_normals(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f& to_world, float* out) {
+  const Eigen::Vector3f first = (to_world * mesh.normals[triangle[0]]).normalized();
+  const Eigen::Vector3f to_1 = (to_world * mesh.normals[triangle[1]]).normalized() - first;
+  const Eigen::Vector3f to_2 = (to_world * mesh.normals[triangle[2]]).normalized() - first;
+  for (int c = 0; c < 3; ++c) {
+    out[c] = first[c];
+    out[3 + c] = to_1[c];
+    out[6 + c] = to_2[c];
+  }
+}
+
+}  // namespace
+
+ShadingScene::ShadingScene(const Scene& scene) : scene_(scene) {
+  add_parts();
+  parallel_for(parts_.size(), [this](std::size_t i) {
+    const Part& part = parts_[i];
+    const Instance& instance = scene_.instances[part.instance];
+    const Mesh& mesh = scene_.meshes[part.mesh];
+    for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
+      TriangleRecord& record = records_[part.first_record + t];
+      write_differences(mesh.uv, mesh.triangles[t], record.uv);
+      write_differences(mesh.lightmap_uv, mesh.triangles[t], record.light_uv);
+      record.surface = part.surface;
+      record.instance = instance.id;
+      record.detail = part.first_detail == kNoDetail ? kNoDetail : part.first_detail + static_cast<std::uint32_t>(t);
+      if (mesh.colors.empty() || part.first_detail == kNoDetail) continue;
+      for (int k = 0; k < 3; ++k) {
+        std::memcpy(&details_[record.detail].color[k], mesh.colors[mesh.triangles[t][k]].data(), 4);
+      }
+    }
+    place(i, instance.T_world_instance);
+  });
+}
+
+void ShadingScene::add_parts() {
+  std::size_t records = 0;
+  std::size_t details = 0;
+  for (std::uint32_t i = 0; i < scene_.instances.size(); ++i) {
+    for (const std::uint32_t index : scene_.instances[i].meshes) {
+      const Mesh& mesh = scene_.meshes[index];
+      Part part{i, index, add_surface(mesh), static_cast<std::uint32_t>(records), kNoDetail};
+      records += mesh.triangles.size();
+      if (needs_detail(scene_, mesh)) {
+        part.first_detail = static_cast<std::uint32_t>(details);
+        details += mesh.triangles.size();
+      }
+      parts_.push_back(part);
+      first_record_.push_back(part.first_record);
+    }
+  }
+  if (records > std::numeric_limits<std::int32_t>::max() / kRecordWords) {
+    throw ArgumentError("render: the scene places " + std::to_string(records) +
+                        " triangles; expected at most 134 million");
+  }
+  TriangleDetail plain{};
+  for (auto& color : plain.color) color = 0xFFFFFFFFu;
+  records_.resize(std::max<std::size_t>(1, records));  // kernels read record 0 for rays that hit nothing
+  details_.resize(std::max<std::size_t>(1, details), plain);
+}
+
+std::uint32_t ShadingScene::add_surface(const Mesh& mesh) {
+  const bool textured = is_textured(scene_, mesh);
+  const std::int32_t lightmap = is_lightmapped(mesh) ? mesh.lightmap : kNone;
+  const SurfaceKey key{mesh.material, lightmap, textured, !mesh.colors.empty()};
+  const auto [entry, is_new] = surface_numbers_.try_emplace(key, static_cast<std::uint32_t>(surfaces_.size()));
+  if (!is_new) return entry->second;
+  const Material& material = material_of(scene_, mesh);
+  Surface surface{};
+  for (int c = 0; c < 3; ++c) surface.base_color[c] = material.base_color[c];
+  surface.base_alpha = material.base_color[3];
+  surface.alpha_cutoff = material.alpha_cutoff;
+  surface.emissive = material.emissive;
+  surface.vertex_colors = !mesh.colors.empty();
+  if (textured) surface.texture = add_texture(material.texture, TextureStore::Edge::kRepeat);
+  if (lightmap != kNone) surface.lightmap = add_texture(lightmap, TextureStore::Edge::kClamp);
+  surfaces_.push_back(surface);
+  return entry->second;
+}
+
+const SampledTexture* ShadingScene::add_texture(std::int32_t index, TextureStore::Edge edge) {
+  auto& store = textures_[{index, edge}];
+  if (!store) store = std::make_unique<TextureStore>(scene_.textures[static_cast<std::size_t>(index)], edge);
+  return &store->sampled();
+}
+
+void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_instance) {
+  const Part& part = parts_[number];
+  const Mesh& mesh = scene_.meshes[part.mesh];
+  const SampledTexture* texture = surfaces_[part.surface].texture;
+  const Eigen::Matrix3f normal_to_world = T_world_instance.linear().inverse().transpose();
+  for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
+    const Triangle& triangle = mesh.triangles[t];
+    TriangleRecord& record = records_[part.first_record + t];
+    if (texture != nullptr) {
+      const Eigen::Vector3f first = mesh.positions[triangle[0]];
+      const Eigen::Vector3f to_1 = T_world_instance.linear() * (mesh.positions[triangle[1]] - first);
+      const Eigen::Vector3f to_2 = T_world_instance.linear() * (mesh.positions[triangle[2]] - first);
+      const Eigen::Vector2f size(texture->width[0], texture->height[0]);
+      const Eigen::Vector2f uv_1 = size.cwiseProduct(Eigen::Vector2f(record.uv[2], record.uv[3]));
+      const Eigen::Vector2f uv_2 = size.cwiseProduct(Eigen::Vector2f(record.uv[4], record.uv[5]));
+      record.log2_density = std::log2(texel_density(to_1, to_2, uv_1, uv_2));
+    }
+    if (part.first_detail != kNoDetail && !mesh.normals.empty()) {
+      write_normals(mesh, triangle, normal_to_world, details_[part.first_detail + t].normal);
+    }
+  }
+}
+
+void ShadingScene::describe(KernelScene& kernel) const {
+  kernel.first_record = first_record_.data();
+  kernel.records = records_.data();
+  kernel.details = details_.data();
+  kernel.surfaces = surfaces_.data();
+  for (int c = 0; c < 3; ++c) {
+    kernel.zenith[c] = scene_.sky.zenith[c];
+    kernel.horizon[c] = scene_.sky.horizon[c];
+  }
+}
+
+}  // namespace wiw::cpu

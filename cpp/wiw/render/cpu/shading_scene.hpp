@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <map>
+#include <span>
+#include <tuple>
+#include <vector>
+
+#include "wiw/render/cpu/texture_store.hpp"
+
+namespace wiw::cpu {
+
+/// One mesh of one instance: the unit of geometry, numbered alike here and in Embree.
+struct Part {
+  std::uint32_t instance = 0;  // index into Scene::instances
+  std::uint32_t mesh = 0;
+  std::uint32_t surface = 0;
+  std::uint32_t first_record = 0;
+  std::uint32_t first_detail = kNoDetail;
+};
+
+/// What the kernels shade with: one record a placed triangle, surfaces, and textures with their mip levels.
+class ShadingScene {
+ public:
+  explicit ShadingScene(const Scene& scene);
+
+  [[nodiscard]] std::span<const Part> parts() const { return parts_; }
+  [[nodiscard]] const Surface& surface(const Part& part) const { return surfaces_[part.surface]; }
+  [[nodiscard]] const TriangleRecord* records(const Part& part) const { return records_.data() + part.first_record; }
+
+  /// Recomputes what depends on a part's pose: world normals and texel densities.
+  void place(std::size_t part, const Eigen::Affine3f& T_world_instance);
+
+  /// Fills everything but the Embree scenes.
+  void describe(KernelScene& kernel) const;
+
+ private:
+  using SurfaceKey = std::tuple<std::int32_t, std::int32_t, bool, bool>;  // material, lightmap, textured, colours
+  std::uint32_t add_surface(const Mesh& mesh);
+  const SampledTexture* add_texture(std::int32_t index, TextureStore::Edge edge);
+  void add_parts();
+
+  const Scene& scene_;
+  std::map<std::pair<std::int32_t, TextureStore::Edge>, std::unique_ptr<TextureStore>> textures_;
+  std::map<SurfaceKey, std::uint32_t> surface_numbers_;
+  std::vector<Surface> surfaces_;
+  std::vector<Part> parts_;
+  std::vector<std::uint32_t> first_record_;  // by part
+  std::vector<TriangleRecord> records_;
+  std::vector<TriangleDetail> details_;
+};
+
+}  // namespace wiw::cpu

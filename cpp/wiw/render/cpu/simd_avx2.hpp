@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <embree3/rtcore.h>
+#include <immintrin.h>
+
+#include "wiw/render/cpu/kernel.hpp"
+
+/// Eight lanes: AVX2 with FMA.
+namespace wiw::cpu {
+namespace {
+
+constexpr int kLanes = 8;
+typedef float Floats __attribute__((vector_size(4 * kLanes)));
+typedef std::int32_t Ints __attribute__((vector_size(4 * kLanes)));
+using RayHit = RTCRayHit8;
+
+inline void intersect(const int* valid, RTCScene scene, RTCIntersectContext* context, RayHit* rays) {
+  rtcIntersect8(valid, scene, context, rays);
+}
+
+inline Floats floor_of(Floats x) { return (Floats)_mm256_floor_ps((__m256)x); }
+inline Floats sqrt_of(Floats x) { return (Floats)_mm256_sqrt_ps((__m256)x); }
+
+inline Floats columns_of(const float* first) {
+  return (Floats)_mm256_broadcast_ps(reinterpret_cast<const __m128*>(first));
+}
+inline Floats rows_of(const float* first) {
+  return (Floats)_mm256_set_m128(_mm_set1_ps(first[1]), _mm_set1_ps(first[0]));
+}
+
+inline int mask_bits(Ints mask) { return _mm256_movemask_ps((__m256)mask); }
+
+inline Floats look_up(const float* table, Ints index) {
+  const __m256 low = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table), (__m256i)index);
+  const __m256 high = _mm256_permutevar8x32_ps(_mm256_loadu_ps(table + 8), (__m256i)index);
+  return (Floats)_mm256_blendv_ps(low, high, (__m256)(index << 28));
+}
+inline Ints look_up(const std::int32_t* table, Ints index) {
+  return (Ints)look_up(reinterpret_cast<const float*>(table), index);
+}
+
+/// Texels `index` and `index + 1` of every lane.
+inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints& right) {
+  const auto* base = reinterpret_cast<const long long*>(texels);
+  const __m256i even_odd = _mm256_setr_epi32(0, 2, 4, 6, 1, 3, 5, 7);
+  const __m256i low = _mm256_i32gather_epi64(base, _mm256_castsi256_si128((__m256i)index), 4);
+  const __m256i high = _mm256_i32gather_epi64(base, _mm256_extracti128_si256((__m256i)index, 1), 4);
+  const __m256i a = _mm256_permutevar8x32_epi32(low, even_odd);  // 4 left texels, 4 right texels
+  const __m256i b = _mm256_permutevar8x32_epi32(high, even_odd);
+  left = (Ints)_mm256_permute2x128_si256(a, b, 0x20);
+  right = (Ints)_mm256_permute2x128_si256(a, b, 0x31);
+}
+
+/// Transposes eight rows of eight in place.
+inline void transpose(__m256 rows[8]) {
+  __m256 pairs[8];
+  for (int i = 0; i < 4; ++i) {
+    pairs[2 * i] = _mm256_unpacklo_ps(rows[2 * i], rows[2 * i + 1]);
+    pairs[2 * i + 1] = _mm256_unpackhi_ps(rows[2 * i], rows[2 * i + 1]);
+  }
+  __m256 quads[8];
+  for (int half = 0; half < 2; ++half) {
+    const __m256* p = pairs + 4 * half;
+    quads[4 * half + 0] = _mm256_shuffle_ps(p[0], p[2], 0x44);
+    quads[4 * half + 1] = _mm256_shuffle_ps(p[0], p[2], 0xEE);
+    quads[4 * half + 2] = _mm256_shuffle_ps(p[1], p[3], 0x44);
+    quads[4 * half + 3] = _mm256_shuffle_ps(p[1], p[3], 0xEE);
+  }
+  for (int i = 0; i < 4; ++i) {
+    rows[i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x20);
+    rows[4 + i] = _mm256_permute2f128_ps(quads[i], quads[4 + i], 0x31);
+  }
+}
+
+/// words[k] = word k of every lane's 64-byte line.
+inline void load_lines(const void* lines, Ints index, Floats* words) {
+  const auto* base = static_cast<const float*>(lines);
+  for (int half = 0; half < 2; ++half) {
+    __m256 rows[8];
+    for (int lane = 0; lane < kLanes; ++lane) {
+      const auto line = static_cast<std::size_t>(static_cast<std::uint32_t>(index[lane]));
+      rows[lane] = _mm256_load_ps(base + line * kRecordWords + 8 * half);
+    }
+    transpose(rows);
+    for (int k = 0; k < 8; ++k) words[8 * half + k] = (Floats)rows[k];
+  }
+}
+
+}  // namespace
+}  // namespace wiw::cpu

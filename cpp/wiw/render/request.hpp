@@ -1,0 +1,22 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+
+#include "wiw/render/renderer.hpp"
+
+namespace wiw {
+
+/// Largest image side; beyond it, single-precision pixel coordinates and int32 offsets stop being safe.
+constexpr int kMaxImageSide = 16384;
+
+/// Throws ArgumentError unless the poses are finite rigid transforms and the camera can be drawn.
+void check_request(std::span<const Pose> T_world_camera, const Camera& camera);
+
+/// Throws ArgumentError unless the number of colour samples is 1, 4, 9 or 16.
+void check_options(const RenderOptions& options);
+
+/// Throws ArgumentError for ids the scene does not have, a length mismatch, or poses that are not finite.
+void check_poses(const Scene& scene, std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses);
+
+}  // namespace wiw

@@ -1,0 +1,19 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured: task scores in percent, distances between images, and distances between poses."""
+
+from wiw.metrics.answers import aeqa_score, aeqa_spl
+from wiw.metrics.images import psnr, ssim
+from wiw.metrics.navigation import mean_trajectory, path_efficiency, spl, success_rate
+from wiw.metrics.poses import pose_error
+
+__all__ = [
+    "aeqa_score",
+    "aeqa_spl",
+    "mean_trajectory",
+    "path_efficiency",
+    "pose_error",
+    "psnr",
+    "spl",
+    "ssim",
+    "success_rate",
+]
