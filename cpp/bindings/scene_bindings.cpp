@@ -1,0 +1,187 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+#include <pybind11/stl/filesystem.h>
+
+#include <algorithm>
+#include <cstring>
+#include <optional>
+
+#include "arrays.hpp"
+#include "scene_builder.hpp"
+#include "wiw/scene/describe.hpp"
+#include "wiw/scene/import.hpp"
+#include "wiw/scene/measure.hpp"
+#include "wiw/scene/sdf.hpp"
+
+namespace py = pybind11;
+
+namespace {
+
+using wiw::Scene;
+using wiw::ScenePtr;
+
+template <class T, int N>
+py::array_t<T> rows_to_array(const std::vector<Eigen::Matrix<T, N, 1>>& rows) {
+  py::array_t<T> array({static_cast<py::ssize_t>(rows.size()), static_cast<py::ssize_t>(N)});
+  if (!rows.empty()) std::memcpy(array.mutable_data(), rows.data(), rows.size() * sizeof(rows[0]));
+  return array;
+}
+
+py::array_t<float> box_to_array(const Eigen::AlignedBox3f& box) {
+  py::array_t<float> array({2, 3});
+  for (int axis = 0; axis < 3; ++axis) {
+    array.mutable_at(0, axis) = box.min()[axis];
+    array.mutable_at(1, axis) = box.max()[axis];
+  }
+  return array;
+}
+
+py::array_t<float> matrix_to_array(const Eigen::Matrix4f& matrix) {
+  py::array_t<float> array({4, 4});
+  for (int row = 0; row < 4; ++row) {
+    for (int column = 0; column < 4; ++column) array.mutable_at(row, column) = matrix(row, column);
+  }
+  return array;
+}
+
+py::dict instance_to_dict(const Scene& scene, const wiw::Instance& instance) {
+  std::size_t triangles = 0;
+  for (const std::uint32_t mesh : instance.meshes) triangles += scene.meshes[mesh].triangles.size();
+  py::dict result;
+  result["id"] = instance.id;
+  result["name"] = instance.name;
+  result["category"] = instance.category == wiw::kNone ? std::string() : scene.categories[instance.category];
+  result["attributes"] = instance.attributes;
+  result["T_world_instance"] = matrix_to_array(instance.T_world_instance.matrix());
+  result["bounds"] = box_to_array(wiw::instance_bounds(scene, instance));
+  result["triangle_count"] = triangles;
+  return result;
+}
+
+py::list instances_to_list(const Scene& scene) {
+  py::list result;
+  for (const wiw::Instance& instance : scene.instances) result.append(instance_to_dict(scene, instance));
+  return result;
+}
+
+py::list rooms_to_list(const Scene& scene) {
+  py::list result;
+  for (const wiw::Room& room : scene.rooms) {
+    py::dict entry;
+    entry["name"] = room.name;
+    entry["type"] = room.type;
+    entry["bounds"] = box_to_array(room.bounds);
+    result.append(entry);
+  }
+  return result;
+}
+
+py::tuple triangles_to_arrays(const Scene& scene) {
+  wiw::TriangleSoup soup;
+  {
+    const py::gil_scoped_release release;
+    soup = wiw::world_triangles(scene);
+  }
+  py::array_t<std::uint32_t> instance(static_cast<py::ssize_t>(soup.instance.size()));
+  std::ranges::copy(soup.instance, instance.mutable_data());
+  return py::make_tuple(rows_to_array(soup.vertices), rows_to_array(soup.triangles), instance);
+}
+
+wiw::Up up_from_text(const std::optional<std::string>& up) {
+  if (!up || *up == "auto") return wiw::Up::kAuto;
+  if (*up == "y") return wiw::Up::kY;
+  if (*up == "z") return wiw::Up::kZ;
+  throw wiw::ArgumentError("up must be 'auto', 'y' or 'z', got '" + *up + "'");
+}
+
+void set_limits(const py::dict& values, wiw::ImportLimits& limits) {
+  for (const auto& [key, value] : values) {
+    const auto name = key.cast<std::string>();
+    const auto figure = value.cast<std::size_t>();
+    if (name == "file_bytes")
+      limits.file_bytes = figure;
+    else if (name == "triangles")
+      limits.triangles = figure;
+    else if (name == "nodes")
+      limits.nodes = figure;
+    else if (name == "texture_pixels")
+      limits.texture_pixels = figure;
+    else if (name == "texture_bytes")
+      limits.texture_bytes = figure;
+    else
+      throw wiw::ArgumentError("'" + name +
+                               "' is no limit; expected file_bytes, triangles, nodes, texture_pixels or texture_bytes");
+  }
+}
+
+using Paths = std::vector<std::filesystem::path>;
+
+py::tuple import_scene(const std::filesystem::path& path, const std::optional<std::string>& up,
+                       const std::optional<float> ceiling, const bool smooth_normals, const py::dict& limits,
+                       const Paths& texture_folders, const Paths& model_folders) {
+  wiw::ImportTrace trace;
+  wiw::ImportOptions options;
+  options.up = up_from_text(up);
+  options.ceiling_height = ceiling;
+  options.smooth_normals = smooth_normals;
+  options.texture_folders = texture_folders;
+  options.model_folders = model_folders;
+  options.trace = &trace;
+  set_limits(limits, options.limits);
+  ScenePtr scene;
+  {
+    const py::gil_scoped_release release;
+    const std::string extension = path.extension().string();
+    const bool world = extension == ".world" || extension == ".sdf";
+    scene = world ? wiw::load_sdf_world(path, options) : wiw::load_mesh(path, options);
+  }
+  return py::make_tuple(std::const_pointer_cast<Scene>(scene), trace.read, trace.absent);
+}
+
+void bind_scene_class(py::module_& module) {
+  py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", "A scene in memory: metres, Y up, immutable.")
+      .def_static("from_arrays", &wiw::bindings::scene_from_arrays, py::arg("meshes"), py::kw_only(),
+                  py::arg("name") = "arrays", py::arg("textures") = py::list(), py::arg("materials") = py::list(),
+                  wiw::bindings::kFromArraysDoc)
+      .def_property_readonly("name", [](const Scene& scene) { return scene.name; })
+      .def_property_readonly(
+          "categories", [](const Scene& scene) { return scene.categories; }, "Unique, lower case.")
+      .def_property_readonly(
+          "attributes", [](const Scene& scene) { return scene.attributes; },
+          "Facts about the scene as text, e.g. which axis of the file was up and by which rule.")
+      .def_property_readonly(
+          "warnings", [](const Scene& scene) { return scene.warnings; },
+          "What the importer had to leave out, one sentence each.")
+      .def_property_readonly("triangle_count", &Scene::triangle_count, "Over all placements.")
+      .def_property_readonly(
+          "bounds", [](const Scene& scene) { return box_to_array(scene.bounds()); },
+          "float32 [2, 3]: least and greatest corner in the world, metres.")
+      .def_property_readonly(
+          "instances", &instances_to_list,
+          "One dict a placed object: id (what the instance image holds), name, category, attributes, "
+          "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world, triangle_count.")
+      .def_property_readonly("rooms", &rooms_to_list,
+                             "One dict a room: name, type, bounds float32 [2, 3]; empty where unknown.")
+      .def_property_readonly(
+          "mesh_count", [](const Scene& scene) { return scene.meshes.size(); }, "Meshes; placements share them.")
+      .def_property_readonly("material_count", [](const Scene& scene) { return scene.materials.size(); })
+      .def_property_readonly("texture_count", [](const Scene& scene) { return scene.textures.size(); })
+      .def_property_readonly("texture_bytes", &wiw::texture_bytes, "Decoded textures in bytes.")
+      .def_property_readonly("mesh_bytes", &wiw::mesh_bytes, "Vertex and triangle arrays in bytes.")
+      .def("__repr__", [](const Scene& scene) { return "<" + wiw::summary(scene) + ">"; })
+      .def("describe", &wiw::describe, "Several lines for a person: size, categories, memory, warnings.")
+      .def("world_triangles", &triangles_to_arrays,
+           "All placements in the world: vertices float32 [V, 3], triangles uint32 [T, 3], instance id uint32 [T].");
+}
+
+}  // namespace
+
+void bind_scene(py::module_& module) {
+  bind_scene_class(module);
+  module.def("import_scene", &import_scene, py::arg("path"), py::kw_only(), py::arg("up") = py::none(),
+             py::arg("ceiling") = py::none(), py::arg("smooth_normals") = false, py::arg("limits") = py::dict(),
+             py::arg("texture_folders") = Paths{}, py::arg("model_folders") = Paths{},
+             "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
+}

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <assimp/GltfMaterial.h>
+#include <assimp/scene.h>
+
+#include <algorithm>
+#include <cmath>
+
+#include "wiw/scene/import/assimp_scene.hpp"
+#include "wiw/scene/import/texture_source.hpp"
+
+namespace wiw {
+namespace {
+
+constexpr float kNeutral = 0.7f;  // stands in for a texture that is missing
+
+/// glTF factors are linear light; the scene multiplies display-encoded values (a pure power law).
+float encoded(float linear) { return std::pow(std::clamp(linear, 0.f, 1.f), 1.f / 2.2f); }
+
+bool is_gltf(MeshFormat format) { return format == MeshFormat::kGlb || format == MeshFormat::kGltf; }
+
+std::string texture_reference(const aiMaterial& material) {
+  aiString path;
+  for (const aiTextureType type : {aiTextureType_BASE_COLOR, aiTextureType_DIFFUSE, aiTextureType_EMISSIVE}) {
+    if (material.GetTexture(type, 0, &path) == aiReturn_SUCCESS && path.length > 0) return path.C_Str();
+  }
+  return {};
+}
+
+Eigen::Vector4f gltf_color(const aiMaterial& material) {
+  aiColor4D color(1, 1, 1, 1);
+  material.Get(AI_MATKEY_BASE_COLOR, color);
+  return {encoded(color.r), encoded(color.g), encoded(color.b), std::clamp(color.a, 0.f, 1.f)};
+}
+
+Eigen::Vector4f diffuse_color(const aiMaterial& material) {
+  aiColor4D color(kNeutral, kNeutral, kNeutral, 1);
+  material.Get(AI_MATKEY_COLOR_DIFFUSE, color);
+  return Eigen::Vector4f(color.r, color.g, color.b, 1.f).cwiseMax(0.f).cwiseMin(1.f);
+}
+
+/// Texture alpha counts only where the material says that it is transparent: many exporters leave junk in it. Blending
+/// is drawn as a cut-out at one half.
+float alpha_cutoff(const aiMaterial& material, MeshFormat format) {
+  if (is_gltf(format)) {
+    aiString mode("OPAQUE");
+    float cutoff = 0.5f;
+    material.Get(AI_MATKEY_GLTF_ALPHAMODE, mode);
+    material.Get(AI_MATKEY_GLTF_ALPHACUTOFF, cutoff);
+    if (mode == aiString("MASK")) return cutoff;
+    return mode == aiString("BLEND") ? 0.5f : -1.f;
+  }
+  float opacity = 1.f;
+  material.Get(AI_MATKEY_OPACITY, opacity);
+  const bool transparent = opacity < 1.f || material.GetTextureCount(aiTextureType_OPACITY) > 0;
+  return transparent ? 0.5f : -1.f;
+}
+
+Material convert_material(const aiMaterial& source, MeshFormat format, const TextureSource& textures) {
+  Material material;
+  aiString name;
+  if (source.Get(AI_MATKEY_NAME, name) == aiReturn_SUCCESS) material.name = name.C_Str();
+  const std::string reference = texture_reference(source);
+  material.texture = textures.find(reference);
+  if (!reference.empty() && material.texture == kNone) {
+    material.base_color = {kNeutral, kNeutral, kNeutral, 1.f};
+  } else if (is_gltf(format)) {
+    material.base_color = gltf_color(source);
+  } else if (material.texture == kNone) {
+    material.base_color = diffuse_color(source);
+  }
+  if (material.texture != kNone) material.alpha_cutoff = alpha_cutoff(source, format);
+  return material;
+}
+
+}  // namespace
+
+void convert_materials(const aiScene& file, const FileContext& context, Scene& scene) {
+  std::vector<std::string> references;
+  for (unsigned i = 0; i < file.mNumMaterials; ++i) {
+    std::string reference = texture_reference(*file.mMaterials[i]);
+    if (!reference.empty() && std::ranges::find(references, reference) == references.end()) {
+      references.push_back(std::move(reference));
+    }
+  }
+  TextureSource textures(file, context.path, context.options);
+  textures.load(references, scene);
+  for (unsigned i = 0; i < file.mNumMaterials; ++i) {
+    scene.materials.push_back(convert_material(*file.mMaterials[i], context.format, textures));
+  }
+}
+
+}  // namespace wiw

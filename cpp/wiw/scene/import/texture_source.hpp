@@ -1,0 +1,41 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <filesystem>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "wiw/scene/import.hpp"
+
+struct aiScene;
+
+namespace wiw {
+
+/// Finds and decodes the textures a mesh file refers to. A reference is tried as
+///  1. an image embedded in the file;
+///  2. a path relative to the file (backslashes, `file://` and %20 understood);
+///  3. its base name in the file's folder, `textures`, `../textures`, `materials/textures`, `../materials/textures`
+///     and the folders of ImportOptions::texture_folders.
+class TextureSource {
+ public:
+  TextureSource(const aiScene& file, std::filesystem::path path, const ImportOptions& options);
+
+  /// Decodes all references in parallel into scene.textures. A reference without a usable image adds one warning.
+  void load(const std::vector<std::string>& references, Scene& scene);
+
+  /// Index into Scene::textures; kNone if the reference could not be loaded.
+  [[nodiscard]] std::int32_t find(const std::string& reference) const;
+
+ private:
+  struct Result;
+  [[nodiscard]] Result decode(const std::string& reference) const;
+  [[nodiscard]] std::vector<std::filesystem::path> candidates(const std::string& reference) const;
+
+  const aiScene& file_;
+  std::filesystem::path path_;
+  const ImportOptions& options_;
+  std::map<std::string, std::int32_t> indices_;
+};
+
+}  // namespace wiw

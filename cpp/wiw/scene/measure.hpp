@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+
+#include "wiw/scene/scene.hpp"
+
+namespace wiw {
+
+/// Box around one placed object, in the world.
+Eigen::AlignedBox3f instance_bounds(const Scene& scene, const Instance& instance);
+
+/// Memory of the decoded textures, and of the vertex and triangle arrays.
+std::size_t texture_bytes(const Scene& scene);
+std::size_t mesh_bytes(const Scene& scene);
+
+}  // namespace wiw
