@@ -110,7 +110,7 @@ WORLD_MODELS = Registry("world model", "wiw.world_models", {
 POLICIES = Registry("policy", "wiw.policies", {
     "heuristic": "wiw.policies.heuristic:Heuristic",
     "matcher": "wiw.policies.matcher:Matcher",
-    "climber": "wiw.policies.matcher:Climber",
+    "climber": "wiw.policies.matcher.climber:Climber",
     "geometric": "wiw.policies.geometric:Geometric",
 })
 TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"})
