@@ -139,3 +139,31 @@ def list_tasks() -> list[str]:
 def list_metrics() -> list[str]:
     """Names of the task metrics."""
     return METRICS.names()
+
+
+def world_model(name: Any, **options: Any) -> Any:
+    """A world model by name, `path.py:Class`, class or instance; None for "none".
+
+    Raises:
+        RegistryError: unknown name, or options that do not fit; the message says what is known.
+    """
+    return WORLD_MODELS.make(name, **options)
+
+
+def policy(name: Any, **options: Any) -> Any:
+    """A policy by name, `path.py:Class`, class or instance.
+
+    Raises:
+        RegistryError: unknown name, or options that do not fit; the message says what is known.
+    """
+    return POLICIES.make(name, **options)
+
+
+def make(task_id: str, **options: Any) -> Any:
+    """A gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
+
+    Raises:
+        RegistryError: unknown task, or options that do not fit; the message says what is known.
+    """
+    name = task_id.removesuffix("-v0").lower()
+    return TASKS.make(name, **options).environment()

@@ -84,6 +84,8 @@ class Control:
     """int8 [K] primitive ids, padded to the model's frames - 1."""
     trajectory: NDArray[np.float64]
     """float64 [K, 3]: x forward, y left, azimuth, in the frame of frame 0."""
+    viewpoints: NDArray[np.float64]
+    """float64 [K, 4, 4]: T_start_camera after each action; start is the camera of frame 0."""
     text: str = ""
     ids: NDArray[np.generic] | None = None
     """[K] or [K + 1] ids or vectors in the model's own vocabulary, null token in front where it needs one."""

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+# make demo | test | bench | lint | wheel    each does all the set-up it needs (Debian packages, .venv, build).
+.PHONY: help setup demo test bench lint wheel sanitize clean
+.DEFAULT_GOAL := help
+BIN := .venv/bin
+TESTS := build/tests
+JOBS ?= $(shell nproc)
+
+help:       ## this list
+	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed -E 's/: .*## /\t/' | expand -t 12
+
+setup:      ## Debian packages, .venv, the package in editable mode
+	@scripts/setup
+
+demo: setup ## the main job: ImageNav on generated apartments with four world models, table and report
+	$(BIN)/wiw demo
+
+test:       ## all tests: ctest, then pytest
+	@scripts/setup test
+	$(BIN)/cmake -S . -B $(TESTS) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DWIW_BUILD_TESTS=ON -DWIW_BUILD_PYTHON=OFF >/dev/null
+	$(BIN)/cmake --build $(TESTS)
+	$(BIN)/ctest --test-dir $(TESTS) --output-on-failure
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+
+bench:      ## every speed claim, side by side with what a user would pick instead
+	@scripts/setup test
+	$(BIN)/python tests/benchmark/run_all.py
+
+lint:       ## ruff, mypy, clang-format, clang-tidy
+	@scripts/setup test lint
+	$(BIN)/pre-commit run --all-files
+
+wheel:      ## a self-contained wheel in dist/
+	@scripts/setup
+	scripts/build_wheel
+
+sanitize:   ## C++ tests under ASAN+UBSAN and under TSAN
+	@scripts/setup
+	scripts/sanitize
+
+clean:
+	rm -rf build dist

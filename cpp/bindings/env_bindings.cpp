@@ -1,0 +1,148 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/env/vector_env.hpp"
+
+#include <pybind11/eigen.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include "arrays.hpp"
+
+namespace py = pybind11;
+using namespace wiw;
+using namespace wiw::bindings;
+
+namespace {
+
+std::vector<Action> to_actions(const Array<std::int8_t>& ids) {
+  expect_shape(ids, {-1}, "actions int8 [K]");
+  std::vector<Action> actions;
+  for (py::ssize_t i = 0; i < ids.size(); ++i) actions.push_back(to_action(ids.at(i)));
+  return actions;
+}
+
+py::array_t<double> to_array(const std::vector<Pose>& poses) {
+  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{4}, py::ssize_t{4}});
+  for (std::size_t i = 0; i < poses.size(); ++i) {
+    Eigen::Map<Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(array.mutable_data() + 16 * i) = poses[i].matrix();
+  }
+  return array;
+}
+
+/// Allocates what `outputs` names, batch-major with `batch` as first axis, or without it when `batch` is 0.
+struct Images {
+  py::dict arrays;
+  ObservationTargets targets;
+
+  Images(const NavigationConfig& config, const std::vector<std::string>& outputs, py::ssize_t batch) {
+    for (const std::string& name : outputs) {
+      if (name == "panorama") {
+        targets.panorama = add<std::uint8_t>(name, batch, {config.panorama.height, config.panorama.width, 3});
+      } else if (name == "front") {
+        targets.front = add<std::uint8_t>(name, batch, {config.front.height, config.front.width, 3});
+      } else if (name == "depth") {
+        targets.depth = add<float>(name, batch, {config.panorama.height, config.panorama.width});
+      } else {
+        throw ArgumentError("observe: expected outputs among panorama, front, depth, got '" + name + "'");
+      }
+    }
+  }
+
+  template <class T>
+  T* add(const std::string& name, py::ssize_t batch, std::vector<py::ssize_t> shape) {
+    if (batch > 0) shape.insert(shape.begin(), batch);
+    py::array_t<T> array(shape);
+    arrays[py::str(name)] = array;
+    return array.mutable_data();
+  }
+};
+
+}  // namespace
+
+void bind_env(py::module_& module) {
+  py::enum_<Motion>(module, "Motion").value("refuse", Motion::kRefuse).value("slide", Motion::kSlide);
+
+  py::class_<NavigationConfig>(module, "NavigationConfig")
+      .def(py::init([](double forward_m, double turn_deg, Motion motion, double camera_height,
+                       std::pair<int, int> panorama, std::pair<int, int> front, double front_hfov_deg) {
+             NavigationConfig config;
+             config.actions = {.forward_m = forward_m, .turn_rad = radians(turn_deg)};
+             config.motion = motion;
+             config.camera_height = camera_height;
+             config.panorama = {panorama.first, panorama.second};
+             config.front = {front.first, front.second};
+             config.front_hfov = radians(front_hfov_deg);
+             return config;
+           }),
+           py::arg("forward_m") = 0.2, py::arg("turn_deg") = 22.5, py::arg("motion") = Motion::kRefuse,
+           py::arg("camera_height") = 1.0, py::arg("panorama") = std::pair(576, 1024),
+           py::arg("front") = std::pair(480, 480), py::arg("front_hfov_deg") = 90.0);
+
+  py::class_<NavigationEnv>(module, "NavigationEnv")
+      .def(py::init([](std::shared_ptr<Renderer> renderer, std::shared_ptr<nav::NavMesh> navmesh,
+                       const NavigationConfig& config) {
+             return NavigationEnv({std::move(renderer), std::move(navmesh)}, config);
+           }),
+           py::arg("renderer"), py::arg("navmesh"), py::arg("config") = NavigationConfig{})
+      .def("reset", &NavigationEnv::reset, py::arg("position"), py::arg("yaw"), py::arg("tolerance") = 0.3,
+           "Puts the agent on the mesh at `position` (metres), heading `yaw` (radians, left positive).")
+      .def(
+          "step", [](NavigationEnv& env, int action) { return env.step(to_action(action)); }, py::arg("action"),
+          "Carries out one primitive; True if the pose changed.")
+      .def_property_readonly("position", &NavigationEnv::position, "float64 [3] world metres, on the floor.")
+      .def_property_readonly("yaw", &NavigationEnv::yaw, "Heading in radians, left positive.")
+      .def_property_readonly("odometry", &NavigationEnv::odometry,
+                             "float64 [3]: x forward, y left, azimuth, in the frame of the reset.")
+      .def_property_readonly("T_world_camera",
+                             [](const NavigationEnv& env) { return Eigen::Matrix4d(env.T_world_camera().matrix()); })
+      .def_property_readonly("renderer", [](const NavigationEnv& env) { return env.world().renderer; })
+      .def("fork", [](const NavigationEnv& env) { return NavigationEnv(env); },
+           "A copy that moves on its own in the same world.")
+      .def(
+          "camera_poses_after",
+          [](const NavigationEnv& env, const Array<std::int8_t>& actions) {
+            return to_array(env.camera_poses_after(to_actions(actions)));
+          },
+          py::arg("actions"), "float64 [K, 4, 4]: camera poses after each of int8 [K] primitives; nothing moves.")
+      .def(
+          "observe",
+          [](const NavigationEnv& env, const std::vector<std::string>& outputs) {
+            Images images(env.config(), outputs, 0);
+            {
+              const py::gil_scoped_release release;
+              env.observe(images.targets);
+            }
+            return images.arrays;
+          },
+          py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
+          "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the ray).");
+
+  py::class_<VectorEnv>(module, "VectorEnv")
+      .def(py::init<std::vector<NavigationEnv>>(), py::arg("envs"))
+      .def("__len__", &VectorEnv::size)
+      .def("__getitem__", &VectorEnv::env, py::return_value_policy::reference_internal)
+      .def(
+          "step",
+          [](VectorEnv& envs, const Array<std::int8_t>& ids) {
+            const std::vector<Action> actions = to_actions(ids);
+            py::array_t<bool> moved(static_cast<py::ssize_t>(envs.size()));
+            const std::span<bool> view(moved.mutable_data(), envs.size());
+            {
+              const py::gil_scoped_release release;
+              envs.step(actions, view);
+            }
+            return moved;
+          },
+          py::arg("actions"), "int8 [N] primitives, one each; bool [N]: whose pose changed.")
+      .def(
+          "observe",
+          [](VectorEnv& envs, const std::vector<std::string>& outputs) {
+            Images images(envs.env(0).config(), outputs, static_cast<py::ssize_t>(envs.size()));
+            {
+              const py::gil_scoped_release release;
+              envs.observe(images.targets);
+            }
+            return images.arrays;
+          },
+          py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
+          "As NavigationEnv.observe, with [N] in front.");
+}

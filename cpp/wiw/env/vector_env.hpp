@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+#include <vector>
+
+#include "wiw/env/navigation_env.hpp"
+
+namespace wiw {
+
+/// Several environments stepped and observed together. They may be in different scenes; those of one scene share its
+/// renderer and navigation mesh.
+class VectorEnv {
+ public:
+  /// All must have the same observation sizes. Throws ArgumentError otherwise.
+  explicit VectorEnv(std::vector<NavigationEnv> envs);
+
+  [[nodiscard]] std::size_t size() const { return envs_.size(); }
+  NavigationEnv& env(std::size_t i) { return envs_.at(i); }
+
+  /// One primitive each; moved[i] tells whether environment i changed its pose.
+  void step(std::span<const Action> actions, std::span<bool> moved);
+
+  /// Writes batch-major observations: members of `targets` are [N, ...].
+  void observe(const ObservationTargets& targets) const;
+
+ private:
+  std::vector<NavigationEnv> envs_;
+};
+
+}  // namespace wiw

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Episode files: JSON, one object an episode, with the goal's full pose so that goal images can be made again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import FileError
+from wiw.types import Episode
+
+VERSION = 1
+
+
+def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
+    """Writes an episode file; `about` (generator, seed, ...) goes into its header."""
+    body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": [asdict(e) for e in episodes]}
+    Path(path).write_text(json.dumps(body, indent=1), encoding="utf-8")
+
+
+def load(path: str | Path) -> list[Episode]:
+    """Reads an episode file written by `save`.
+
+    Raises:
+        FileError: missing, not JSON, of another format or version, or an episode lacks a field; names the file.
+    """
+    body = read_json(path)
+    if not isinstance(body, Mapping) or body.get("format") != "wiw-episodes":
+        raise FileError(f"{path}: expected an episode file of wiw ('format': 'wiw-episodes')")
+    if body.get("version") != VERSION:
+        raise FileError(f"{path}: version {body.get('version')}, this release reads version {VERSION}")
+    return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(body.get("episodes", []))]
+
+
+def read_json(path: str | Path) -> Any:
+    """The parsed file, gunzipped when its name ends in .gz.
+
+    Raises:
+        FileError: it cannot be read or parsed; names file and cause.
+    """
+    import gzip
+
+    try:
+        raw = Path(path).read_bytes()
+        return json.loads(gzip.decompress(raw) if str(path).endswith(".gz") else raw)
+    except (OSError, EOFError, ValueError) as error:
+        raise FileError(f"{path}: {error}") from error
+
+
+def _episode(item: Any, where: str) -> Episode:
+    names = [f.name for f in fields(Episode)]
+    missing = [name for name in names if name != "info" and (not isinstance(item, Mapping) or name not in item)]
+    if missing:
+        raise FileError(f"{where} lacks {', '.join(missing)}")
+    values = {name: item[name] for name in names if name in item}
+    for name in ("start_position", "goal_position"):
+        point = values[name]
+        if not isinstance(point, Sequence) or len(point) != 3:
+            raise FileError(f"{where}: {name} must be [x, y, z] in metres, got {point!r}")
+        values[name] = tuple(float(x) for x in point)
+    return Episode(**values)

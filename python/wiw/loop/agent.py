@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop's inside: propose, imagine, revise (paper, section "Unified Strategy for Closed-Loop Online Planning")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wiw.errors import ArgumentError
+from wiw.loop.clock import Clock
+from wiw.loop.imagine import Imagination, imagine
+from wiw.policies.base import Policy, Situation
+from wiw.registry import POLICIES, WORLD_MODELS
+from wiw.types import Decision, Goal, Key, Observation
+from wiw.world_models.base import WorldModel
+
+
+@dataclass(frozen=True)
+class Query:
+    """One live episode that asks for a decision."""
+
+    observation: Observation
+    goal: Goal
+    key: Key
+    simulator: Any = None
+    """Fork of the environment; only looked at when the world model declares that it needs one."""
+
+
+class Agent:
+    """A policy with or without a world model.
+
+    Args:
+        policy: base and proposal policy (name or instance).
+        model: world model (name or instance); None runs the same loop with imagination left out.
+        revision: policy that scores imagined futures; None means the policy itself, or its default reviser.
+        candidates: plans per decision (M); None means the task's default, 3.
+        horizon: primitives per plan (L); None means the task's default, 5.
+        execute: primitives carried out before the next decision; None means L - 2, as in the paper's ImageNav.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        model: Any = None,
+        revision: Any = None,
+        candidates: int | None = None,
+        horizon: int | None = None,
+        execute: int | None = None,
+    ) -> None:
+        self.policy: Policy = POLICIES.make(policy)
+        self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model)
+        self.revision: Policy = self._reviser(revision)
+        self.candidates = 3 if candidates is None else candidates
+        self.horizon = 5 if horizon is None else horizon
+        self.execute = max(1, self.horizon - 2) if execute is None else execute
+        if self.candidates < 1 or self.horizon < 1 or not 1 <= self.execute <= self.horizon:
+            raise ArgumentError(f"Agent: expected candidates >= 1 and 1 <= execute <= horizon, got candidates="
+                                f"{self.candidates}, horizon={self.horizon}, execute={self.execute}")
+        self._memories: dict[tuple[int, int], tuple[Any, Any]] = {}
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What observations must carry beyond images: "depth", "simulator"."""
+        model = () if self.model is None else self.model.accepts.needs
+        return tuple(sorted({*self.policy.needs, *self.revision.needs, *model}))
+
+    def decide(self, observation: Any, goal: Goal, key: Key, simulator: Any = None) -> Decision:
+        """One decision for one episode; `observation` is an Observation or the environment's dict."""
+        if isinstance(observation, dict):
+            observation = Observation(**observation)
+        return self.decide_batch([Query(observation, goal, key, simulator)])[0]
+
+    def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
+        """One decision for each live episode; the world model and the reviser see all candidates of all of them at once."""
+        clock = Clock()
+        proposing, revising = self._situations(queries)
+        with clock("propose"):
+            self.policy.observe(proposing)
+            if self.revision is not self.policy:
+                self.revision.observe(revising)
+            proposals = self.policy.propose(proposing, self.candidates, self.horizon)
+        if self.model is None:
+            rollouts, calls = [None] * len(queries), {}
+            scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
+        else:
+            imagined: Imagination = imagine(self.model, queries, proposals, self.revision.frames, clock)
+            rollouts, calls = imagined.rollouts, imagined.calls
+            with clock("revise"):
+                scores = self.revision.score(revising, proposals, imagined.rollouts)
+        seconds = clock.share(len(queries))
+        return [
+            self._decision(query, situation, plans, rollout, score, seconds, calls)
+            for query, situation, plans, rollout, score in zip(queries, revising, proposals, rollouts, scores, strict=True)
+        ]
+
+    def forget(self, key: Key) -> None:
+        """Drops the memory of an episode that has ended."""
+        self._memories.pop((key.seed, key.episode), None)
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity for the run's manifest."""
+        model = None if self.model is None else {"name": type(self.model).__name__, **vars(self.model)}
+        return {
+            "policy": self.policy.describe(),
+            "revision": self.revision.describe(),
+            "model": model,
+            "candidates": self.candidates,
+            "horizon": self.horizon,
+            "execute": self.execute,
+        }
+
+    def _reviser(self, revision: Any) -> Policy:
+        if revision is not None:
+            return POLICIES.make(revision)
+        if self.policy.can_revise or self.model is None:
+            return self.policy
+        if self.policy.default_revision is None:
+            raise ArgumentError(f"Agent: policy {type(self.policy).__name__} only proposes; give `revision=` a policy that scores")
+        return POLICIES.make(self.policy.default_revision)
+
+    def _situations(self, queries: Sequence[Query]) -> tuple[list[Situation], list[Situation]]:
+        """Each episode as its proposer and as its reviser know it; the same object where one policy is both."""
+        proposing, revising = [], []
+        for query in queries:
+            name = (query.key.seed, query.key.episode)
+            if query.key.decision == 0 or name not in self._memories:
+                memory = self.policy.begin(query.goal, query.key)
+                same = self.revision is self.policy
+                self._memories[name] = (memory, memory if same else self.revision.begin(query.goal, query.key))
+            own, other = self._memories[name]
+            proposing.append(Situation(query.observation, query.goal, query.key, own))
+            revising.append(Situation(query.observation, query.goal, query.key, other))
+        return proposing, revising
+
+    def _decision(self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any) -> Decision:
+        actions, chosen = self.revision.revise(situation, proposals, scores)
+        return Decision(
+            actions=actions,
+            execute=min(self.execute, len(actions)),
+            proposals=tuple(proposals),
+            rollouts=None if rollouts is None else tuple(rollouts),
+            scores=np.asarray(scores, np.float64),
+            chosen=chosen,
+            observation=query.observation,
+            goal=query.goal,
+            key=query.key,
+            seconds=seconds,
+            calls=calls,
+        )

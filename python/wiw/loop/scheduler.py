@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The closed loop's outside: keeps many episodes live so that every model call carries a whole batch."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from wiw.errors import ContractError
+from wiw.loop.agent import Agent, Query
+from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
+
+
+class Sink(Protocol):
+    """Receives what happens, in any order over episodes and in order within one."""
+
+    def decision(self, record: DecisionRecord) -> None:
+        """One decision was taken and carried out."""
+
+    def episode(self, result: EpisodeResult) -> None:
+        """One episode has ended, or its infrastructure has failed."""
+
+
+@dataclass
+class Trial:
+    """One live episode."""
+
+    index: int
+    episode: Episode
+    env: Any
+    key: Key
+    observation: Any
+    begin: float
+    decisions: int = 0
+    done: bool = field(default=False)
+
+    def query(self, agent: Agent) -> Query:
+        """What the agent is asked; a fork of the simulator goes along only where the world model declares its need."""
+        simulator = self.env.fork() if "simulator" in agent.needs else None
+        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator)
+
+    def carry_out(self, decision: Decision) -> DecisionRecord:
+        """Executes the decision's first segment and observes."""
+        before = self.env.truth()
+        outcome = self.env.run(decision.actions[: decision.execute])
+        record = DecisionRecord(self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path)
+        self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
+        self.decisions += 1
+        return record
+
+
+def run_episodes(
+    task: Any, agent: Agent, episodes: Sequence[tuple[int, Episode]], *, seed: int, live: int = 4, sink: Sink
+) -> None:
+    """Runs (index, episode) pairs to their ends, at most `live` at a time.
+
+    An exception in an episode or a batch is infrastructure: the episodes it hits are reported as failed and the rest go
+    on. A broken contract would hit every episode alike, so it is raised.
+    """
+    waiting, trials = deque(episodes), list[Trial]()
+    envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
+    try:
+        while waiting or trials:
+            while waiting and envs:
+                _start(waiting.popleft(), envs, trials, seed, sink)
+            _advance(agent, trials, sink)
+            for trial in [trial for trial in trials if trial.done]:
+                trials.remove(trial)
+                envs.append(trial.env)
+                agent.forget(trial.key)
+    finally:
+        for env in [*envs, *(trial.env for trial in trials)]:
+            env.close()
+
+
+def _start(item: tuple[int, Episode], envs: list[Any], trials: list[Trial], seed: int, sink: Sink) -> None:
+    index, episode = item
+    begin = time.perf_counter()
+    env = envs.pop()
+    try:
+        observation = env.begin(episode)
+    except Exception as error:  # whatever went wrong, the run goes on and the record says so
+        envs.append(env)
+        sink.episode(_failed(index, episode, begin, error))
+        return
+    trials.append(Trial(index, episode, env, Key(seed, index), observation, begin))
+
+
+def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> None:
+    """One decision for every live episode."""
+    if not trials:
+        return
+    try:
+        decisions = agent.decide_batch([trial.query(agent) for trial in trials])
+    except ContractError:
+        raise
+    except Exception as error:
+        for trial in trials:
+            trial.done = True
+            sink.episode(_failed(trial.index, trial.episode, trial.begin, error))
+        return
+    for trial, decision in zip(trials, decisions, strict=True):
+        try:
+            sink.decision(trial.carry_out(decision))
+            if trial.done:
+                sink.episode(_finished(trial))
+        except Exception as error:
+            trial.done = True
+            sink.episode(_failed(trial.index, trial.episode, trial.begin, error))
+
+
+def _finished(trial: Trial) -> EpisodeResult:
+    metrics = {**trial.env.result(), "decisions": float(trial.decisions)}
+    seconds = time.perf_counter() - trial.begin
+    return EpisodeResult(trial.index, trial.episode.episode_id, trial.episode.scene, "done", metrics, seconds)
+
+
+def _failed(index: int, episode: Episode, begin: float, error: Exception) -> EpisodeResult:
+    text = "".join(traceback.format_exception(error))
+    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, time.perf_counter() - begin, text)
+

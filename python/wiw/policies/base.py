@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a policy is: it proposes plans, scores imagined futures, and turns scores into a decision."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.types import Goal, Key, Observation, Proposal, Rollout
+
+
+@dataclass(frozen=True)
+class FrameSpec:
+    """How a policy wants imagined frames shown: the paper's 384x384 views, or the whole panorama at a size of its own.
+
+    A perspective world model can only give its front view, whatever is asked for.
+    """
+
+    view: str = "front"
+    """"front" (HFOV 90), "surround" (front, left, right, back) or "panorama"."""
+    size: tuple[int, int] = (384, 384)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """One live episode at the moment of a decision, as a policy may know it."""
+
+    observation: Observation
+    goal: Goal
+    key: Key
+    memory: Any
+    """What `Policy.begin` returned for this episode; the policy may change it."""
+
+
+class Policy(ABC):
+    """Base, proposal and revision policy in one (paper, appendix "Policies in Embodied Tasks").
+
+    All calls are batched over the live episodes. Randomness must be drawn from `situation.key` alone.
+    """
+
+    needs: tuple[str, ...] = ()
+    """"depth" where observations must carry it."""
+    frames: FrameSpec = FrameSpec()
+    default_revision: str | None = None
+    """Name of the reviser that stands in where this policy only proposes."""
+
+    def begin(self, goal: Goal, key: Key) -> Any:
+        """Memory for a new episode; None for a policy that keeps none."""
+        return None
+
+    def observe(self, situations: Sequence[Situation]) -> None:
+        """Called once a decision, before `propose`, also on a policy that only revises."""
+
+    @abstractmethod
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """At most `candidates` plans of at most `horizon` primitives for each episode, best first."""
+        raise NotImplementedError
+
+    def score(
+        self, situations: Sequence[Situation], proposals: Sequence[Sequence[Proposal]], rollouts: Sequence[Sequence[Rollout]]
+    ) -> list[NDArray[np.float64]]:
+        """One score a candidate for each episode, higher is better. One call for all live episodes."""
+        raise NotImplementedError(f"{type(self).__name__} only proposes; give the agent a revision policy")
+
+    def revise(self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]) -> tuple[NDArray[np.int8], int | None]:
+        """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
+        best = int(np.argmax(scores))
+        return proposals[best].actions, best
+
+    @property
+    def can_revise(self) -> bool:
+        """Whether this policy scores imagined futures itself."""
+        return type(self).score is not Policy.score
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity for the run's manifest."""
+        return {"policy": type(self).__name__}

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's rule-based policy: random primitives under two rules that avoid dithering."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from wiw._core import core
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.policies.base import Policy, Situation
+from wiw.types import Goal, Key, Proposal
+
+INVERSE = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
+
+
+class Heuristic(Policy):
+    """Samples primitives that never undo the previous one and never turn the same way more than four times running.
+
+    Source: paper, appendix "Policies in Embodied Tasks". It proposes only; `matcher` is its default reviser.
+    """
+
+    default_revision = "matcher"
+
+    def __init__(self, max_turns: int = 4) -> None:
+        self.max_turns = max_turns
+
+    def begin(self, goal: Goal, key: Key) -> list[int]:
+        """The primitives of the last plan proposed first, newest last: the rules look back over decisions."""
+        return []
+
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Independent draws, keyed by (seed, episode, decision, candidate); the first is what the base policy does."""
+        return [[self._plan(situation, candidate, horizon) for candidate in range(candidates)] for situation in situations]
+
+    def _plan(self, situation: Situation, candidate: int, horizon: int) -> Proposal:
+        key = situation.key
+        draws = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), horizon)
+        plan: list[int] = []
+        for draw in draws:
+            allowed = self.allowed(plan)
+            plan.append(allowed[int(draw * len(allowed))])
+        return Proposal(np.array(plan, np.int8))
+
+    def allowed(self, history: Sequence[int]) -> list[int]:
+        """Primitives that may follow `history`."""
+        last = history[-1] if history else None
+        turns = 0
+        while turns < len(history) and last in INVERSE and history[-1 - turns] == last:
+            turns += 1
+        return [
+            action
+            for action in (FORWARD, TURN_LEFT, TURN_RIGHT)
+            if action != INVERSE.get(last) and not (action == last and turns >= self.max_turns)  # type: ignore[arg-type]
+        ]

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A policy without a VLM: runs straight ahead in diverse headings, judged by colour, edges and a map of the unexplored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw import panorama
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.policies.base import FrameSpec, Policy, Situation
+from wiw.policies.matcher import appearance
+from wiw.policies.matcher.exploration import ExplorationMap
+from wiw.types import Goal, Key, Proposal, Rollout
+
+HEADINGS = 16
+TURN = 2 * np.pi / HEADINGS
+STEP = 0.2
+
+
+@dataclass(frozen=True)
+class MatcherOptions:
+    """Weights, tuned on apartments of the train and val splits."""
+
+    histogram: float = 2.0
+    """Of the overlap between the goal's colours and those seen in a heading."""
+    frontier: float = 0.3
+    """Per metre gained towards the nearest frontier."""
+    novelty: float = 0.3
+    """Per metre (at most one) from where the agent has been."""
+    turn: float = 0.04
+    """Cost of one turn."""
+    imagined: float = 1.0
+    """Of the best imagined similarity less the present one."""
+    near: float = 4.0
+    """How much more it weighs when the goal is near."""
+    calm: float = 0.8
+    """Share of the exploration terms that fades when the goal is near."""
+    gate: float = 2.9
+    """Similarity at which the goal counts as near with probability one half."""
+    gate_width: float = 0.12
+    spread: int = 3
+    """Least difference between headings of imagined plans, in turns, when the goal is near."""
+    reach: float = 1.0
+    """Metres ahead at which a heading is judged."""
+
+
+@dataclass
+class Memory:
+    """What the matcher knows of one episode."""
+
+    goal: appearance.GoalTemplate
+    map: ExplorationMap = field(default_factory=ExplorationMap)
+    similarity: float = 0.0
+    """Of the present place, best over headings."""
+    gate: float = 0.0
+    heading_histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
+    places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
+    """Odometry and similarity of every place the agent has really seen."""
+
+
+class Matcher(Policy):
+    """Explores where nothing matches, climbs the similarity to the goal image where something does.
+
+    Without a world model it takes the best of all 16 headings by what it really sees; with one, the best plans are
+    imagined and the similarity of the imagined places decides between them.
+    """
+
+    needs = ("depth",)
+    frames = FrameSpec("panorama", appearance.PANORAMA)
+
+    def __init__(self, **options: Any) -> None:
+        self.options = MatcherOptions(**options)
+
+    def describe(self) -> dict[str, Any]:
+        """Name and weights."""
+        return {"policy": type(self).__name__, **asdict(self.options)}
+
+    def begin(self, goal: Goal, key: Key) -> Memory:
+        """Features of the goal image and an empty map."""
+        assert goal.image is not None
+        return Memory(appearance.goal_template(goal.image))
+
+    def observe(self, situations: Sequence[Situation]) -> None:
+        """Extends each map and measures how much the present place looks like the goal's."""
+        small = panorama.resize(np.stack([s.observation.panorama for s in situations]), appearance.PANORAMA)
+        bands = appearance.describe(small)
+        for i, situation in enumerate(situations):
+            memory: Memory = situation.memory
+            band = appearance.Band(bands.colors[i : i + 1], bands.edges[i : i + 1], bands.histograms[i : i + 1])
+            memory.similarity = float(appearance.similarity(band, memory.goal).max())
+            memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
+            memory.heading_histogram = headings(appearance.histogram_similarity(band, memory.goal)[0])
+            observation = situation.observation
+            assert observation.depth is not None
+            memory.map.update(observation.depth[4::8, 4::8], observation.odometry)
+            memory.places.append((observation.odometry, memory.similarity))
+
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """The best headings by what is really seen, as straight runs; spread out once the goal is near."""
+        return [self._propose(situation, candidates, horizon) for situation in situations]
+
+    def score(
+        self, situations: Sequence[Situation], proposals: Sequence[Sequence[Proposal]], rollouts: Sequence[Sequence[Rollout]]
+    ) -> list[NDArray[np.float64]]:
+        """Prior plus the gain in similarity that the imagined places promise."""
+        options = self.options
+        scores = []
+        for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
+            memory: Memory = situation.memory
+            gains = [imagined_similarity(memory.goal, future) - memory.similarity for future in futures]
+            weight = options.imagined * (1 + options.near * memory.gate)
+            scores.append(np.array([plan.prior + weight * gain for plan, gain in zip(plans, gains, strict=True)]))
+        return scores
+
+    def _propose(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
+        memory: Memory = situation.memory
+        priors, runs = self._judge_headings(memory, situation.observation.odometry)
+        order = [int(k) for k in np.argsort(-priors, kind="stable")]
+        chosen: list[int] = []
+        apart = self.options.spread if memory.gate > 0.5 else 1
+        for k in order:
+            if len(chosen) < candidates and all(circular_distance(k, other) >= apart for other in chosen):
+                chosen.append(k)
+        chosen += [k for k in order if k not in chosen][: candidates - len(chosen)]
+        return [Proposal(straight_run(k, horizon, int(runs[k] / STEP)), prior=float(priors[k])) for k in chosen]
+
+    def _judge_headings(self, memory: Memory, odometry: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Prior of each heading and the metres that are free ahead; heading k is k left turns away."""
+        options = self.options
+        distance = memory.map.frontier_distance()
+        runs, ends = memory.map.look_ahead(odometry, HEADINGS, options.reach)
+        progress = np.clip(memory.map.at(distance, odometry[None, :2])[0] - memory.map.at(distance, ends), -1.5, 1.5)
+        novelty = np.minimum(memory.map.distance_to_trail(ends), 1.0)
+        turns = np.array([circular_distance(k, 0) for k in range(HEADINGS)])
+        calm = 1 - options.calm * memory.gate
+        prior = (
+            options.histogram * memory.heading_histogram
+            + calm * (options.frontier * progress + options.novelty * novelty)
+            - options.turn * turns
+        )
+        return prior - 2.0 * (runs < STEP), runs
+
+
+def headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[16] values at the headings k = 0, 1, ... left turns from a [128] row over panorama columns."""
+    width = len(columns)
+    centres = (width // 2 - np.arange(HEADINGS) * width // HEADINGS) % width
+    return columns[centres]
+
+
+def circular_distance(a: int, b: int) -> int:
+    """Turns between two headings."""
+    difference = abs(a - b) % HEADINGS
+    return min(difference, HEADINGS - difference)
+
+
+def straight_run(heading: int, horizon: int, free_steps: int) -> NDArray[np.int8]:
+    """Turns towards `heading` (left turns, 0..15), then forward; at least one primitive, at most `horizon`."""
+    turns = heading if heading <= HEADINGS // 2 else heading - HEADINGS
+    plan = [TURN_LEFT if turns > 0 else TURN_RIGHT] * abs(turns) + [FORWARD] * max(free_steps, 1)
+    return np.array(plan[:horizon], np.int8)
+
+
+def imagined_similarity(goal: appearance.GoalTemplate, rollout: Rollout) -> float:
+    """The best similarity that the plan's places reach; frames of turning on the spot show no new place."""
+    places = rollout.frames[~rollout.real]
+    if len(places) == 0:
+        places = rollout.frames[-1:]
+    return float(appearance.similarity(appearance.describe(places), goal).max())

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How much a place looks like the place of the goal image: colour histograms and normalised correlation over all headings.
+
+A panorama is reduced to a band of 32 x 128 pixels, latitudes within 45 degrees, 2.8 degrees a column; the goal's
+90-degree view covers 32 of those columns. The similarity of a place is the best over all 128 headings, so that turning
+on the spot gains nothing: what counts is where one stands.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+PANORAMA = (64, 128)
+ROWS = slice(16, 48)
+COLUMNS = 128
+WINDOW = 32
+BINS = (4, 8, 8)
+"""Of L, a, b."""
+HISTOGRAM_WEIGHT = 2.0
+
+
+@dataclass(frozen=True)
+class Band:
+    """Features of N places: `maps` float32 [N, G, C, 32, W] (G groups of C channels), `histograms` [N, W, bins]."""
+
+    colors: NDArray[np.float32]
+    edges: NDArray[np.float32]
+    histograms: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class GoalTemplate:
+    """The goal's features, zero-mean and unit-norm within `mask`, as spectra over columns."""
+
+    colors: NDArray[np.float32]
+    edges: NDArray[np.float32]
+    histogram: NDArray[np.float32]
+    mask: NDArray[np.float32]
+
+
+def goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
+    """Features of a goal view uint8 [S, S, 3] with HFOV 90."""
+    band, mask = project_front(image)
+    features = describe(band[None])
+    window = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
+    weights = mask[:, window].astype(np.float32)
+    histogram = np.zeros(int(np.prod(BINS)), np.float32)
+    np.add.at(histogram, _bins(_lab(band))[:, window][weights > 0], 1.0)
+    return GoalTemplate(
+        colors=_normalised(features.colors[0][..., window], weights),
+        edges=_normalised(features.edges[0][..., window], weights),
+        histogram=histogram / histogram.sum(),
+        mask=weights,
+    )
+
+
+def describe(panoramas: NDArray[np.uint8]) -> Band:
+    """Features of panoramas uint8 [N, 64, 128, 3]."""
+    bands = panoramas[:, ROWS]
+    labs = [_lab(band) for band in bands]
+    return Band(
+        colors=np.stack([_color_map(lab) for lab in labs]),
+        edges=np.stack([_edge_map(lab) for lab in labs]),
+        histograms=np.stack([_column_histograms(lab) for lab in labs]),
+    )
+
+
+def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
+    """float32 [N, 128]: 2 x histogram overlap + colour correlation + edge correlation, for each heading column.
+
+    Column c is the centre of the compared window; the highest possible value is 4.
+    """
+    score = HISTOGRAM_WEIGHT * histogram_similarity(places, goal)
+    score += _correlation(places.colors, goal.colors, goal.mask)
+    score += _correlation(places.edges, goal.edges, goal.mask)
+    return score
+
+
+def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
+    """float32 [N, 128]: Bhattacharyya coefficient of the goal's and each window's Lab histogram."""
+    wrapped = np.concatenate([places.histograms[:, -WINDOW // 2 :], places.histograms, places.histograms[:, : WINDOW // 2]], 1)
+    sums = np.cumsum(np.pad(wrapped, ((0, 0), (1, 0), (0, 0))), axis=1)
+    windows = sums[:, WINDOW:] - sums[:, :-WINDOW]
+    windows = windows[:, :COLUMNS] / np.maximum(windows[:, :COLUMNS].sum(2, keepdims=True), 1e-9)
+    return np.sqrt(np.maximum(windows, 0)) @ np.sqrt(goal.histogram)
+
+
+def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """A 90-degree view uint8 [S, S, 3] drawn into an empty panorama uint8 [64, 128, 3], and the band's mask [32, 128]."""
+    u, v, inside = _front_map()
+    size = image.shape[0]
+    small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA) if size != 64 else image
+    drawn = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    drawn[~inside] = 0
+    return drawn, inside[ROWS]
+
+
+@cache
+def _front_map() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Where each panorama pixel looks up a 64 x 64 view of 90 degrees, and whether it is inside."""
+    height, width = PANORAMA
+    longitude = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    latitude = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    longitude, latitude = np.meshgrid(longitude, latitude)
+    ahead = np.cos(longitude) * np.cos(latitude)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = np.tan(longitude), np.sin(latitude) / ahead
+    inside = (ahead > 0) & (np.abs(x) <= 1) & (np.abs(y) <= 1)
+    u, v = (np.clip(x, -1, 1) + 1) * 32 - 0.5, (1 - np.clip(y, -1, 1)) * 32 - 0.5
+    return u.astype(np.float32), v.astype(np.float32), inside
+
+
+def _lab(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """float32 [H, W, 3]: L 0..100, a and b about -100..100."""
+    return cv2.cvtColor(image.astype(np.float32) / 255, cv2.COLOR_RGB2Lab)  # type: ignore[return-value]
+
+
+def _color_map(lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[3, 32, W]: Lab, blurred so that a place a step away still correlates."""
+    return _blur(lab, 2.0).transpose(2, 0, 1)
+
+
+def _edge_map(lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[4, 32, W]: strength of lightness edges in four orientations, blurred."""
+    light = cv2.copyMakeBorder(lab[..., 0], 1, 1, 1, 1, cv2.BORDER_WRAP)
+    dx, dy = cv2.Sobel(light, cv2.CV_32F, 1, 0)[1:-1, 1:-1], cv2.Sobel(light, cv2.CV_32F, 0, 1)[1:-1, 1:-1]
+    dy[[0, -1]] = 0  # the wrap that is right for columns is wrong for rows
+    angle = np.remainder(np.arctan2(dy, dx), np.pi)
+    strength = np.sqrt(np.hypot(dx, dy))
+    centres = np.arange(4) * np.pi / 4
+    share = np.maximum(np.cos(2 * (angle[..., None] - centres)), 0) ** 2
+    return _blur(strength[..., None] * share, 1.0).transpose(2, 0, 1)
+
+
+def _blur(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    margin = int(3 * sigma) + 1
+    wide = cv2.copyMakeBorder(image, 0, 0, margin, margin, cv2.BORDER_WRAP)
+    return cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[:, margin:-margin]
+
+
+def _bins(lab: NDArray[np.float32]) -> NDArray[np.intp]:
+    """[H, W]: index of each pixel's Lab bin; chroma within 48 covers what rooms show."""
+    scaled = np.stack([lab[..., 0] / 100, lab[..., 1] / 96 + 0.5, lab[..., 2] / 96 + 0.5], -1)
+    cells = np.clip((scaled * BINS).astype(np.intp), 0, np.array(BINS) - 1)
+    return np.ravel_multi_index(tuple(np.moveaxis(cells, -1, 0)), BINS)
+
+
+def _column_histograms(lab: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[W, bins]: how many pixels of each column fall into each bin."""
+    bins = _bins(lab)
+    count = int(np.prod(BINS))
+    flat = bins + count * np.arange(bins.shape[1])
+    return np.bincount(flat.ravel(), minlength=count * bins.shape[1]).reshape(-1, count).astype(np.float32)
+
+
+def _normalised(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Zero mean within the mask per channel, unit norm over all channels."""
+    centred = (values - (values * mask).sum((-2, -1), keepdims=True) / mask.sum()) * mask
+    return (centred / max(float(np.linalg.norm(centred)), 1e-6)).astype(np.float32)
+
+
+def _correlation(places: NDArray[np.float32], goal: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    """[N, 128]: normalised correlation of the goal with the window centred at each column, by FFT over columns.
+
+    With w the goal's mask of n pixels and f a channel: sum (f - mean) g = sum f g because g has zero mean, and the
+    window's energy is sum over channels of sum w f^2 - (sum w f)^2 / n.
+    """
+    spectrum = np.fft.rfft(places, axis=-1)
+    spectrum_squared = np.fft.rfft((places**2).sum(1), axis=-1)
+    pad = COLUMNS - WINDOW
+    goal_spectrum = np.conj(np.fft.rfft(np.pad(goal, ((0, 0), (0, 0), (0, pad))), axis=-1))
+    mask_spectrum = np.conj(np.fft.rfft(np.pad(mask, ((0, 0), (0, pad))), axis=-1))
+    dot = np.fft.irfft((spectrum * goal_spectrum).sum((1, 2)), COLUMNS, axis=-1)
+    sums = np.fft.irfft((spectrum * mask_spectrum).sum(2), COLUMNS, axis=-1)
+    squares = np.fft.irfft((spectrum_squared * mask_spectrum).sum(1), COLUMNS, axis=-1)
+    energy = np.maximum(squares - (sums**2).sum(1) / mask.sum(), 1e-6)
+    return np.roll(dot / np.sqrt(energy), WINDOW // 2, axis=-1).astype(np.float32)

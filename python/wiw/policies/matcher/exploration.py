@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map of what has been seen, built from panorama depth and odometry, and the way to its frontiers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse import csgraph
+
+CELL = 0.1
+"""Metres."""
+HALF = 160
+"""Cells from the start to the map's edge."""
+RANGE = 4.0
+"""Metres up to which depth counts as seen."""
+CAMERA_HEIGHT = 1.0
+OBSTACLE = (0.25, 1.5)
+"""Heights above the floor, in metres, at which a surface blocks the agent."""
+FAR = 30.0
+
+
+@dataclass
+class ExplorationMap:
+    """Grid in the start frame: x forward (rows), y left (columns)."""
+
+    seen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), bool))
+    occupied: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.uint8))
+    trail: list[NDArray[np.float64]] = field(default_factory=list)
+
+    def update(self, depth: NDArray[np.float32], odometry: NDArray[np.float64]) -> None:
+        """Adds one panorama of distances float32 [H, W] seen from (x, y, azimuth)."""
+        rays, height = _rays(depth.shape)
+        azimuth = odometry[2] + rays["azimuth"]
+        flat = depth * rays["cos_latitude"]
+        floor_height = CAMERA_HEIGHT + depth * height
+        hit = (depth > 0) & (flat < RANGE)
+        solid = hit & (floor_height > OBSTACLE[0]) & (floor_height < OBSTACLE[1])
+        x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
+        ground = hit & (np.abs(floor_height) < 0.12)
+        self.seen[cells(x[ground], y[ground])] = True
+        self._sweep(np.where(solid, flat, np.inf).min(0), azimuth, odometry)
+        rows, columns = cells(x[solid], y[solid])
+        np.maximum.at(self.occupied, (rows, columns), 1)
+        self.trail.append(np.array(odometry[:2]))
+        here = cells(np.array([odometry[0]]), np.array([odometry[1]]))
+        self.seen[here] = True
+
+    def _sweep(self, reach: NDArray[np.float64], azimuth: NDArray[np.float64], odometry: NDArray[np.float64]) -> None:
+        """Marks what lies in front of the nearest obstacle of each column as seen."""
+        steps = np.arange(0.05, RANGE, CELL / 2)[:, None]
+        inside = steps < np.minimum(reach, RANGE)[None] - CELL
+        x, y = odometry[0] + steps * np.cos(azimuth), odometry[1] + steps * np.sin(azimuth)
+        self.seen[cells(x[inside], y[inside])] = True
+
+    def free(self) -> NDArray[np.bool_]:
+        """Cells where the agent may stand: seen, and further than its radius from anything solid."""
+        return self.seen & ~ndimage.binary_dilation(self.occupied > 0, _disk(1))
+
+    def look_ahead(
+        self, odometry: NDArray[np.float64], headings: int, reach: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Free metres ahead in each of `headings` directions, at most `reach`, and the points [headings, 2] there."""
+        azimuth = odometry[2] + np.arange(headings) * 2 * np.pi / headings
+        steps = np.arange(CELL / 2, reach + 1e-9, CELL / 2)
+        x = odometry[0] + steps * np.cos(azimuth)[:, None]
+        y = odometry[1] + steps * np.sin(azimuth)[:, None]
+        clear = self.free()[cells(x, y)]
+        clear |= steps < 1.5 * CELL  # the agent stands there already
+        runs = np.where(clear.all(1), reach, steps[np.argmin(clear, axis=1)] - CELL / 2)
+        ends = odometry[:2] + runs[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
+        return runs, ends
+
+    def at(self, values: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Values of a grid at points [N, 2] in metres."""
+        return values[cells(points[:, 0], points[:, 1])]
+
+    def distance_to_trail(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Metres from points [N, 2] to the nearest place the agent has been."""
+        return np.linalg.norm(points[:, None] - np.stack(self.trail)[None], axis=2).min(1)
+
+    def frontier_distance(self) -> NDArray[np.float64]:
+        """Metres from each free cell to the nearest frontier through free cells; FAR where there is none."""
+        free = self.free()
+        row, column = cells(self.trail[-1][:1], self.trail[-1][1:])
+        free[row, column] = True
+        unknown = ~self.seen & ~(self.occupied > 0)
+        frontier = free & ndimage.binary_dilation(unknown, np.ones((3, 3)))
+        labels, count = ndimage.label(frontier, np.ones((3, 3)))
+        if count:
+            sizes = ndimage.sum_labels(frontier, labels, np.arange(count + 1))
+            frontier &= sizes[labels] >= 3
+        return distance_field(free, frontier)
+
+
+def cells(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of positions in metres, clipped to the map."""
+    row = np.clip(np.floor(x / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
+    column = np.clip(np.floor(y / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
+    return row, column
+
+
+def distance_field(free: NDArray[np.bool_], sources: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Metres from each free cell to the nearest source over 8-connected free cells; FAR where unreachable."""
+    field_ = np.full(free.shape, FAR)
+    if not sources.any():
+        return field_
+    rows, columns = np.nonzero(free)
+    top, left = rows.min(), columns.min()
+    box = (slice(top, rows.max() + 1), slice(left, columns.max() + 1))
+    graph, index = _grid_graph(free[box])
+    starts = index[box_sources] if (box_sources := sources[box]).any() else np.array([], np.intp)
+    distance = csgraph.dijkstra(graph, directed=False, indices=starts, min_only=True)
+    inner = np.full(index.shape, FAR)
+    inner[free[box]] = np.minimum(distance, FAR)
+    field_[box] = inner
+    return field_
+
+
+def _grid_graph(free: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.intp]]:
+    """8-connected graph of the free cells, with metres as weights, and each cell's node."""
+    index = np.cumsum(free.ravel()).reshape(free.shape) - 1
+    heads, tails, weights = [], [], []
+    height, width = free.shape
+    for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        a = (slice(0, height - dr), slice(max(0, -dc), width - max(0, dc)))
+        b = (slice(dr, height), slice(max(0, dc), width - max(0, -dc)))
+        both = free[a] & free[b]
+        heads.append(index[a][both])
+        tails.append(index[b][both])
+        weights.append(np.full(int(both.sum()), CELL * np.hypot(dr, dc)))
+    nodes = int(free.sum())
+    edges = (np.concatenate(heads), np.concatenate(tails))
+    return sparse.csr_array((np.concatenate(weights), edges), shape=(nodes, nodes)), index
+
+
+@cache
+def _rays(shape: tuple[int, int]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """Azimuth (left positive) of each column, cosine and sine of the latitude of each row."""
+    height, width = shape
+    azimuth = np.pi - (np.arange(width) + 0.5) / width * 2 * np.pi
+    latitude = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    return {"azimuth": azimuth, "cos_latitude": np.cos(latitude)[:, None]}, np.sin(latitude)[:, None]
+
+
+def _disk(radius: int) -> NDArray[np.bool_]:
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1]
+    return x**2 + y**2 <= radius**2 + 1

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ceiling: a world model that is the world."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import WorldModel, accepts
+
+
+class Oracle(WorldModel):
+    """Carries the plan out in a fork of the simulator and returns what it truly sees there.
+
+    No model can do better with the same policy, so its score is the ceiling. It alone is handed the simulator.
+    """
+
+    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """True panoramas; frames that another row answers and frames of padding are left unwritten."""
+        assert observations.simulators is not None
+        image = observations.image
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
+        frames[:, 0] = image
+        jobs: dict[int, list[tuple[int, int, NDArray[np.float64]]]] = defaultdict(list)
+        renderers = {}
+        for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
+            poses = simulator.camera_poses_after(control.actions[: control.length])
+            renderers[id(simulator.renderer)] = simulator.renderer
+            jobs[id(simulator.renderer)] += [(row, 1 + k, poses[k]) for k in range(control.shared, control.length)]
+        for name, views in jobs.items():
+            if views:
+                rows, steps, poses = zip(*views, strict=True)
+                frames[list(rows), list(steps)] = _panoramas(renderers[name], np.stack(poses), image.shape[1:3])
+        return frames
+
+
+def _panoramas(renderer: object, poses: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.uint8]:
+    return renderer.panorama(poses, (size[0], size[1]), ["color"])["color"]  # type: ignore[attr-defined, no-any-return]
