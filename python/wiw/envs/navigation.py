@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Navigation episodes as a gymnasium environment, one primitive a step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import env as _env
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.worlds import World, world
+from wiw.errors import ArgumentError
+from wiw.types import Episode, Goal, Key, Observation, Truth
+
+PRIMITIVES = (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)
+"""What the discrete action space counts: `env.step(0)` goes forward."""
+
+
+class NavigationTask(Protocol):
+    """What the environment asks of its task."""
+
+    seed: int
+    backend: str
+    motion: str
+    budget: int
+
+    def episode(self, index: int) -> Episode: ...
+    def goal(self, world: World, episode: Episode) -> Goal: ...
+    def succeeded(self, trip: Trip) -> bool: ...
+    def result(self, trip: Trip) -> dict[str, float]: ...
+
+
+@dataclass
+class Trip:
+    """The privileged record of one episode so far: what metrics are computed from."""
+
+    episode: Episode
+    world: World
+    positions: list[NDArray[np.float64]]
+    """After each primitive, beginning with the start."""
+    at_decision: bool = True
+    """Whether the agent stands at the end of an executed segment."""
+    stopped: bool = False
+    success: bool = False
+
+    @property
+    def actions(self) -> int:
+        """Primitives carried out, refused moves and stop included."""
+        return len(self.positions) - 1
+
+    @property
+    def travelled(self) -> float:
+        """Metres walked."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()) if self.actions else 0.0
+
+    def distance_to_goal(self) -> float:
+        """Straight-line metres from the agent to the goal's position."""
+        return float(np.linalg.norm(self.positions[-1] - np.asarray(self.episode.goal_position)))
+
+    def geodesic_to_goal(self) -> float:
+        """Metres of the shortest walk to the goal; inf when it cannot be reached."""
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
+
+
+@dataclass(frozen=True)
+class Segment:
+    """What carrying out several primitives came to."""
+
+    observation: Observation
+    executed: NDArray[np.int8]
+    path: NDArray[np.float64]
+    terminated: bool
+    truncated: bool
+
+
+class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
+    """An agent that sees a panorama and a front view and moves by 0.2 m or turns by 22.5 degrees.
+
+    Observations are dicts: "panorama" uint8 [576, 1024, 3], "front" uint8 [480, 480, 3] (HFOV 90), "odometry"
+    float64 [3], and "depth" float32 [576, 1024] where asked for. The reward is 1 on reaching the goal. Where the agent
+    truly is stays in `truth()`, outside observation and info.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
+
+    def __init__(self, task: NavigationTask, depth: bool = False) -> None:
+        self.task = task
+        self.render_mode = "rgb_array"
+        self.outputs = ["panorama", "front", *(["depth"] if depth else [])]
+        self.action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))
+        self.observation_space = gymnasium.spaces.Dict(self._spaces(depth))
+        self._core: Any = None
+        self._trip: Trip | None = None
+        self._goal: Goal | None = None
+        self._observation: Observation | None = None
+        self._next = 0
+
+    # -- gymnasium -----------------------------------------------------------------------------------------------------
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Starts an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random."""
+        super().reset(seed=seed)
+        index = (options or {}).get("episode")
+        if index is None:
+            index = int(self.np_random.integers(64)) if seed is not None else self._next
+        observation = self.begin(self.task.episode(index))
+        self._next = index + 1
+        return observation.as_dict(), {"key": Key(self.task.seed, index)}
+
+    def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Carries out one primitive: 0 forward, 1 turn left, 2 turn right, 3 stop."""
+        if not self.action_space.contains(action):
+            raise ArgumentError(f"step: expected an action from 0 to {len(PRIMITIVES) - 1}, got {action!r}")
+        segment = self.run([PRIMITIVES[action]])
+        info = {"result": self.result()} if segment.terminated or segment.truncated else {}
+        return segment.observation.as_dict(), float(self.trip.success), segment.terminated, segment.truncated, info
+
+    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+        """The front view."""
+        return self._seen.front
+
+    # -- the loop ------------------------------------------------------------------------------------------------------
+
+    def begin(self, episode: Episode) -> Observation:
+        """Starts a given episode and observes."""
+        place = world(episode.scene, self.task.backend)
+        config = _env.NavigationConfig(motion=_env.Motion.__members__[self.task.motion])
+        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh.core, config)
+        self._core.reset(np.asarray(episode.start_position), episode.start_yaw)
+        self._trip = Trip(episode, place, [self._core.position])
+        self._goal = self.task.goal(place, episode)
+        return self._observe()
+
+    def run(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
+        """Carries out primitives until the plan, the budget or the episode ends; observes once, at the end."""
+        trip, executed = self.trip, []
+        first = len(trip.positions) - 1
+        done = False
+        for i, action in enumerate(actions):
+            self._core.step(int(action))
+            executed.append(int(action))
+            trip.positions.append(self._core.position)
+            trip.stopped, trip.at_decision = action == STOP, i + 1 == len(actions)
+            trip.success = self.task.succeeded(trip)
+            done = trip.success or trip.stopped
+            if done or trip.actions >= self.task.budget:
+                break
+        path = np.stack(trip.positions[first:])
+        return Segment(self._observe(), np.array(executed, np.int8), path, done, not done and trip.actions >= self.task.budget)
+
+    @property
+    def goal(self) -> Goal:
+        """What the agent is asked to reach."""
+        self._require_episode()
+        assert self._goal is not None
+        return self._goal
+
+    def fork(self) -> Any:
+        """The simulator as it stands, to be run ahead by the oracle; this environment does not move."""
+        self._require_episode()
+        return self._core.fork()
+
+    # -- privileged ----------------------------------------------------------------------------------------------------
+
+    @property
+    def trip(self) -> Trip:
+        """The privileged record of the running episode."""
+        self._require_episode()
+        assert self._trip is not None
+        return self._trip
+
+    def truth(self) -> Truth:
+        """Where the agent truly is; for metrics, records and reports alone."""
+        trip = self.trip
+        return Truth(trip.positions[-1], self._core.yaw, trip.distance_to_goal(), trip.geodesic_to_goal())
+
+    def result(self) -> dict[str, float]:
+        """The task's metrics of the running episode."""
+        return self.task.result(self.trip)
+
+    # ------------------------------------------------------------------------------------------------------------------
+
+    @property
+    def _seen(self) -> Observation:
+        self._require_episode()
+        assert self._observation is not None
+        return self._observation
+
+    def _observe(self) -> Observation:
+        self._observation = Observation(**self._core.observe(self.outputs), odometry=self._core.odometry)
+        return self._observation
+
+    def _require_episode(self) -> None:
+        if self._trip is None:
+            raise ArgumentError("the environment has no episode yet; call reset() first")
+
+    @staticmethod
+    def _spaces(depth: bool) -> dict[str, gymnasium.Space[Any]]:
+        box = gymnasium.spaces.Box
+        spaces: dict[str, gymnasium.Space[Any]] = {
+            "panorama": box(0, 255, (576, 1024, 3), np.uint8),
+            "front": box(0, 255, (480, 480, 3), np.uint8),
+            "odometry": box(-np.inf, np.inf, (3,), np.float64),
+        }
+        return {**spaces, "depth": box(0, np.inf, (576, 1024), np.float32)} if depth else spaces

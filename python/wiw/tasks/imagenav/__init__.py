@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image-Goal Navigation: reach the place where the goal image was taken (paper, appendix "Image-Goal Navigation")."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from wiw.datasets import episodes as episode_file
+from wiw.datasets.imagenav import camera_pose, generate
+from wiw.envs.navigation import NavigationEnv, Trip
+from wiw.datasets.worlds import World, world
+from wiw.errors import ArgumentError
+from wiw.scenes import resolve
+from wiw.types import Episode, Goal
+
+
+@dataclass(frozen=True)
+class ImageNavRules:
+    """Budget, stop rule and metric variants; the defaults are the paper's."""
+
+    decisions: int = 20
+    """K."""
+    candidates: int = 3
+    """M, plans imagined per decision."""
+    horizon: int = 5
+    """L, primitives per plan."""
+    execute: int = 3
+    """Primitives carried out per decision, L - 2."""
+    radius: float = 0.5
+    """Metres; the episode succeeds on entering this sphere around the goal's position."""
+    checked: Literal["primitive", "decision"] = "primitive"
+    """Whether success is looked at after every primitive or only where a decision is due."""
+    distance: Literal["euclidean", "geodesic"] = "euclidean"
+    spl: Literal["metres", "actions"] = "metres"
+    """SPL by path length (the paper's formula) or by number of primitives."""
+    motion: Literal["refuse", "slide"] = "refuse"
+
+
+PRESETS = {
+    "paper": ImageNavRules(),
+    "official": ImageNavRules(decisions=21, checked="decision", distance="geodesic", spl="actions"),
+}
+"""`official` repeats what the authors' published code does where it differs from the paper."""
+
+
+class ImageNav:
+    """The task: where episodes come from, when one ends, and what is measured.
+
+    Args:
+        scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world.
+        seed: seed of the generated episodes and of the run.
+        preset: "paper" or "official"; `rules` overrides it field by field.
+        episode_file: a JSON episode file to use instead of generating.
+        per_scene: generated episodes a scene.
+        backend: renderer, "auto", "cpu" or "gpu".
+    """
+
+    name = "imagenav"
+    metrics = ("success", "spl", "mean_trajectory")
+
+    def __init__(
+        self,
+        scenes: str = "apartments:val",
+        seed: int = 0,
+        preset: str = "paper",
+        episode_file: str | Path | None = None,
+        per_scene: int = 5,
+        backend: str = "auto",
+        **rules: Any,
+    ) -> None:
+        if preset not in PRESETS:
+            raise ArgumentError(f"imagenav: no preset '{preset}'; there are {', '.join(PRESETS)}")
+        unknown = set(rules) - set(asdict(PRESETS[preset]))
+        if unknown:
+            raise ArgumentError(f"imagenav: unknown rules {sorted(unknown)}; there are {sorted(asdict(PRESETS[preset]))}")
+        self.rules = replace(PRESETS[preset], **rules)
+        self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
+        self.episode_file = None if episode_file is None else str(episode_file)
+        self._episodes: list[Episode] = []
+
+    @property
+    def motion(self) -> str:
+        """What happens to a blocked move: "refuse" or "slide"."""
+        return self.rules.motion
+
+    @property
+    def budget(self) -> int:
+        """Primitives an episode may take."""
+        return self.rules.decisions * self.rules.execute
+
+    @property
+    def defaults(self) -> dict[str, int]:
+        """Options for `wiw.Agent` that the task prescribes."""
+        return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity: what must be equal for two runs to be comparable."""
+        source = {"episode_file": self.episode_file} if self.episode_file else {"scenes": self.scenes, "per_scene": self.per_scene}
+        return {"task": self.name, "seed": self.seed, **source, **asdict(self.rules)}
+
+    def environment(self, depth: bool = False) -> NavigationEnv:
+        """A gymnasium environment of this task; `depth` adds it to the observations."""
+        return NavigationEnv(self, depth)
+
+    def episodes(self, count: int) -> list[Episode]:
+        """The first `count` episodes; generated scene by scene, `per_scene` each.
+
+        Raises:
+            ArgumentError: the episode file or the scenes hold fewer.
+        """
+        if not self._episodes and self.episode_file:
+            self._episodes = episode_file.load(self.episode_file)
+        scenes = [] if self.episode_file else resolve(self.scenes)
+        whole_scene = len(scenes) == 1
+        while len(self._episodes) < count and not self.episode_file:
+            done = len(self._episodes) // self.per_scene
+            if not whole_scene and done >= len(scenes):
+                break
+            self._episodes += self._of_scene(scenes[0] if whole_scene else scenes[done], done if whole_scene else 0)
+        if len(self._episodes) < count:
+            raise ArgumentError(f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; "
+                                "name more scenes (apartments:val:N) or raise per_scene")
+        return self._episodes[:count]
+
+    def episode(self, index: int) -> Episode:
+        """Episode `index` of the task."""
+        return self.episodes(index + 1)[index]
+
+    def goal(self, place: World, episode: Episode) -> Goal:
+        """The goal image: front view at the goal's pose."""
+        pose = camera_pose(np.asarray(episode.goal_position), episode.goal_yaw)
+        image = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("color",))["color"][0]
+        return Goal(self.name, image=image)
+
+    def succeeded(self, trip: Trip) -> bool:
+        """Whether the agent has entered the goal's sphere, looked at as the rules say."""
+        if trip.success:
+            return True
+        if self.rules.checked == "decision" and not trip.at_decision:
+            return False
+        if trip.distance_to_goal() > self.rules.radius:  # no walk is shorter than the straight line
+            return False
+        return self.rules.distance == "euclidean" or trip.geodesic_to_goal() <= self.rules.radius
+
+    def result(self, trip: Trip) -> dict[str, float]:
+        """Metrics of one finished episode; `spl` is its contribution, 0 to 1."""
+        by_actions = self.rules.spl == "actions"
+        shortest = float(trip.episode.info.get("ideal_primitives", 0)) if by_actions else trip.episode.geodesic
+        walked = float(trip.actions) if by_actions else trip.travelled
+        return {
+            "success": float(trip.success),
+            "actions": float(trip.actions),
+            "travelled": trip.travelled,
+            "shortest": trip.episode.geodesic,
+            "spl": float(trip.success) * shortest / max(walked, shortest, 1e-9),
+            "distance_to_goal": trip.distance_to_goal(),
+        }
+
+    def _of_scene(self, scene: str, block: int) -> list[Episode]:
+        """One block of episodes in one scene, numbered on from those before it."""
+        made = generate(world(scene, self.backend), self.per_scene * (block + 1), self.seed)[self.per_scene * block :]
+        return [replace(e, episode_id=f"{len(self._episodes) + i:04d}") for i, e in enumerate(made)]
