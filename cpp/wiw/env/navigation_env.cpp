@@ -27,12 +27,12 @@ NavigationEnv::NavigationEnv(World world, const NavigationConfig& config) : worl
 }
 
 void NavigationEnv::reset(const Eigen::Vector3d& position, double yaw, double tolerance) {
-  const auto snapped = world_.navmesh->snap(position);
-  if (!snapped || (*snapped - position).norm() > tolerance) {
+  const auto snapped = world_.navmesh->snap(position.cast<float>());
+  if (!snapped || (snapped->cast<double>() - position).norm() > tolerance) {
     throw NavigationError("NavigationEnv.reset: " + text_of(position) + " is not on the navigation mesh (nearest point " +
-                          (snapped ? text_of(*snapped) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
+                          (snapped ? text_of(snapped->cast<double>()) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
   }
-  position_ = start_position_ = *snapped;
+  position_ = start_position_ = snapped->cast<double>();
   start_yaw_ = yaw;
   turns_ = 0;
 }
@@ -48,9 +48,9 @@ bool NavigationEnv::step(Action action) {
   const Eigen::Vector3d end = position_ + config_.actions.forward_m * heading;
   const Eigen::Vector3d before = position_;
   if (config_.motion == Motion::kSlide) {
-    position_ = world_.navmesh->try_step(position_, end, true);
-  } else if (world_.navmesh->is_navigable(end)) {
-    if (const auto snapped = world_.navmesh->snap(end)) position_ = *snapped;
+    position_ = world_.navmesh->try_step(position_.cast<float>(), end.cast<float>(), true).cast<double>();
+  } else if (world_.navmesh->is_navigable(end.cast<float>())) {
+    if (const auto snapped = world_.navmesh->snap(end.cast<float>())) position_ = snapped->cast<double>();
   }
   return position_ != before;
 }

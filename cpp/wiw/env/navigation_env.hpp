@@ -6,7 +6,7 @@
 #include <vector>
 
 #include "wiw/action/action.hpp"
-#include "wiw/nav/navmesh.hpp"
+#include "wiw/nav/nav_mesh.hpp"
 #include "wiw/render/renderer.hpp"
 
 namespace wiw {
