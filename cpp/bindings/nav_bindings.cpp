@@ -1,0 +1,319 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <pybind11/eigen.h>
+#include <pybind11/numpy.h>
+#include <pybind11/operators.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+#include <pybind11/stl/filesystem.h>
+
+#include <limits>
+
+#include "arrays.hpp"
+#include "wiw/nav/nav_mesh.hpp"
+
+namespace py = pybind11;
+using namespace wiw;
+using namespace wiw::nav;
+using wiw::bindings::Array;
+
+namespace {
+
+/// float32 [N, 3], or [3] for a single point, whose results then lose their first axis too.
+struct Points {
+  std::vector<Eigen::Vector3f> values;
+  bool single = false;
+};
+
+Points to_points(const Array<float>& array, const char* name) {
+  Points points;
+  points.single = array.ndim() == 1;
+  const std::string expected = std::string(name) + " [N, 3] or [3]";
+  if (points.single) {
+    bindings::expect_shape(array, {3}, expected.c_str());
+  } else {
+    bindings::expect_shape(array, {-1, 3}, expected.c_str());
+  }
+  points.values.resize(static_cast<std::size_t>(array.size() / 3));
+  if (array.size() > 0) std::copy(array.data(), array.data() + array.size(), points.values[0].data());
+  return points;
+}
+
+/// Two batches of which one may be a single point.
+struct Pairs {
+  Points a, b;
+  [[nodiscard]] bool single() const { return a.single && b.single; }
+  [[nodiscard]] std::size_t size() const { return a.single ? b.values.size() : a.values.size(); }
+  [[nodiscard]] const Eigen::Vector3f& first(std::size_t i) const { return a.values[a.single ? 0 : i]; }
+  [[nodiscard]] const Eigen::Vector3f& second(std::size_t i) const { return b.values[b.single ? 0 : i]; }
+};
+
+Pairs to_pairs(const Array<float>& a, const char* name_a, const Array<float>& b, const char* name_b) {
+  Pairs pairs{to_points(a, name_a), to_points(b, name_b)};
+  if (!pairs.a.single && !pairs.b.single && pairs.a.values.size() != pairs.b.values.size()) {
+    throw ArgumentError(std::string("expected as many ") + name_a + " as " + name_b + ", got " +
+                        std::to_string(pairs.a.values.size()) + " and " + std::to_string(pairs.b.values.size()));
+  }
+  return pairs;
+}
+
+py::array_t<float> point_array(const std::vector<Eigen::Vector3f>& points, std::vector<py::ssize_t> shape) {
+  py::array_t<float> array(std::move(shape));
+  if (!points.empty()) std::copy(points[0].data(), points[0].data() + 3 * points.size(), array.mutable_data());
+  return array;
+}
+
+py::array_t<float> point_array(const Points& like, const std::vector<Eigen::Vector3f>& points) {
+  const auto count = static_cast<py::ssize_t>(points.size());
+  return like.single ? point_array(points, {3}) : point_array(points, {count, 3});
+}
+
+template <class T>
+py::object value_array(bool single, const std::vector<T>& values) {
+  if (single) return py::cast(static_cast<T>(values[0]));
+  py::array_t<T> array(static_cast<py::ssize_t>(values.size()));
+  std::copy(values.begin(), values.end(), array.mutable_data());
+  return array;
+}
+
+py::array_t<float> box_array(const Eigen::AlignedBox3f& box) { return point_array({box.min(), box.max()}, {2, 3}); }
+
+Metric to_metric(const std::string& name) {
+  if (name == "exact") return Metric::kExact;
+  if (name == "detour") return Metric::kDetour;
+  if (name == "detour-uncapped") return Metric::kDetourUncapped;
+  throw ArgumentError("expected metric 'exact', 'detour' or 'detour-uncapped', got '" + name + "'");
+}
+
+py::array_t<float> snap(const NavMesh& mesh, const Array<float>& array) {
+  Points points = to_points(array, "points");
+  {
+    const py::gil_scoped_release release;
+    const Eigen::Vector3f nowhere = Eigen::Vector3f::Constant(std::numeric_limits<float>::quiet_NaN());
+    for (Eigen::Vector3f& point : points.values) point = mesh.snap(point).value_or(nowhere);
+  }
+  return point_array(points, points.values);
+}
+
+py::object is_navigable(const NavMesh& mesh, const Array<float>& array, float max_dy) {
+  const Points points = to_points(array, "points");
+  std::vector<std::uint8_t> result;
+  {
+    const py::gil_scoped_release release;
+    for (const Eigen::Vector3f& point : points.values) result.push_back(mesh.is_navigable(point, max_dy));
+  }
+  if (points.single) return py::bool_(result[0] != 0);
+  py::array_t<bool> flags(static_cast<py::ssize_t>(result.size()));
+  std::copy(result.begin(), result.end(), flags.mutable_data());
+  return flags;
+}
+
+py::object island_of(const NavMesh& mesh, const Array<float>& array) {
+  const Points points = to_points(array, "points");
+  std::vector<std::int64_t> result;
+  {
+    const py::gil_scoped_release release;
+    for (const Eigen::Vector3f& point : points.values) result.push_back(mesh.island_of(point));
+  }
+  return value_array(points.single, result);
+}
+
+py::array_t<float> sample(const NavMesh& mesh, std::size_t count, std::uint64_t seed, py::object island) {
+  const int index = island.is_none() ? -1 : island.cast<int>();
+  std::vector<Eigen::Vector3f> points;
+  {
+    const py::gil_scoped_release release;
+    points = mesh.sample(count, seed, index);
+  }
+  return point_array(points, {static_cast<py::ssize_t>(count), 3});
+}
+
+py::array_t<float> try_step(const NavMesh& mesh, const Array<float>& start, const Array<float>& end, bool sliding) {
+  const Pairs pairs = to_pairs(start, "start", end, "end");
+  std::vector<Eigen::Vector3f> reached(pairs.size());
+  {
+    const py::gil_scoped_release release;
+    for (std::size_t i = 0; i < reached.size(); ++i) {
+      reached[i] = mesh.try_step(pairs.first(i), pairs.second(i), sliding);
+    }
+  }
+  return point_array(pairs.a.single ? pairs.b : pairs.a, reached);
+}
+
+py::object geodesic_distance(const NavMesh& mesh, const Array<float>& a, const Array<float>& b,
+                             const std::string& metric_name, bool return_reason) {
+  const Pairs pairs = to_pairs(a, "a", b, "b");
+  const Metric metric = to_metric(metric_name);
+  std::vector<double> metres(pairs.size());
+  std::vector<std::string> reasons(pairs.size());
+  {
+    const py::gil_scoped_release release;
+    for (std::size_t i = 0; i < metres.size(); ++i) {
+      const Distance distance = mesh.geodesic_distance(pairs.first(i), pairs.second(i), metric);
+      metres[i] = distance.metres;
+      reasons[i] = reason_text(distance.reason);
+    }
+  }
+  py::object distances = value_array(pairs.single(), metres);
+  if (!return_reason) return distances;
+  return py::make_tuple(distances, pairs.single() ? py::cast(reasons[0]) : py::cast(reasons));
+}
+
+py::array_t<float> shortest_path(const NavMesh& mesh, const Array<float>& a, const Array<float>& b,
+                                 const std::string& metric_name) {
+  const Points start = to_points(a, "a"), end = to_points(b, "b");
+  if (!start.single || !end.single) throw ArgumentError("expected one start and one end, each [3]");
+  const Metric metric = to_metric(metric_name);
+  Path path;
+  {
+    const py::gil_scoped_release release;
+    path = mesh.shortest_path(start.values[0], end.values[0], metric);
+  }
+  if (path.reason != Reason::kNone) {
+    throw NavigationError(std::string("no way from start to end: ") + reason_text(path.reason));
+  }
+  return point_array(path.points, {static_cast<py::ssize_t>(path.points.size()), 3});
+}
+
+std::shared_ptr<NavMesh> from_triangles(const Array<float>& vertices, const Array<std::int64_t>& faces,
+                                        const NavMeshSettings& settings) {
+  bindings::expect_shape(vertices, {-1, 3}, "vertices [V, 3]");
+  bindings::expect_shape(faces, {-1, 3}, "faces [F, 3]");
+  const Points points = to_points(vertices, "vertices");
+  std::vector<Eigen::Matrix<std::uint32_t, 3, 1>> triangles(static_cast<std::size_t>(faces.shape(0)));
+  const std::int64_t* index = faces.data();
+  for (auto& triangle : triangles) {
+    for (int k = 0; k < 3; ++k, ++index) {
+      if (*index < 0 || *index >= vertices.shape(0)) {
+        throw ArgumentError("faces: expected indices in [0, " + std::to_string(vertices.shape(0)) + "), got " +
+                            std::to_string(*index));
+      }
+      triangle[k] = static_cast<std::uint32_t>(*index);
+    }
+  }
+  const py::gil_scoped_release release;
+  return NavMesh::from_triangles(points.values, triangles, settings);
+}
+
+void bind_settings(py::module_& module) {
+  const NavMeshSettings defaults;
+  py::class_<NavMeshSettings> settings(module, "NavMeshSettings", R"(How walkable surfaces become polygons.
+
+Lengths in metres, angles in degrees; the defaults are Habitat's. `region_min_size`, `region_merge_size`,
+`edge_max_error` and `detail_sample_distance` count cells of `cell_size`.)");
+  settings.def(py::init([](const py::kwargs& values) {
+    py::object result = py::cast(NavMeshSettings{});
+    for (const auto& [name, value] : values) {
+      if (!py::hasattr(result, name)) {
+        throw ArgumentError("NavMeshSettings has no field '" + name.cast<std::string>() + "'");
+      }
+      py::setattr(result, name, value);
+    }
+    result.cast<const NavMeshSettings&>().validate();
+    return result.cast<NavMeshSettings>();
+  }));
+#define FIELD(name) settings.def_readwrite(#name, &NavMeshSettings::name);
+  FIELD(cell_size)
+  FIELD(cell_height)
+  FIELD(agent_height)
+  FIELD(agent_radius)
+  FIELD(agent_max_climb)
+  FIELD(agent_max_slope)
+  FIELD(region_min_size)
+  FIELD(region_merge_size)
+  FIELD(edge_max_length)
+  FIELD(edge_max_error)
+  FIELD(vertices_per_polygon)
+  FIELD(detail_sample_distance)
+  FIELD(detail_sample_max_error)
+  FIELD(filter_low_hanging_obstacles)
+  FIELD(filter_ledge_spans)
+  FIELD(filter_walkable_low_height_spans)
+  FIELD(include_static_objects)
+#undef FIELD
+  settings.def(py::self == py::self);
+}
+
+void bind_construction(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  mesh.def_static("build", &NavMesh::build, py::arg("scene"), py::arg("settings") = NavMeshSettings{},
+                  py::call_guard<py::gil_scoped_release>(),
+                  "Navigation mesh of a `wiw.scenes` scene. ArgumentError if nothing in it is walkable.");
+  mesh.def_static("from_triangles", &from_triangles, py::arg("vertices"), py::arg("faces"),
+                  py::arg("settings") = NavMeshSettings{},
+                  "Navigation mesh of a triangle soup: vertices float [V, 3] (metres, Y up), faces int [F, 3], "
+                  "counter-clockwise from above where one can walk.");
+  mesh.def_static(
+      "load", [](const std::filesystem::path& path) { return NavMesh::load(path.string()); }, py::arg("path"),
+      py::call_guard<py::gil_scoped_release>(),
+      "Reads a Habitat `.navmesh` file, version 1 or 2. FileError names the file and what is wrong with it.");
+  mesh.def(
+      "save",
+      [](const NavMesh& self, const std::filesystem::path& path, int version) { self.save(path.string(), version); },
+      py::arg("path"), py::arg("version") = 2, py::call_guard<py::gil_scoped_release>(),
+      "Writes a Habitat `.navmesh` file; version 1 leaves the settings out.");
+}
+
+void bind_geometry(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  mesh.def_property_readonly(
+      "settings", [](const NavMesh& self) { return self.settings(); },
+      "Settings of the build; defaults where a version 1 file does not tell.");
+  mesh.def_property_readonly("area", &NavMesh::area, "Walkable surface of all islands, m2.");
+  mesh.def_property_readonly(
+      "islands", [](const NavMesh& self) { return self.surface().islands; },
+      "Connected parts, largest first: list of Island(area, polygons, bounds).");
+  mesh.def_property_readonly(
+      "bounds", [](const NavMesh& self) { return box_array(self.bounds()); },
+      "float32 [2, 3]: lowest and highest corner.");
+  mesh.def(
+      "triangles",
+      [](const NavMesh& self) {
+        const auto& corners = self.surface().corners;
+        return py::make_tuple(point_array(corners, {static_cast<py::ssize_t>(corners.size() / 3), 3, 3}),
+                              value_array(false, self.surface().triangle_island));
+      },
+      "The surface as float32 [T, 3, 3] triangles, and the island of each as int32 [T].");
+  mesh.def(
+      "outline",
+      [](const NavMesh& self) {
+        const auto& ends = self.surface().outline;
+        return point_array(ends, {static_cast<py::ssize_t>(ends.size() / 2), 2, 3});
+      },
+      "Walls and drops: float32 [S, 2, 3] segments around all islands.");
+}
+
+void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  mesh.def("snap", &snap, py::arg("points"),
+           "Nearest points on the mesh, float32 like `points` ([N, 3] or [3]); NaN where there is none within 2 m "
+           "sideways and 4 m up or down.");
+  mesh.def("is_navigable", &is_navigable, py::arg("points"), py::arg("max_dy") = 0.5f,
+           "bool [N]: on the mesh within `max_dy` metres vertically and 1 cm horizontally.");
+  mesh.def("island_of", &island_of, py::arg("points"),
+           "int64 [N]: index into `islands` of the island nearest to each point, -1 off the mesh.");
+  mesh.def("sample", &sample, py::arg("n"), py::arg("seed"), py::arg("island") = 0,
+           "float32 [n, 3], uniform over the surface of one island (0 is the largest; None: of all); a function of "
+           "`seed` alone.");
+  mesh.def("try_step", &try_step, py::arg("start"), py::arg("end"), py::arg("sliding") = true,
+           "Where straight steps from `start` towards `end` (float [N, 3] or [3]) come to stand: at a wall they slide "
+           "along it, or stop with sliding=False. `start` itself where there is no way at all.");
+  mesh.def("geodesic_distance", &geodesic_distance, py::arg("a"), py::arg("b"), py::arg("metric") = "exact",
+           py::arg("return_reason") = false,
+           "Length in metres of the shortest way between `a` and `b` (float [N, 3] or [3] each; one may be a single "
+           "point): float64 [N] or float, inf where there is none. With return_reason also why: '' or 'start off "
+           "mesh', 'end off mesh', 'other island', or for metric='detour' its search limit.");
+  mesh.def("shortest_path", &shortest_path, py::arg("a"), py::arg("b"), py::arg("metric") = "exact",
+           "float32 [P, 3]: the bends of the shortest way, ends included. NavigationError says why there is none.");
+}
+
+}  // namespace
+
+void bind_nav(py::module_& module) {
+  bind_settings(module);
+  py::class_<Island>(module, "Island", "A connected part of a navigation mesh.")
+      .def_readonly("area", &Island::area, "Surface in m2.")
+      .def_readonly("polygons", &Island::polygons)
+      .def_property_readonly("bounds", [](const Island& self) { return box_array(self.bounds); }, "float32 [2, 3].");
+  py::class_<NavMesh, std::shared_ptr<NavMesh>> mesh(
+      module, "NavMesh", "Where an agent can stand, for one body size. Immutable; safe to share between threads.");
+  bind_construction(mesh);
+  bind_geometry(mesh);
+  bind_queries(mesh);
+}
