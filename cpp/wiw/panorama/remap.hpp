@@ -1,0 +1,29 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <span>
+
+#include "wiw/core/cpu.hpp"
+#include "wiw/panorama/bilinear_table.hpp"
+
+namespace wiw::panorama {
+
+/// One resampling of a source by a table: columns are moved by `shift` in [0, width), `out` holds the table's pixels.
+template <class T>
+struct RemapTarget {
+  int shift = 0;
+  T* out = nullptr;
+};
+
+/// Resamples one source image to several targets that share a table, walking them together so that the table is
+/// read from memory once. uint8 is rounded from 14-bit weights, float is blended in float32; results do not depend on
+/// the instruction set (uint8).
+void remap(const BilinearTable& table, ImageView<const std::uint8_t> source,
+           std::span<const RemapTarget<std::uint8_t>> targets, Isa isa = active_isa());
+void remap(const BilinearTable& table, ImageView<const float> source, std::span<const RemapTarget<float>> targets);
+
+/// Nearest texels, copied: any type, ids included.
+template <class T>
+void remap(const NearestTable& table, ImageView<const T> source, std::span<const RemapTarget<T>> targets);
+
+}  // namespace wiw::panorama
