@@ -5,6 +5,7 @@
 #include <optional>
 
 #include "arrays.hpp"
+#include "wiw/render/gpu/gpu_renderer.hpp"
 #include "wiw/render/renderer.hpp"
 
 namespace py = pybind11;
@@ -70,6 +71,26 @@ void set_poses(Renderer& renderer, const Array<std::uint32_t>& ids, const Array<
   renderer.set_poses(id_span, transforms);
 }
 
+py::list egl_devices() {
+  std::vector<wiw::EglDeviceReport> reports;
+  {
+    const py::gil_scoped_release release;
+    reports = wiw::report_egl_devices();
+  }
+  py::list devices;
+  for (const wiw::EglDeviceReport& report : reports) {
+    py::dict device;
+    device["index"] = report.index;
+    device["vendor"] = report.vendor;
+    device["renderer"] = report.renderer;
+    device["version"] = report.version;
+    device["software"] = report.software;
+    device["error"] = report.error;
+    devices.append(device);
+  }
+  return devices;
+}
+
 }  // namespace
 
 void bind_render(py::module_& module) {
@@ -100,4 +121,8 @@ void bind_render(py::module_& module) {
           py::arg("T_world_camera"), py::arg("size"), py::arg("color"), py::arg("depth"), py::arg("instance"))
       .def("set_poses", &set_poses, py::arg("instance_ids"), py::arg("T_world_instance"))
       .def_property_readonly("description", &Renderer::description);
+  module.def("egl_devices", &egl_devices,
+             "Every EGL device, each tried: dicts with 'index' (for WIW_EGL_DEVICE; -1 is the surfaceless platform), "
+             "'vendor', 'renderer', 'version', 'software' and 'error' (empty, or why it gives no OpenGL context). "
+             "Raises BackendError when there is no EGL library.");
 }

@@ -1,0 +1,14 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "wiw/render/renderer.hpp"
+
+namespace wiw::testing {
+
+/// A room without a ceiling that has one of every kind of surface: textured floor and walls, a lightmap, a smooth
+/// sphere, a box with vertex colours, an emissive panel, a cutout screen, a mesh of many chunks, a scaled placement.
+ScenePtr make_furnished();
+
+constexpr std::uint32_t kFurnishedSphere = 6;
+
+}  // namespace wiw::testing

@@ -1,0 +1,34 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/gpu/draw_list.hpp"
+
+#include <algorithm>
+#include <tuple>
+
+#include "wiw/render/gpu/frustum.hpp"
+
+namespace wiw::gpu {
+
+void DrawList::gather(const View& view, const Scene& scene, const std::vector<MeshRange>& meshes,
+                      const std::vector<Chunk>& chunks, const std::vector<Eigen::Affine3f>& poses) {
+  draws_.clear();
+  const Frustum frustum(view);
+  const Eigen::Vector3f eye = view.eye.head<3>();
+  for (std::uint32_t i = 0; i < poses.size(); ++i) {
+    const Frustum local = frustum.in_instance(poses[i]);
+    for (const std::uint32_t mesh : scene.instances[i].meshes) {
+      const MeshRange& range = meshes[mesh];
+      if (range.chunk_count == 0 || !local.may_see(range.box)) continue;
+      for (std::size_t k = range.first_chunk; k < range.first_chunk + range.chunk_count; ++k) {
+        const Chunk& chunk = chunks[k];
+        if (range.chunk_count > 1 && !local.may_see(chunk.box)) continue;
+        const float distance = (poses[i] * chunk.box.center() - eye).norm();
+        draws_.push_back({distance, i, mesh, static_cast<std::uint32_t>(k)});
+      }
+    }
+  }
+  std::ranges::sort(draws_, {}, [&](const Draw& draw) {
+    return std::tuple((meshes[draw.mesh].appearance & kCutout) != 0, draw.distance, draw.instance, draw.chunk);
+  });
+}
+
+}  // namespace wiw::gpu

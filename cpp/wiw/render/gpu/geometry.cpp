@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/gpu/geometry.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <span>
+#include <string>
+
+#include "wiw/core/error.hpp"
+
+namespace wiw::gpu {
+
+namespace {
+
+Vertex make_vertex(const Mesh& mesh, std::size_t i) {
+  Vertex vertex{};
+  Eigen::Map<Eigen::Vector3f>(vertex.position) = mesh.positions[i];
+  if (!mesh.normals.empty()) {
+    for (int k = 0; k < 3; ++k) {
+      vertex.normal[k] = static_cast<std::int16_t>(std::lround(std::clamp(mesh.normals[i][k], -1.f, 1.f) * 32767.f));
+    }
+  }
+  if (!mesh.uv.empty()) Eigen::Map<Eigen::Vector2f>(vertex.uv) = mesh.uv[i];
+  if (!mesh.lightmap_uv.empty()) Eigen::Map<Eigen::Vector2f>(vertex.lightmap_uv) = mesh.lightmap_uv[i];
+  if (!mesh.colors.empty()) Eigen::Map<Eigen::Matrix<std::uint8_t, 4, 1>>(vertex.color) = mesh.colors[i];
+  return vertex;
+}
+
+void set_appearance(const Scene& scene, const Mesh& mesh, MeshRange& range) {
+  static const Material kDefault;
+  const Material& material =
+      mesh.material == kNone ? kDefault : scene.materials[static_cast<std::size_t>(mesh.material)];
+  range.material = mesh.material;
+  if (material.texture != kNone && !mesh.uv.empty()) {
+    range.texture = material.texture;
+    range.appearance |= kTextured;
+  }
+  if (mesh.lightmap != kNone && !mesh.lightmap_uv.empty()) {
+    range.lightmap = mesh.lightmap;
+    range.appearance |= kLightmapped;
+  }
+  if (material.emissive) range.appearance |= kEmissive;
+  if (material.alpha_cutoff >= 0) range.appearance |= kCutout;
+  if (!mesh.colors.empty()) range.appearance |= kVertexColors;
+  if (!mesh.normals.empty()) range.appearance |= kSmooth;
+}
+
+/// Splits the triangles of one mesh at the median of the longest side until a part is small enough.
+class Splitter {
+ public:
+  Splitter(const Mesh& mesh, std::uint32_t first_vertex, Geometry& geometry)
+      : mesh_(mesh), first_vertex_(first_vertex), geometry_(geometry), order_(mesh.triangles.size()) {
+    centres_.reserve(order_.size());
+    for (const auto& triangle : mesh.triangles) {
+      centres_.emplace_back((mesh.positions[triangle[0]] + mesh.positions[triangle[1]] + mesh.positions[triangle[2]]) /
+                            3.f);
+    }
+    std::iota(order_.begin(), order_.end(), 0u);
+    if (!order_.empty()) split(order_);
+  }
+
+ private:
+  void split(std::span<std::uint32_t> part) {
+    if (part.size() <= kChunkTriangles) return emit(part);
+    Eigen::AlignedBox3f box;
+    for (const std::uint32_t i : part) box.extend(centres_[i]);
+    Eigen::Index axis = 0;
+    box.sizes().maxCoeff(&axis);
+    const std::size_t half = part.size() / 2;
+    std::ranges::nth_element(part, part.begin() + static_cast<std::ptrdiff_t>(half), {},
+                             [&](std::uint32_t i) { return centres_[i][axis]; });
+    split(part.first(half));
+    split(part.subspan(half));
+  }
+
+  void emit(std::span<std::uint32_t> part) {
+    std::ranges::sort(part);  // the file's order keeps neighbouring vertices close in memory
+    Chunk chunk;
+    chunk.first_index = geometry_.indices.size();
+    chunk.index_count = 3 * part.size();
+    for (const std::uint32_t i : part) {
+      for (const std::uint32_t vertex : mesh_.triangles[i]) {
+        chunk.box.extend(mesh_.positions[vertex]);
+        geometry_.indices.push_back(first_vertex_ + vertex);
+      }
+    }
+    geometry_.chunks.push_back(chunk);
+  }
+
+  const Mesh& mesh_;
+  std::uint32_t first_vertex_;
+  Geometry& geometry_;
+  std::vector<std::uint32_t> order_;
+  std::vector<Eigen::Vector3f> centres_;
+};
+
+}  // namespace
+
+Geometry build_geometry(const Scene& scene) {
+  Geometry geometry;
+  std::size_t vertices = 0;
+  for (const Mesh& mesh : scene.meshes) vertices += mesh.positions.size();
+  if (vertices > std::numeric_limits<std::uint32_t>::max()) {
+    throw ArgumentError("the gpu back end draws at most 2^32 vertices, got " + std::to_string(vertices));
+  }
+  geometry.vertices.reserve(vertices);
+  for (const Mesh& mesh : scene.meshes) {
+    MeshRange range;
+    range.first_chunk = geometry.chunks.size();
+    const auto first_vertex = static_cast<std::uint32_t>(geometry.vertices.size());
+    for (std::size_t i = 0; i < mesh.positions.size(); ++i) geometry.vertices.push_back(make_vertex(mesh, i));
+    Splitter(mesh, first_vertex, geometry);
+    range.chunk_count = geometry.chunks.size() - range.first_chunk;
+    for (std::size_t i = 0; i < range.chunk_count; ++i) range.box.extend(geometry.chunks[range.first_chunk + i].box);
+    set_appearance(scene, mesh, range);
+    geometry.meshes.push_back(range);
+  }
+  return geometry;
+}
+
+}  // namespace wiw::gpu

@@ -1,0 +1,54 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <Eigen/Geometry>
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+#include "wiw/render/gpu/shader_source.hpp"
+#include "wiw/scene/scene.hpp"
+
+namespace wiw::gpu {
+
+/// Vertex as the graphics card reads it, 40 bytes.
+struct Vertex {
+  float position[3];
+  std::int16_t normal[4];  // signed normalised
+  float uv[2];
+  float lightmap_uv[2];
+  std::uint8_t color[4];
+};
+static_assert(sizeof(Vertex) == 40);
+
+/// Nearby triangles of one mesh, culled together.
+struct Chunk {
+  Eigen::AlignedBox3f box;  // instance coordinates
+  std::size_t first_index = 0;
+  std::size_t index_count = 0;
+};
+
+/// Triangles culled together; smaller ones cost draw calls, larger ones draw what is out of sight.
+constexpr std::size_t kChunkTriangles = 4096;
+
+struct MeshRange {
+  Eigen::AlignedBox3f box;
+  std::size_t first_chunk = 0;
+  std::size_t chunk_count = 0;
+  ProgramKey appearance = 0;
+  std::int32_t material = kNone;
+  std::int32_t texture = kNone;
+  std::int32_t lightmap = kNone;
+};
+
+/// All meshes of a scene in one vertex and one index array.
+struct Geometry {
+  std::vector<Vertex> vertices;
+  std::vector<std::uint32_t> indices;
+  std::vector<Chunk> chunks;
+  std::vector<MeshRange> meshes;  // parallel to Scene::meshes
+};
+
+Geometry build_geometry(const Scene& scene);
+
+}  // namespace wiw::gpu

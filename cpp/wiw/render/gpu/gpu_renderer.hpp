@@ -1,0 +1,32 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "wiw/render/renderer.hpp"
+
+namespace wiw {
+
+/// OpenGL back end on the process's EGL device. Throws BackendError with the remedy when there is none.
+std::shared_ptr<Renderer> make_gpu_renderer(ScenePtr scene, const RenderOptions& options);
+
+/// Whether an EGL device that is no software rasteriser gives a context here. Never throws; opens a context only on
+/// devices that may be hardware.
+bool has_gpu_hardware();
+
+/// One row of `wiw doctor`.
+struct EglDeviceReport {
+  int index = -1;        // what WIW_EGL_DEVICE selects; -1: the surfaceless platform
+  std::string vendor;    // empty when it gives no context, and then
+  std::string renderer;  //
+  std::string version;   //
+  std::string error;     // says why
+  bool software = false;
+};
+
+/// Every EGL device, each tried. Throws BackendError when there is no EGL library.
+std::vector<EglDeviceReport> report_egl_devices();
+
+}  // namespace wiw

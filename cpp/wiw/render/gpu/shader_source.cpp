@@ -1,0 +1,359 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/render/gpu/shader_source.hpp"
+
+#include <array>
+#include <utility>
+
+namespace wiw::gpu {
+
+namespace {
+
+// One view of a batch. Axes are those of the camera in the world; a cube face has its own, beside the panorama's up.
+constexpr const char* kViewBlock = R"(
+layout(std140) uniform View {
+  vec4 right;
+  vec4 up;
+  vec4 back;
+  vec4 eye;
+  vec4 projection;   // clip x and y per camera x and y over depth; shift of the sample from the pixel centre, clip units
+  vec4 lens;         // near plane; pixel width at depth 1 (panorama: pi / H, then 2 pi / W); added to the level of detail
+  vec4 panorama_up;
+};
+)";
+
+constexpr const char* kSurfaceBlocks = R"(
+layout(std140) uniform Instance {
+  vec4 world_rows[3];
+  vec4 normal_rows[3];
+  uvec4 instance_id;
+};
+layout(std140) uniform Material {
+  vec4 base_color;
+  vec4 cutoff;
+};
+)";
+
+constexpr const char* kSceneVertex = R"(
+layout(location = 0) in vec3 position;
+layout(location = 1) in vec3 normal;
+layout(location = 2) in vec2 uv;
+layout(location = 3) in vec2 lightmap_uv;
+layout(location = 4) in vec4 color;
+out vec3 offset;   // from the eye, world axes
+#ifdef SMOOTH
+out vec3 smooth_normal;
+#endif
+#ifdef TEXTURED
+out vec2 texture_uv;
+#endif
+#ifdef LIGHTMAPPED
+out vec2 light_uv;
+#endif
+#ifdef VERTEX_COLORS
+out vec3 vertex_color;
+#endif
+void main() {
+  vec4 p = vec4(position, 1.0);
+  offset = vec3(dot(world_rows[0], p), dot(world_rows[1], p), dot(world_rows[2], p)) - eye.xyz;
+  float depth = -dot(back.xyz, offset);
+  vec2 image = vec2(dot(right.xyz, offset), dot(up.xyz, offset)) * projection.xy - depth * projection.zw;
+  gl_Position = vec4(image, lens.x, depth);   // reversed depth with the far plane at infinity: near / depth
+#ifdef SMOOTH
+  smooth_normal = vec3(dot(normal_rows[0].xyz, normal), dot(normal_rows[1].xyz, normal), dot(normal_rows[2].xyz, normal));
+#endif
+#ifdef TEXTURED
+  texture_uv = uv;
+#endif
+#ifdef LIGHTMAPPED
+  light_uv = lightmap_uv;
+#endif
+#ifdef VERTEX_COLORS
+  vertex_color = color.rgb;
+#endif
+}
+)";
+
+constexpr const char* kOutputs = R"(
+#ifdef COLOR_OUT
+layout(location = 0) out vec4 out_color;
+#endif
+#ifdef DEPTH_OUT
+layout(location = 1) out float out_depth;
+#ifdef CUBE_FACE
+layout(location = 3) out vec2 out_slope;
+#endif
+#endif
+#ifdef ID_OUT
+layout(location = 2) out uint out_id;
+#endif
+)";
+
+// The formulas of shading.hpp. Footprint and texel density come from the derivatives of position and texture
+// coordinates across the pixel quad, which are exact on a triangle's plane.
+constexpr const char* kShading = R"(
+float ambient_light(vec3 n) {
+  return 0.80 + 0.12 * n.y + 0.05 * (n.x * n.x - n.z * n.z) + 0.02 * n.x;
+}
+float pixel_depth() {
+#ifdef CUBE_FACE
+  return length(offset);
+#else
+  return 1.0 / gl_FragCoord.w;
+#endif
+}
+float pixel_width(float depth) {
+#ifdef CUBE_FACE
+  float sine = dot(panorama_up.xyz, offset) / depth;
+  return max(lens.y, lens.z * sqrt(max(0.0, 1.0 - sine * sine)));
+#else
+  return lens.y;
+#endif
+}
+float level_of_detail(vec2 tx, vec2 ty, vec3 px, vec3 py, vec3 n) {
+  float depth = pixel_depth();
+  float area2 = max(dot(n, n), 1e-30);
+  float footprint = pixel_width(depth) * max(depth, depth * depth * sqrt(area2) / abs(dot(n, offset)));
+  // Largest singular value of d(texel)/d(world): largest eigenvalue of inverse(P'P) T'T for P = [px py], T = [tx ty].
+  float half_trace = 0.5 * (dot(py, py) * dot(tx, tx) - 2.0 * dot(px, py) * dot(tx, ty) + dot(px, px) * dot(ty, ty)) / area2;
+  float cross_texels = tx.x * ty.y - tx.y * ty.x;
+  float determinant = cross_texels * cross_texels / area2;
+  float density2 = half_trace + sqrt(max(0.0, half_trace * half_trace - determinant));
+  return clamp(log2(footprint) + 0.5 * log2(density2) + lens.w, 0.0, 16.0);
+}
+)";
+
+constexpr const char* kSceneFragment = R"(
+in vec3 offset;
+#ifdef SMOOTH
+in vec3 smooth_normal;
+#endif
+#ifdef TEXTURED
+in vec2 texture_uv;
+uniform sampler2D surface_texture;
+#endif
+#ifdef LIGHTMAPPED
+in vec2 light_uv;
+uniform sampler2D lightmap;
+#endif
+#ifdef VERTEX_COLORS
+in vec3 vertex_color;
+#endif
+)";
+
+constexpr const char* kSceneMain = R"(
+void main() {
+#ifdef COLOR_OUT
+  vec3 px = dFdx(offset);
+  vec3 py = dFdy(offset);
+  vec3 n = cross(px, py);
+#endif
+#ifdef CUTOUT
+  float alpha = base_color.a;
+#ifdef TEXTURED
+  alpha *= textureLod(surface_texture, texture_uv, 0.0).a;
+#endif
+  bool hole = alpha < cutoff.x;
+#endif
+#ifdef COLOR_OUT
+  vec3 shade = base_color.rgb;
+#ifdef TEXTURED
+  vec2 texels = vec2(textureSize(surface_texture, 0));
+  float lod = level_of_detail(dFdx(texture_uv) * texels, dFdy(texture_uv) * texels, px, py, n);
+  shade *= textureLod(surface_texture, texture_uv, lod).rgb;
+#endif
+#ifdef VERTEX_COLORS
+  shade *= vertex_color;
+#endif
+#if defined(LIGHTMAPPED)
+  shade *= 2.0 * textureLod(lightmap, light_uv, 0.0).rgb;
+#elif !defined(EMISSIVE)
+  vec3 facing = dot(n, offset) > 0.0 ? -n : n;
+#ifdef SMOOTH
+  facing = dot(smooth_normal, facing) < 0.0 ? -smooth_normal : smooth_normal;
+#endif
+  shade *= ambient_light(normalize(facing));
+#endif
+  out_color = vec4(shade, 1.0);
+#endif
+#ifdef DEPTH_OUT
+#ifdef CUBE_FACE
+  // One over depth is linear across the image of a plane, so value and slope give the plane's depth at any nearby ray.
+  out_depth = gl_FragCoord.w;
+  out_slope = vec2(dFdx(gl_FragCoord.w), dFdy(gl_FragCoord.w));
+#else
+  out_depth = 1.0 / gl_FragCoord.w;
+#endif
+#endif
+#ifdef ID_OUT
+  out_id = instance_id.x;
+#endif
+#ifdef CUTOUT
+  if (hole) discard;
+#endif
+}
+)";
+
+constexpr const char* kScreenVertex = R"(
+out vec3 ray;
+void main() {
+  vec2 corner = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+  gl_Position = vec4(corner, 0.0, 1.0);
+  vec2 image = (corner + projection.zw) / projection.xy;
+  ray = right.xyz * image.x + up.xyz * image.y - back.xyz;
+}
+)";
+
+constexpr const char* kSky = R"(
+uniform vec3 zenith;
+uniform vec3 horizon;
+vec4 sky(vec3 direction) {
+  return vec4(mix(horizon, zenith, max(normalize(direction).y, 0.0)), 1.0);
+}
+)";
+
+constexpr const char* kSkyMain = R"(
+in vec3 ray;
+void main() {
+  out_color = sky(ray);
+#ifdef DEPTH_OUT
+  out_depth = 0.0;
+#endif
+#ifdef ID_OUT
+  out_id = 0u;
+#endif
+}
+)";
+
+// Each layer holds one sample of every pixel.
+constexpr const char* kAverageMain = R"(
+layout(location = 0) out vec4 out_color;
+uniform sampler2DArray color_map;
+uniform int sample_count;
+void main() {
+  vec4 sum = vec4(0.0);
+  for (int i = 0; i < sample_count; ++i) sum += texelFetch(color_map, ivec3(gl_FragCoord.xy, i), 0);
+  out_color = sum / float(sample_count);
+}
+)";
+
+// Layer f holds face f, whose axes are given in camera coordinates.
+constexpr const char* kPanoramaMain = R"(
+uniform sampler2DArray color_map;
+uniform sampler2DArray depth_map;
+uniform usampler2DArray id_map;
+uniform sampler2DArray slope_map;
+uniform vec3 face_axes[18];   // right, up, back of each face
+uniform vec2 samples[16];
+uniform int sample_count;
+uniform int face_size;
+uniform int width;
+uniform int height;
+
+vec3 direction(vec2 pixel) {
+  float longitude = (pixel.x / float(width) - 0.5) * 6.283185307179586;
+  float latitude = (0.5 - pixel.y / float(height)) * 3.141592653589793;
+  return vec3(sin(longitude) * cos(latitude), sin(latitude), -cos(longitude) * cos(latitude));
+}
+int face_of(vec3 d) {
+  vec3 a = abs(d);
+  if (a.z >= a.x && a.z >= a.y) return d.z < 0.0 ? 0 : 2;
+  if (a.x >= a.y) return d.x > 0.0 ? 1 : 3;
+  return d.y > 0.0 ? 4 : 5;
+}
+vec2 face_position(vec3 d, int face) {
+  float depth = -dot(d, face_axes[3 * face + 2]);
+  vec2 image = vec2(dot(d, face_axes[3 * face]), -dot(d, face_axes[3 * face + 1])) / depth;
+  return clamp((0.5 * image + 0.5) * float(face_size), vec2(0.001), vec2(float(face_size) - 0.001));
+}
+// Bilinear among the texels that show the same instance, so that outlines stay sharp.
+vec4 surface_color(vec2 position, int face, uint id) {
+  vec2 corner = floor(position - 0.5);
+  vec2 part = position - 0.5 - corner;
+  vec4 sum = vec4(0.0);
+  float weights = 0.0;
+  for (int i = 0; i < 4; ++i) {
+    vec2 step = vec2(i & 1, i >> 1);
+    ivec3 texel = ivec3(clamp(ivec2(corner + step), 0, face_size - 1), face);
+    vec2 share = mix(1.0 - part, part, step);
+    float weight = texelFetch(id_map, texel, 0).x == id ? share.x * share.y : 0.0;
+    sum += weight * texelFetch(color_map, texel, 0);
+    weights += weight;
+  }
+  return sum / weights;
+}
+void main() {
+  vec3 d = direction(gl_FragCoord.xy);
+  int face = face_of(d);
+  vec2 position = face_position(d, face);
+  ivec3 texel = ivec3(position, face);
+#ifdef COLOR_OUT
+  vec4 sum = vec4(0.0);
+  for (int i = 0; i < sample_count; ++i) {
+    vec3 ray = direction(gl_FragCoord.xy + samples[i]);
+    int ray_face = face_of(ray);
+    vec2 hit = face_position(ray, ray_face);
+    uint id = texelFetch(id_map, ivec3(hit, ray_face), 0).x;
+    sum += id == 0u ? sky(right.xyz * ray.x + up.xyz * ray.y + back.xyz * ray.z) : surface_color(hit, ray_face, id);
+  }
+  out_color = sum / float(sample_count);
+#endif
+#ifdef DEPTH_OUT
+  float inverse = texelFetch(depth_map, texel, 0).x;
+  vec2 from_centre = position - floor(position) - 0.5;
+  float at_ray = inverse + dot(texelFetch(slope_map, texel, 0).xy, from_centre);
+  at_ray = clamp(at_ray, 0.5 * inverse, 2.0 * inverse);
+  out_depth = inverse == 0.0 ? 0.0 : 1.0 / (at_ray * max(abs(d.x), max(abs(d.y), abs(d.z))));
+#endif
+#ifdef ID_OUT
+  out_id = texelFetch(id_map, texel, 0).x;
+#endif
+}
+)";
+
+std::string header(ProgramKey key) {
+  static constexpr std::array<std::pair<ProgramKey, const char*>, 10> kNames{{{kTextured, "TEXTURED"},
+                                                                              {kLightmapped, "LIGHTMAPPED"},
+                                                                              {kEmissive, "EMISSIVE"},
+                                                                              {kVertexColors, "VERTEX_COLORS"},
+                                                                              {kCutout, "CUTOUT"},
+                                                                              {kSmooth, "SMOOTH"},
+                                                                              {kColorOut, "COLOR_OUT"},
+                                                                              {kDepthOut, "DEPTH_OUT"},
+                                                                              {kIdOut, "ID_OUT"},
+                                                                              {kCubeFace, "CUBE_FACE"}}};
+  std::string text = "#version 330 core\n";
+  for (const auto& [bit, name] : kNames) {
+    if ((key & bit) != 0) text += std::string("#define ") + name + "\n";
+  }
+  return text;
+}
+
+}  // namespace
+
+ProgramKey reduce(ProgramKey key) {
+  if ((key & kColorOut) == 0) {
+    key &= ~(kLightmapped | kEmissive | kVertexColors | kSmooth);
+    if ((key & kCutout) == 0) key &= ~kTextured;
+  }
+  if ((key & kEmissive) != 0) key &= ~(kLightmapped | kSmooth);
+  if ((key & kLightmapped) != 0) key &= ~kSmooth;
+  return key;
+}
+
+std::string scene_vertex_source(ProgramKey key) { return header(key) + kViewBlock + kSurfaceBlocks + kSceneVertex; }
+
+std::string scene_fragment_source(ProgramKey key) {
+  return header(key) + kViewBlock + kSurfaceBlocks + kOutputs + kSceneFragment + kShading + kSceneMain;
+}
+
+std::string screen_vertex_source() { return header(0) + kViewBlock + kScreenVertex; }
+
+std::string sky_fragment_source(ProgramKey outputs) { return header(outputs) + kOutputs + kSky + kSkyMain; }
+
+std::string average_fragment_source() { return header(0) + kAverageMain; }
+
+std::string panorama_fragment_source(ProgramKey outputs) {
+  return header(outputs) + kViewBlock + kOutputs + kSky + kPanoramaMain;
+}
+
+}  // namespace wiw::gpu

@@ -1,0 +1,17 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include "wiw/render/gpu/framebuffer.hpp"
+
+namespace wiw::gpu {
+
+/// Targets of a render call: the views of a batch, the faces of one panorama, the samples of one view.
+struct Workspace {
+  explicit Workspace(const Gl& gl) : batch(gl), faces(gl), samples(gl) {}
+
+  Framebuffer batch;
+  Framebuffer faces;
+  Framebuffer samples;
+};
+
+}  // namespace wiw::gpu
