@@ -64,7 +64,7 @@ class Trip:
 
     def geodesic_to_goal(self) -> float:
         """Metres of the shortest walk to the goal; inf when it cannot be reached."""
-        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position, metric="detour"))
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         """Starts a given episode and observes."""
         place = world(episode.scene, self.task.backend)
         config = _env.NavigationConfig(motion=_env.Motion.__members__[self.task.motion])
-        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh.core, config)
+        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh, config)
         self._core.reset(np.asarray(episode.start_position), episode.start_yaw)
         self._trip = Trip(episode, place, [self._core.position])
         self._goal = self.task.goal(place, episode)
