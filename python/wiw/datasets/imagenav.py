@@ -47,11 +47,11 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
     points = world.navmesh.sample(2 * rules.attempts, key)
     draws = core.uniform(core.fold_key([key, 1]), 5 * rules.attempts).reshape(-1, 5)
     for start, goal, draw in zip(points[::2], points[1::2], draws, strict=True):
-        geodesic = float(world.navmesh.geodesic_distance(start, goal, metric="detour"))
+        geodesic = float(world.navmesh.geodesic_distance(start, goal))
         if not rules.shortest <= geodesic <= rules.longest:
             continue
         start_yaw = float(2 * np.pi * draw[0])
-        ideal = ideal_primitives(np.asarray(world.navmesh.shortest_path(start, goal, metric="detour")), start_yaw)
+        ideal = ideal_primitives(np.asarray(world.navmesh.shortest_path(start, goal)), start_yaw)
         if ideal > rules.budget or in_sight(world, start, goal):
             continue
         goal_yaw = _best_view(world, goal, 2 * np.pi * draw[1:], rules)

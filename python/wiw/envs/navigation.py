@@ -67,7 +67,7 @@ class Trip:
 
     def geodesic_to_goal(self) -> float:
         """Metres of the shortest walk to the goal; inf when it cannot be reached."""
-        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position, metric="detour"))
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
 
 
 @dataclass(frozen=True)
