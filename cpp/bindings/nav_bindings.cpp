@@ -9,7 +9,9 @@
 #include <limits>
 
 #include "arrays.hpp"
+#include "wiw/nav/distance_field.hpp"
 #include "wiw/nav/nav_mesh.hpp"
+#include "wiw/nav/waypoints.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -158,8 +160,8 @@ py::object geodesic_distance(const NavMesh& mesh, const Array<float>& a, const A
   return py::make_tuple(distances, pairs.single() ? py::cast(reasons[0]) : py::cast(reasons));
 }
 
-py::array_t<float> shortest_path(const NavMesh& mesh, const Array<float>& a, const Array<float>& b,
-                                 const std::string& metric_name) {
+py::object shortest_path(const NavMesh& mesh, const Array<float>& a, const Array<float>& b,
+                         const std::string& metric_name, bool return_length) {
   const Points start = to_points(a, "a"), end = to_points(b, "b");
   if (!start.single || !end.single) throw ArgumentError("expected one start and one end, each [3]");
   const Metric metric = to_metric(metric_name);
@@ -171,7 +173,69 @@ py::array_t<float> shortest_path(const NavMesh& mesh, const Array<float>& a, con
   if (path.reason != Reason::kNone) {
     throw NavigationError(std::string("no way from start to end: ") + reason_text(path.reason));
   }
-  return point_array(path.points, {static_cast<py::ssize_t>(path.points.size()), 3});
+  py::array_t<float> points = point_array(path.points, {static_cast<py::ssize_t>(path.points.size()), 3});
+  if (return_length) return py::make_tuple(points, path.length);
+  return points;
+}
+
+double surface_length(const NavMesh& mesh, const Array<float>& array, float step) {
+  const Points points = to_points(array, "points");
+  const py::gil_scoped_release release;
+  return mesh.surface_length(points.values, step);
+}
+
+py::array_t<double> distance_matrix(const NavMesh& mesh, const Array<float>& array, const std::string& metric_name) {
+  const Points points = to_points(array, "points");
+  const Metric metric = to_metric(metric_name);
+  const auto n = static_cast<py::ssize_t>(points.values.size());
+  auto metres = std::make_unique<std::vector<double>>();
+  {
+    const py::gil_scoped_release release;
+    *metres = mesh.distance_matrix(points.values, metric);
+  }
+  const double* data = metres->data();
+  const py::capsule owner(metres.release(), [](void* p) { delete static_cast<std::vector<double>*>(p); });
+  return py::array_t<double>({n, n}, data, owner);
+}
+
+py::object field_distance(const DistanceField& field, const Array<float>& array, bool return_reason) {
+  const Points points = to_points(array, "points");
+  std::vector<double> metres;
+  std::vector<std::string> reasons;
+  {
+    const py::gil_scoped_release release;
+    for (const Eigen::Vector3f& point : points.values) {
+      const Distance distance = field.distance(point);
+      metres.push_back(distance.metres);
+      reasons.emplace_back(reason_text(distance.reason));
+    }
+  }
+  py::object distances = value_array(points.single, metres);
+  if (!return_reason) return distances;
+  return py::make_tuple(distances, points.single ? py::cast(reasons[0]) : py::cast(reasons));
+}
+
+py::object select_among(const Array<double>& distances, double mean_weight, double spacing) {
+  bindings::expect_shape(distances, {-1, distances.ndim() == 2 ? distances.shape(0) : -1}, "distances [N, N]");
+  const auto n = static_cast<std::size_t>(distances.shape(0));
+  RankedPlaces places;
+  {
+    const py::gil_scoped_release release;
+    places = select_waypoints(std::span(distances.data(), n * n), n, {.mean_weight = mean_weight, .spacing = spacing});
+  }
+  const std::vector<std::int64_t> index(places.index.begin(), places.index.end());
+  return py::make_tuple(value_array(false, index), value_array(false, places.score));
+}
+
+py::array_t<float> select_on_mesh(const NavMesh& mesh, std::uint64_t seed, double density, std::size_t min_samples,
+                                  double mean_weight, double spacing, const std::string& metric) {
+  const WaypointOptions options{density, min_samples, mean_weight, spacing, to_metric(metric)};
+  std::vector<Eigen::Vector3f> points;
+  {
+    const py::gil_scoped_release release;
+    points = select_waypoints(mesh, seed, options);
+  }
+  return point_array(points, {static_cast<py::ssize_t>(points.size()), 3});
 }
 
 std::shared_ptr<NavMesh> from_triangles(const Array<float>& vertices, const Array<std::int64_t>& faces,
@@ -275,9 +339,10 @@ void bind_geometry(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
       "outline",
       [](const NavMesh& self) {
         const auto& ends = self.surface().outline;
-        return point_array(ends, {static_cast<py::ssize_t>(ends.size() / 2), 2, 3});
+        return py::make_tuple(point_array(ends, {static_cast<py::ssize_t>(ends.size() / 2), 2, 3}),
+                              value_array(false, self.surface().outline_island));
       },
-      "Walls and drops: float32 [S, 2, 3] segments around all islands.");
+      "Walls and drops: float32 [S, 2, 3] segments around all islands, and the island of each as int32 [S].");
 }
 
 void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
@@ -299,8 +364,50 @@ void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
            "Length in metres of the shortest way between `a` and `b` (float [N, 3] or [3] each; one may be a single "
            "point): float64 [N] or float, inf where there is none. With return_reason also why: '' or 'start off "
            "mesh', 'end off mesh', 'other island', or for metric='detour' its search limit.");
+  mesh.def("distance_matrix", &distance_matrix, py::arg("points"), py::arg("metric") = "exact",
+           "float64 [N, N]: length in metres of the shortest way between any two of `points` (float [N, 3]), inf where "
+           "there is none. Far faster than asking for each pair.");
   mesh.def("shortest_path", &shortest_path, py::arg("a"), py::arg("b"), py::arg("metric") = "exact",
-           "float32 [P, 3]: the bends of the shortest way, ends included. NavigationError says why there is none.");
+           py::arg("return_length") = false,
+           "float32 [P, 3]: the bends of the shortest way, ends included; with return_length also its length in the "
+           "metric asked for. NavigationError says why there is none.");
+  mesh.def("surface_length", &surface_length, py::arg("points"), py::arg("step") = 0.05f,
+           "Metres of a polyline (float [P, 3]) laid onto the surface, climbs included: what an agent walks along a "
+           "path. Heights are followed every `step` metres.");
+}
+
+void bind_fields(py::module_& module, py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  py::class_<DistanceField>(module, "DistanceField",
+                            "Exact distance to the nearest of fixed goals, made by NavMesh.distances_from.")
+      .def(
+          "__call__", &field_distance, py::arg("points"), py::arg("return_reason") = false,
+          "float64 [N] metres from `points` (float [N, 3] or [3]) to the nearest goal, inf where there is no way; with "
+          "return_reason also why: '', 'start off mesh' or 'other island'.");
+  mesh.def(
+      "distances_from",
+      [](const std::shared_ptr<NavMesh>& self, const Array<float>& array) {
+        const Points goals = to_points(array, "goals");
+        const py::gil_scoped_release release;
+        return DistanceField(self, goals.values);
+      },
+      py::arg("goals"),
+      "A DistanceField of one goal ([3]) or the nearest of several ([N, 3]): what the goals see is computed once, each "
+      "later point costs some ten microseconds. NavigationError if a goal is off the mesh.");
+}
+
+void bind_waypoints(py::module_& module, py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  const WaypointOptions defaults;
+  module.def(
+      "select_waypoints", &select_among, py::arg("distances"), py::arg("mean_weight") = defaults.mean_weight,
+      py::arg("spacing") = defaults.spacing,
+      "Peripheral places, spread out (World-in-World, Algorithm 1, stage 1): from finite `distances` [N, N], the "
+      "indices int64 [W] in descending order of leaf score, eccentricity + mean_weight x mean distance, of which "
+      "no two are closer than `spacing`, and their scores float64 [W].");
+  mesh.def("select_waypoints", &select_on_mesh, py::arg("seed"), py::kw_only(), py::arg("density") = defaults.density,
+           py::arg("min_samples") = defaults.min_samples, py::arg("mean_weight") = defaults.mean_weight,
+           py::arg("spacing") = defaults.spacing, py::arg("metric") = "exact",
+           "float32 [W, 3]: waypoints of the largest island, chosen by wiw.nav.select_waypoints among max(min_samples, "
+           "density x area) samples.");
 }
 
 }  // namespace
@@ -309,11 +416,13 @@ void bind_nav(py::module_& module) {
   bind_settings(module);
   py::class_<Island>(module, "Island", "A connected part of a navigation mesh.")
       .def_readonly("area", &Island::area, "Surface in m2.")
-      .def_readonly("polygons", &Island::polygons)
+      .def_readonly("polygons", &Island::polygons, "Number of polygons.")
       .def_property_readonly("bounds", [](const Island& self) { return box_array(self.bounds); }, "float32 [2, 3].");
   py::class_<NavMesh, std::shared_ptr<NavMesh>> mesh(
       module, "NavMesh", "Where an agent can stand, for one body size. Immutable; safe to share between threads.");
   bind_construction(mesh);
   bind_geometry(mesh);
   bind_queries(mesh);
+  bind_fields(module, mesh);
+  bind_waypoints(module, mesh);
 }

@@ -12,6 +12,6 @@ A* finds, often a little too long, not symmetric, and infinite beyond 256 polygo
 search without that limit.
 """
 
-from wiw._core.nav import Island, NavMesh, NavMeshSettings
+from wiw._core.nav import DistanceField, Island, NavMesh, NavMeshSettings, select_waypoints
 
-__all__ = ["Island", "NavMesh", "NavMeshSettings"]
+__all__ = ["DistanceField", "Island", "NavMesh", "NavMeshSettings", "select_waypoints"]

@@ -7,6 +7,7 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/core/rng.hpp"
+#include "wiw/core/thread_pool.hpp"
 #include "wiw/nav/detour_path.hpp"
 #include "wiw/nav/navmesh_file.hpp"
 #include "wiw/nav/recast_build.hpp"
@@ -26,7 +27,10 @@ const char* reason_text(Reason reason) {
 }
 
 NavMesh::NavMesh(std::vector<std::uint8_t> tile, const NavMeshSettings& settings)
-    : settings_(settings), mesh_(std::move(tile)), surface_(extract_surface(mesh_)) {}
+    : settings_(settings),
+      mesh_(std::move(tile)),
+      surface_(extract_surface(mesh_)),
+      graph_(mesh_, surface_.polygon_island) {}
 
 std::shared_ptr<NavMesh> NavMesh::from_triangles(std::span<const Eigen::Vector3f> vertices,
                                                  std::span<const Eigen::Matrix<std::uint32_t, 3, 1>> triangles,
@@ -102,11 +106,23 @@ std::vector<Eigen::Vector3f> NavMesh::sample(std::size_t count, std::uint64_t se
   return points;
 }
 
-Eigen::Vector3f NavMesh::try_step(const Eigen::Vector3f& start, const Eigen::Vector3f& end, bool sliding) const {
+NavMesh::Ends NavMesh::project_ends(const Eigen::Vector3f& start, const Eigen::Vector3f& end) const {
   const auto from = mesh_.project(start);
   const auto to = mesh_.project(end);
-  const bool connected = from && to && surface_.polygon_island[from->polygon] == surface_.polygon_island[to->polygon];
-  return connected ? walk(mesh_, surface_.polygon_island, *from, end, sliding) : start;
+  if (!from) return {.reason = Reason::kStartOffMesh};
+  if (!to) return {.reason = Reason::kEndOffMesh};
+  const bool connected = surface_.polygon_island[from->polygon] == surface_.polygon_island[to->polygon];
+  return {*from, *to, connected ? Reason::kNone : Reason::kOtherIsland};
+}
+
+Eigen::Vector3f NavMesh::try_step(const Eigen::Vector3f& start, const Eigen::Vector3f& end, bool sliding) const {
+  const Ends ends = project_ends(start, end);
+  return ends.reason == Reason::kNone ? walk(mesh_, graph_, surface_.polygon_island, ends.start, end, sliding) : start;
+}
+
+const Geodesics& NavMesh::geodesics() const {
+  std::call_once(geodesics_made_, [this] { geodesics_ = std::make_unique<const Geodesics>(graph_); });
+  return *geodesics_;
 }
 
 Distance NavMesh::geodesic_distance(const Eigen::Vector3f& start, const Eigen::Vector3f& end, Metric metric) const {
@@ -114,26 +130,75 @@ Distance NavMesh::geodesic_distance(const Eigen::Vector3f& start, const Eigen::V
   return {path.length, path.reason};
 }
 
-Path NavMesh::shortest_path(const Eigen::Vector3f& start, const Eigen::Vector3f& end, Metric metric) const {
-  Path path{.length = std::numeric_limits<double>::infinity()};
-  const auto from = mesh_.project(start);
-  const auto to = mesh_.project(end);
-  if (!from || !to) {
-    path.reason = from ? Reason::kEndOffMesh : Reason::kStartOffMesh;
-    return path;
+Path NavMesh::exact_path(const Projection& start, const Projection& end) const {
+  const Geodesics& exact = geodesics();
+  const Geodesics::Way way = exact.way(exact.site(start), exact.site(end));
+  Path path{.points = {start.point}, .length = way.metres};
+  for (const int corner : way.corners) {
+    path.points.emplace_back(mesh_.tile().verts + 3 * exact.corners().list[corner].vertex);
   }
-  if (surface_.polygon_island[from->polygon] != surface_.polygon_island[to->polygon]) {
-    path.reason = Reason::kOtherIsland;
-    return path;
-  }
-  if (metric == Metric::kExact) throw Error("metric 'exact' is not built yet; ask for 'detour'");
-  path.points = detour_path(mesh_, *from, *to, metric == Metric::kDetour);
-  if (path.points.empty()) {
-    path.reason = Reason::kSearchLimit;
-  } else {
-    path.length = polyline_length(path.points);
-  }
+  path.points.push_back(end.point);
   return path;
+}
+
+Path NavMesh::shortest_path(const Eigen::Vector3f& start, const Eigen::Vector3f& end, Metric metric) const {
+  constexpr double kInfinity = std::numeric_limits<double>::infinity();
+  const Ends ends = project_ends(start, end);
+  if (ends.reason != Reason::kNone) return {.length = kInfinity, .reason = ends.reason};
+  if (metric == Metric::kExact) return exact_path(ends.start, ends.end);
+  Path path{.points = detour_path(mesh_, ends.start, ends.end, metric == Metric::kDetour)};
+  if (path.points.empty()) return {.length = kInfinity, .reason = Reason::kSearchLimit};
+  path.length = polyline_length(path.points);
+  return path;
+}
+
+std::vector<double> NavMesh::distance_matrix(std::span<const Eigen::Vector3f> points, Metric metric) const {
+  const std::size_t n = points.size();
+  std::vector<double> metres(n * n, std::numeric_limits<double>::infinity());
+  if (metric != Metric::kExact) {
+    parallel_for(n, [&](std::size_t i) {
+      for (std::size_t j = 0; j < n; ++j) metres[i * n + j] = geodesic_distance(points[i], points[j], metric).metres;
+    });
+    return metres;
+  }
+  std::vector<Site> sites;
+  std::vector<std::size_t> place;  // of each site among the points
+  for (std::size_t i = 0; i < n; ++i) {
+    const auto projection = mesh_.project(points[i]);
+    if (!projection) continue;
+    sites.push_back(geodesics().site(*projection));
+    place.push_back(i);
+  }
+  if (sites.size() == n) {
+    geodesics().matrix(sites, metres);
+    return metres;
+  }
+  std::vector<double> on_mesh(sites.size() * sites.size());
+  geodesics().matrix(sites, on_mesh);
+  for (std::size_t i = 0; i < sites.size(); ++i) {
+    for (std::size_t j = 0; j < sites.size(); ++j) metres[place[i] * n + place[j]] = on_mesh[i * sites.size() + j];
+  }
+  return metres;
+}
+
+double NavMesh::surface_length(std::span<const Eigen::Vector3f> points, float step) const {
+  if (!(step > 0)) throw ArgumentError("expected a positive step, got " + std::to_string(step));
+  const auto on_surface = [&](const Eigen::Vector3f& point) { return snap(point).value_or(point); };
+  double metres = 0;
+  for (std::size_t i = 1; i < points.size(); ++i) {
+    Eigen::Vector3f from = on_surface(points[i - 1]);
+    const Eigen::Vector3f end = on_surface(points[i]);
+    const int steps = static_cast<int>(std::ceil(std::min(1e6f, (end - from).norm() / step)));
+    const Eigen::Vector3f start = from;
+    for (int k = 1; k <= steps; ++k) {
+      Eigen::Vector3f to = start + (end - start) * (static_cast<float>(k) / static_cast<float>(steps));
+      to.y() = from.y();  // the search for the surface begins where the walk is, not on the chord
+      to = on_surface(to);
+      metres += (to - from).norm();
+      from = to;
+    }
+  }
+  return metres;
 }
 
 }  // namespace wiw::nav

@@ -3,12 +3,14 @@
 
 #include <Eigen/Geometry>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <span>
 #include <string>
 #include <vector>
 
 #include "wiw/nav/detour_mesh.hpp"
+#include "wiw/nav/geodesics.hpp"
 #include "wiw/nav/settings.hpp"
 #include "wiw/nav/surface.hpp"
 #include "wiw/scene/scene.hpp"
@@ -74,13 +76,34 @@ class NavMesh {
                                            Metric metric = Metric::kExact) const;
   [[nodiscard]] Path shortest_path(const Eigen::Vector3f& start, const Eigen::Vector3f& end,
                                    Metric metric = Metric::kExact) const;
+  /// Row-major [n, n] metres between all pairs, infinite where there is no way. kExact is symmetric; the Detour
+  /// metrics are asked once for each ordered pair.
+  [[nodiscard]] std::vector<double> distance_matrix(std::span<const Eigen::Vector3f> points,
+                                                    Metric metric = Metric::kExact) const;
+
+  /// Metres of a polyline laid onto the surface, climbs included: heights are followed in steps of at most `step`.
+  /// Points and lines are projected, so a line that leaves the mesh is measured along its edge.
+  [[nodiscard]] double surface_length(std::span<const Eigen::Vector3f> points, float step = 0.05f) const;
+
+  [[nodiscard]] std::optional<Projection> project(const Eigen::Vector3f& point) const { return mesh_.project(point); }
+  /// The exact metric's visibility graph, made at the first call.
+  [[nodiscard]] const Geodesics& geodesics() const;
 
  private:
+  struct Ends {
+    Projection start, end;
+    Reason reason = Reason::kNone;
+  };
   NavMesh(std::vector<std::uint8_t> tile, const NavMeshSettings& settings);
+  [[nodiscard]] Ends project_ends(const Eigen::Vector3f& start, const Eigen::Vector3f& end) const;
+  [[nodiscard]] Path exact_path(const Projection& start, const Projection& end) const;
 
   NavMeshSettings settings_;
   DetourMesh mesh_;
   Surface surface_;
+  PolygonGraph graph_;
+  mutable std::once_flag geodesics_made_;
+  mutable std::unique_ptr<const Geodesics> geodesics_;
 };
 
 }  // namespace wiw::nav

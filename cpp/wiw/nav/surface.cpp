@@ -87,6 +87,7 @@ void collect_outline(const DetourMesh& mesh, Surface& surface) {
     if (surface.polygon_island[i] < 0) continue;
     for (int k = 0; k < poly.vertCount; ++k) {
       if (poly.neis[k] != 0 && surface.polygon_island[poly.neis[k] - 1] >= 0) continue;
+      surface.outline_island.push_back(surface.polygon_island[i]);
       surface.outline.push_back(vertex(tile, poly.verts[k]));
       surface.outline.push_back(vertex(tile, poly.verts[(k + 1) % poly.vertCount]));
     }

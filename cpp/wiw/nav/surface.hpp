@@ -24,6 +24,7 @@ struct Surface {
   std::vector<int> triangle_island;      // per triangle
   std::vector<double> cumulative_area;   // per triangle, sum up to and including it; triangles are sorted by island
   std::vector<Eigen::Vector3f> outline;  // two a boundary segment
+  std::vector<int> outline_island;       // per boundary segment
 
   [[nodiscard]] double area() const { return cumulative_area.empty() ? 0 : cumulative_area.back(); }
 };
