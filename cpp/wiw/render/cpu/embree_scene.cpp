@@ -34,6 +34,7 @@ EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa is
                        " packets; set WIW_ISA to a lower one (scalar, avx2)");
   }
   for (const Part& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
+  in_moved_.assign(shading.parts().size(), false);
   fixed_ = rtcNewScene(device_);
   moved_ = rtcNewScene(device_);
   rtcSetSceneFlags(moved_, RTC_SCENE_FLAG_DYNAMIC);
@@ -102,17 +103,17 @@ void EmbreeScene::pierce(const RTCFilterFunctionNArguments* arguments) {
 
 void EmbreeScene::move(std::size_t number, const Eigen::Affine3f& T_world_instance) {
   const auto id = static_cast<unsigned>(number);
-  RTCGeometry geometry = rtcGetGeometry(moved_, id);
-  if (geometry == nullptr) {
-    rtcGetDeviceError(device_);  // asking for an id that is not attached yet raises one
-    geometry = make_geometry(number, T_world_instance);
+  if (!in_moved_[number]) {
+    RTCGeometry geometry = make_geometry(number, T_world_instance);
     rtcSetGeometryBuildQuality(geometry, RTC_BUILD_QUALITY_LOW);  // rebuilt at every move
     rtcCommitGeometry(geometry);
     rtcAttachGeometryByID(moved_, geometry, id);
     rtcReleaseGeometry(geometry);
     // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
     rtcSetGeometryMask(rtcGetGeometry(fixed_, id), 0);
+    in_moved_[number] = true;
   } else {
+    RTCGeometry geometry = rtcGetGeometry(moved_, id);
     write_vertices(geometry, number, T_world_instance);
     rtcUpdateGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0);
     rtcCommitGeometry(geometry);

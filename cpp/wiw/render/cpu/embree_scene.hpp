@@ -48,6 +48,7 @@ class EmbreeScene {
   RTCDevice device_ = nullptr;
   RTCScene fixed_ = nullptr;
   RTCScene moved_ = nullptr;
+  std::vector<bool> in_moved_;  // by part
   bool any_moved_ = false;
 };
 
