@@ -1,0 +1,454 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include <map>
+#include <memory>
+
+#include "actions.hpp"
+#include "wiw/planner/assemble.hpp"
+#include "wiw/planner/beam_search.hpp"
+#include "wiw/planner/seeds.hpp"
+
+namespace py = pybind11;
+using namespace wiw;
+using namespace wiw::bindings;
+
+namespace {
+
+using Bytes = Array<std::uint8_t>;
+
+/// A batch, and which of its candidates' steps show the same.
+struct BoundBatch {
+  Batch batch;
+  ViewIndex index;
+};
+
+template <class T>
+T choose(const std::string& value, const std::map<std::string, T>& choices, const char* name) {
+  const auto found = choices.find(value);
+  if (found != choices.end()) return found->second;
+  std::string names;
+  for (const auto& [choice, _] : choices) names += (names.empty() ? "'" : ", '") + choice + "'";
+  throw ArgumentError(std::string(name) + ": expected one of " + names + ", got '" + value + "'");
+}
+
+Bytes to_bytes(const py::array& array, const char* expected) {
+  if (!py::isinstance<py::array_t<std::uint8_t>>(array)) {
+    throw ArgumentError(std::string("expected ") + expected + ", got " + shape_text(array));
+  }
+  return Bytes(array);
+}
+
+ActionSequence plan_of(const py::handle& object) {
+  const py::array array = py::array::ensure(py::reinterpret_borrow<py::object>(object));
+  if (!array) throw ArgumentError("expected a plan of action ids [K], got " + std::string(py::repr(object)));
+  return to_plan(array);
+}
+
+Plans plans_of(const py::sequence& episodes) {
+  Plans plans;
+  for (const py::handle& episode : episodes) {
+    auto& candidates = plans.emplace_back();
+    for (const py::handle& plan : py::reinterpret_borrow<py::sequence>(episode)) candidates.push_back(plan_of(plan));
+  }
+  return plans;
+}
+
+py::list plans_list(const Plans& plans) {
+  py::list episodes;
+  for (const auto& candidates : plans) {
+    py::list list;
+    for (const ActionSequence& plan : candidates) list.append(to_ids(plan));
+    episodes.append(list);
+  }
+  return episodes;
+}
+
+template <class T, class Items, class Get>
+py::array_t<T> column(const Items& items, Get get) {
+  py::array_t<T> array(static_cast<py::ssize_t>(items.size()));
+  T* out = array.mutable_data();
+  for (const auto& item : items) *out++ = static_cast<T>(get(item));
+  return array;
+}
+
+py::array_t<std::int64_t> integers(const std::vector<int>& values) {
+  return column<std::int64_t>(values, [](int value) { return value; });
+}
+
+/// Start of each row of a part as (part, index, frame) into the rollouts made so far.
+py::array_t<std::int64_t> start_places(const Batch& batch, const Part& part) {
+  py::array_t<std::int64_t> array({static_cast<py::ssize_t>(part.start.size()), py::ssize_t{3}});
+  std::int64_t* out = array.mutable_data();
+  for (const Source& source : part.start) {
+    const Batch::Place place = batch.place(source);
+    *out++ = place.part;
+    *out++ = place.index;
+    *out++ = place.frame;
+  }
+  return array;
+}
+
+py::object part_object(const py::object& type, const Batch& batch, const Part& part) {
+  const auto rows = static_cast<py::ssize_t>(part.rows.size());
+  const auto steps = static_cast<py::ssize_t>(part.steps);
+  ActionSequence actions;
+  std::vector<PlanarPose> trajectories;
+  for (const ActionSequence& row : part.actions) {
+    actions.insert(actions.end(), row.begin(), row.end());
+    const auto trajectory = to_trajectory(row, batch.spec().space);
+    trajectories.insert(trajectories.end(), trajectory.begin(), trajectory.end());
+  }
+  std::vector<Pose> viewpoints;
+  for (const PlanarPose& pose : trajectories) viewpoints.push_back(to_viewpoint(pose));
+  return type(part.first, part.steps, integers(part.rows), to_ids(actions).reshape({rows, steps}),
+              planar_array(trajectories).reshape({rows, steps, py::ssize_t{3}}),
+              matrix_array(viewpoints).reshape({rows, steps, py::ssize_t{4}, py::ssize_t{4}}), integers(part.length),
+              integers(part.shared), start_places(batch, part));
+}
+
+Panoramas to_panoramas(const Bytes& array) {
+  expect_shape(array, {-1, -1, -1, 3}, "panoramas uint8 [episodes, H, W, 3]");
+  return {array.data(), static_cast<std::size_t>(array.shape(0)),
+          Size{static_cast<int>(array.shape(1)), static_cast<int>(array.shape(2))}};
+}
+
+/// The answers of a model with the arrays that keep them alive.
+struct Answers {
+  Imagination imagination;
+  std::vector<Bytes> arrays;
+};
+
+Answers to_answers(const py::sequence& rollouts, const std::string& frames) {
+  Answers answers;
+  answers.imagination.kind = choose<FrameKind>(
+      frames, {{"panorama", FrameKind::kPanorama}, {"perspective", FrameKind::kPerspective}}, "frames");
+  constexpr const char* kExpected = "rollouts uint8 [rows, frames, H, W, 3], one array a part";
+  for (const py::handle& item : rollouts) {
+    const Bytes array = to_bytes(py::reinterpret_borrow<py::array>(item), kExpected);
+    expect_shape(array, {-1, -1, -1, -1, 3}, kExpected);
+    answers.imagination.rollouts.push_back({array.data(), static_cast<std::size_t>(array.shape(0)),
+                                            static_cast<std::size_t>(array.shape(1)),
+                                            Size{static_cast<int>(array.shape(2)), static_cast<int>(array.shape(3))}});
+    answers.arrays.push_back(array);
+  }
+  return answers;
+}
+
+std::vector<py::ssize_t> with_view_shape(std::vector<py::ssize_t> shape, const ViewMaker& maker) {
+  if (maker.count() > 1) shape.push_back(maker.count());
+  shape.insert(shape.end(), {maker.spec().size.height, maker.spec().size.width, 3});
+  return shape;
+}
+
+/// `out` if given and fitting, else a new array.
+py::array_t<std::uint8_t> output(const std::optional<py::array>& out, const std::vector<py::ssize_t>& shape) {
+  if (!out) return py::array_t<std::uint8_t>(shape);
+  const bool fits = py::isinstance<py::array_t<std::uint8_t, py::array::c_style>>(*out) && out->writeable() &&
+                    std::vector<py::ssize_t>(out->shape(), out->shape() + out->ndim()) == shape;
+  if (!fits) {
+    std::string wanted;
+    for (const py::ssize_t length : shape) {
+      if (!wanted.empty()) wanted += ", ";
+      wanted += std::to_string(length);
+    }
+    throw ArgumentError("out: expected a writeable C-contiguous uint8 array [" + wanted + "], got " + shape_text(*out));
+  }
+  return py::reinterpret_borrow<py::array_t<std::uint8_t>>(*out);
+}
+
+using MakeViews = void (*)(const Batch&, const ViewIndex&, const Panoramas&, const Imagination&, const ViewMaker&,
+                           std::uint8_t*);
+
+py::array_t<std::uint8_t> views(const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts,
+                                const ViewMaker& maker, const std::string& frames, const std::optional<py::array>& out,
+                                bool dense) {
+  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
+  const Answers answers = to_answers(rollouts, frames);
+  const auto steps = static_cast<py::ssize_t>(self.index.steps);
+  const auto shape = dense ? with_view_shape({static_cast<py::ssize_t>(self.batch.candidates()), steps}, maker)
+                           : with_view_shape({static_cast<py::ssize_t>(self.index.distinct.size())}, maker);
+  py::array_t<std::uint8_t> images = output(out, shape);
+  const MakeViews make = dense ? &make_dense_views : &make_views;
+  std::uint8_t* pixels = images.mutable_data();
+  const Panoramas source = to_panoramas(real);
+  const py::gil_scoped_release release;
+  make(self.batch, self.index, source, answers.imagination, maker, pixels);
+  return images;
+}
+
+void expect_episodes(const Batch& batch, py::ssize_t count) {
+  for (const Row& row : batch.rows()) {
+    if (row.episode >= count) {
+      throw ArgumentError("expected one panorama an episode, got " + std::to_string(count) + " and plans for episode " +
+                          std::to_string(row.episode));
+    }
+  }
+}
+
+py::array_t<std::uint8_t> observations(const BoundBatch& self, const py::array& panoramas, const ViewMaker& maker) {
+  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
+  const Panoramas source = to_panoramas(real);
+  expect_episodes(self.batch, real.shape(0));
+  py::array_t<std::uint8_t> images(with_view_shape({static_cast<py::ssize_t>(self.batch.rows().size())}, maker));
+  std::uint8_t* pixels = images.mutable_data();
+  const py::gil_scoped_release release;
+  make_observations(self.batch, source, maker, pixels);
+  return images;
+}
+
+py::array_t<float> depths(const BoundBatch& self, const Array<float>& distances, const ViewMaker& maker) {
+  expect_shape(distances, {-1, -1, -1}, "distances float32 [episodes, H, W]");
+  expect_episodes(self.batch, distances.shape(0));
+  const Size size{static_cast<int>(distances.shape(1)), static_cast<int>(distances.shape(2))};
+  py::array_t<float> images({static_cast<py::ssize_t>(self.batch.rows().size()),
+                             static_cast<py::ssize_t>(maker.spec().size.height),
+                             static_cast<py::ssize_t>(maker.spec().size.width)});
+  float* pixels = images.mutable_data();
+  const float* source = distances.data();
+  const py::gil_scoped_release release;
+  make_depths(self.batch, source, size, maker, pixels);
+  return images;
+}
+
+py::array_t<std::int32_t> view_index(const BoundBatch& self) {
+  py::array_t<std::int32_t> array(
+      {static_cast<py::ssize_t>(self.batch.candidates()), static_cast<py::ssize_t>(self.index.steps)});
+  std::copy(self.index.cells.begin(), self.index.cells.end(), array.mutable_data());
+  return array;
+}
+
+py::array_t<bool> real_steps(const BoundBatch& self) {
+  py::array_t<bool> array(
+      {static_cast<py::ssize_t>(self.batch.candidates()), static_cast<py::ssize_t>(self.index.steps)});
+  std::transform(self.index.cells.begin(), self.index.cells.end(), array.mutable_data(), [&](int view) {
+    return view >= 0 && self.index.distinct[static_cast<std::size_t>(view)].source.row < 0;
+  });
+  return array;
+}
+
+py::array_t<std::int64_t> owners(const Batch& batch) {
+  std::vector<std::int64_t> first;  // of each episode's candidates
+  const auto& episodes = batch.episodes();
+  for (std::size_t i = 0; i < episodes.size(); ++i) {
+    while (first.size() <= static_cast<std::size_t>(episodes[i])) first.push_back(static_cast<std::int64_t>(i));
+  }
+  return column<std::int64_t>(
+      batch.rows(), [&](const Row& row) { return first[static_cast<std::size_t>(row.episode)] + row.candidate; });
+}
+
+void bind_spec(py::module_& module) {
+  py::class_<ModelSpec>(module, "ModelSpec", "What the planner has to know about a world model.")
+      .def(py::init([](bool causal, int frames, const std::string& padding, const std::string& leading, int max_rows,
+                       const ActionSpace& space) {
+             ModelSpec spec{
+                 .causal = causal,
+                 .frames = frames,
+                 .padding = to_padding(padding),
+                 .leading = choose<Leading>(
+                     leading,
+                     {{"none", Leading::kNone}, {"same_direction", Leading::kSameDirection}, {"any", Leading::kAny}},
+                     "leading"),
+                 .max_rows = max_rows,
+                 .space = space};
+             spec.check();
+             return spec;
+           }),
+           py::arg("causal") = false, py::arg("frames") = 0, py::arg("padding") = "forward",
+           py::arg("leading") = "same_direction", py::arg("max_rows") = 0, py::arg("space") = ActionSpace{},
+           "frames: length of a rollout with the observation, 0 any. leading: turns answered by the real panorama, "
+           "'same_direction' (up to the first forward or reversing turn), 'any' or 'none'. max_rows: rows a call, 0 "
+           "any.")
+      .def_readonly("causal", &ModelSpec::causal)
+      .def_readonly("frames", &ModelSpec::frames)
+      .def_readonly("max_rows", &ModelSpec::max_rows)
+      .def_readonly("space", &ModelSpec::space);
+}
+
+void bind_views(py::module_& module) {
+  py::class_<ViewMaker>(module, "ViewMaker",
+                        "Turns panoramas and frames into views; make it once, it keeps its tables. view: 'front', "
+                        "'surround' (front, left, right, back) or 'panorama'; size (height, width).")
+      .def(py::init([](const std::string& view, std::pair<int, int> size, double hfov_deg) {
+             const auto kind = choose<ViewKind>(
+                 view,
+                 {{"front", ViewKind::kFront}, {"surround", ViewKind::kSurround}, {"panorama", ViewKind::kPanorama}},
+                 "view");
+             return std::make_unique<ViewMaker>(
+                 ViewSpec{.kind = kind, .size = {size.first, size.second}, .hfov = radians(hfov_deg)});
+           }),
+           py::arg("view") = "front", py::arg("size") = std::pair<int, int>{384, 384}, py::arg("hfov_deg") = 90.0)
+      .def_property_readonly(
+          "size",
+          [](const ViewMaker& maker) { return py::make_tuple(maker.spec().size.height, maker.spec().size.width); })
+      .def_property_readonly("count", &ViewMaker::count, "Views an observation: 4 for 'surround', else 1.");
+}
+
+void bind_batch(py::module_& module) {
+  module.attr("Part") =
+      py::module_::import("collections")
+          .attr("namedtuple")("Part", "first steps rows actions trajectories viewpoints length shared start");
+  module.attr("Part").attr("__doc__") =
+      "One rectangular call of the model. rows int64 [r] index the batch's rows; first: frame of the rows the call "
+      "begins "
+      "at; actions int8 [r, steps] padded, trajectories float64 [r, steps, 3] and viewpoints [r, steps, 4, 4] from the "
+      "call's start; length int64 [r] of own actions; shared int64 [r] leading frames an earlier row of the call "
+      "answers; "
+      "start int64 [r, 3] (part, index, frame) of the frame a later call begins with, empty where first is 0.";
+  py::class_<BoundBatch>(module, "Batch", "The smallest set of rollouts that answers all candidates of one decision.")
+      .def_static(
+          "build",
+          [](const py::sequence& plans, const ModelSpec& spec) {
+            const Plans candidates = plans_of(plans);
+            const py::gil_scoped_release release;
+            Batch batch(candidates, spec);
+            ViewIndex index = index_views(batch);
+            return BoundBatch{std::move(batch), std::move(index)};
+          },
+          py::arg("plans"), py::arg("spec") = ModelSpec{}, "plans[episode][candidate]: action ids [K].")
+      .def_property_readonly("candidates", [](const BoundBatch& self) { return self.batch.candidates(); })
+      .def_property_readonly("rows", [](const BoundBatch& self) { return self.batch.rows().size(); })
+      .def_property_readonly("candidate_episode",
+                             [](const BoundBatch& self) { return integers(self.batch.episodes()); })
+      .def_property_readonly("lengths",
+                             [](const BoundBatch& self) {
+                               std::vector<int> lengths;
+                               for (std::size_t i = 0; i < self.batch.candidates(); ++i) {
+                                 lengths.push_back(static_cast<int>(self.batch.sources(i).size()));
+                               }
+                               return integers(lengths);
+                             })
+      .def_property_readonly("row_episode",
+                             [](const BoundBatch& self) {
+                               return column<std::int64_t>(self.batch.rows(),
+                                                           [](const Row& row) { return row.episode; });
+                             })
+      .def_property_readonly(
+          "row_owner", [](const BoundBatch& self) { return owners(self.batch); },
+          "Candidate (counted over all episodes) whose seed the row uses.")
+      .def_property_readonly(
+          "row_turns",
+          [](const BoundBatch& self) {
+            return column<std::int64_t>(self.batch.rows(), [](const Row& row) { return row.turns; });
+          },
+          "Left turns between the real panorama and the row's observation.")
+      .def_property_readonly("row_length",
+                             [](const BoundBatch& self) {
+                               return column<std::int64_t>(self.batch.rows(),
+                                                           [](const Row& row) { return row.actions.size(); });
+                             })
+      .def_property_readonly("row_parent",
+                             [](const BoundBatch& self) {
+                               return column<std::int64_t>(self.batch.rows(),
+                                                           [](const Row& row) { return row.parent; });
+                             })
+      .def_property_readonly("row_shared",
+                             [](const BoundBatch& self) {
+                               return column<std::int64_t>(self.batch.rows(),
+                                                           [](const Row& row) { return row.shared; });
+                             })
+      .def_property_readonly(
+          "parts",
+          [type = py::object(module.attr("Part"))](const BoundBatch& self) {
+            py::list parts;
+            for (const Part& part : self.batch.parts()) {
+              parts.append(part_object(type, self.batch, part));
+            }
+            return parts;
+          },
+          "Calls to make, in this order; see Part.")
+      .def_property_readonly("view_index", &view_index,
+                             "int32 [candidates, steps]: which distinct observation a step shows, -1 behind the plan.")
+      .def_property_readonly("real", &real_steps, "bool [candidates, steps]: shown by the real panorama.")
+      .def("observations", &observations, py::arg("panoramas"), py::arg("maker"),
+           "uint8 [rows, (4,) h, w, 3]: what each row begins with, the real panorama after its leading turns.")
+      .def(
+          "depths", &depths, py::arg("distances"), py::arg("maker"),
+          "float32 [rows, h, w] of distances float32 [episodes, H, W]: planar z in perspective, distance in panoramas.")
+      .def(
+          "views",
+          [](const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
+             const std::string& frames, const std::optional<py::array>& out) {
+            return views(self, panoramas, rollouts, maker, frames, out, true);
+          },
+          py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"), py::arg("frames") = "panorama",
+          py::arg("out") = py::none(),
+          "uint8 [candidates, steps, (4,) h, w, 3], zeros behind a plan's end. rollouts: one uint8 [r, steps + 1, H, "
+          "W, 3] "
+          "a part; frames: 'panorama' or 'perspective'.")
+      .def(
+          "distinct_views",
+          [](const BoundBatch& self, const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
+             const std::string& frames, const std::optional<py::array>& out) {
+            return views(self, panoramas, rollouts, maker, frames, out, false);
+          },
+          py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"), py::arg("frames") = "panorama",
+          py::arg("out") = py::none(), "uint8 [distinct, (4,) h, w, 3], to be looked up by view_index.");
+}
+
+void bind_beam(py::module_& module) {
+  py::class_<BeamSearch>(module, "BeamSearch",
+                         "Keeps the best `width` plans of each episode over `depth` levels: ask(), score, tell().")
+      .def(py::init<int, int>(), py::arg("width"), py::arg("depth") = 1)
+      .def(
+          "ask",
+          [](BeamSearch& self, const py::sequence& proposals) {
+            if (self.level() == 0) return plans_list(self.ask(plans_of(proposals)));
+            std::vector<Plans> continuations;
+            for (const py::handle& episode : proposals) {
+              continuations.push_back(plans_of(py::reinterpret_borrow<py::sequence>(episode)));
+            }
+            return plans_list(self.ask(continuations));
+          },
+          py::arg("proposals"),
+          "Plans to score, [episode][candidate]. First level: proposals[episode][candidate]; deeper: "
+          "continuations[episode][kept plan][continuation], to be appended.")
+      .def(
+          "tell",
+          [](BeamSearch& self, const py::sequence& scores) {
+            std::vector<std::vector<double>> values;
+            for (const py::handle& episode : scores) {
+              const Array<double> row = Array<double>::ensure(py::reinterpret_borrow<py::object>(episode));
+              if (!row || row.ndim() != 1) throw ArgumentError("scores: expected numbers [M] for each episode");
+              values.emplace_back(row.data(), row.data() + row.size());
+            }
+            py::list kept;
+            for (const auto& order : self.tell(values)) kept.append(integers(order));
+            return kept;
+          },
+          py::arg("scores"), "int64 [k] an episode: kept candidates, best first, equal scores in their order.")
+      .def_property_readonly("level", &BeamSearch::level)
+      .def_property_readonly("done", &BeamSearch::done)
+      .def_property_readonly(
+          "beams",
+          [](const BeamSearch& self) {
+            py::list episodes;
+            for (const auto& beam : self.beams()) {
+              py::list entries;
+              for (const auto& entry : beam) {
+                entries.append(py::make_tuple(to_ids(entry.plan), entry.score, entry.origin));
+              }
+              episodes.append(entries);
+            }
+            return episodes;
+          },
+          "Kept plans [episode]: (actions int8 [K], score, index of the proposal it began as).");
+}
+
+}  // namespace
+
+void bind_planner(py::module_& module) {
+  bind_spec(module);
+  bind_views(module);
+  bind_batch(module);
+  bind_beam(module);
+  module.def(
+      "candidate_seeds",
+      [](std::uint64_t run_seed, std::uint64_t episode, std::uint64_t decision, std::size_t count) {
+        py::array_t<std::uint64_t> seeds(static_cast<py::ssize_t>(count));
+        candidate_seeds(run_seed, episode, decision, std::span(seeds.mutable_data(), count));
+        return seeds;
+      },
+      py::arg("run_seed"), py::arg("episode"), py::arg("decision"), py::arg("count"), "uint64 [count].");
+}

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <span>
+#include <vector>
+
+#include "wiw/planner/batch.hpp"
+#include "wiw/planner/view_maker.hpp"
+
+namespace wiw {
+
+/// Observations of the candidates' steps with repetitions named: cells[candidate * steps + step] is the index of a
+/// distinct observation, -1 behind the end of a plan.
+struct ViewIndex {
+  struct Distinct {
+    int episode;
+    Source source;
+  };
+  std::size_t steps = 0;
+  std::vector<int> cells;
+  std::vector<Distinct> distinct;
+};
+
+ViewIndex index_views(const Batch& batch);
+
+/// Real panoramas of the episodes, uint8 [episodes, H, W, 3].
+struct Panoramas {
+  const std::uint8_t* data = nullptr;
+  std::size_t count = 0;
+  Size size;
+};
+
+/// What the model answered to one part: uint8 [rows, frames, H, W, 3].
+struct Rollout {
+  const std::uint8_t* data = nullptr;
+  std::size_t rows = 0;
+  std::size_t frames = 0;
+  Size size;
+};
+
+/// What the model answered to each part of a batch.
+struct Imagination {
+  FrameKind kind = FrameKind::kPanorama;
+  std::vector<Rollout> rollouts;
+};
+
+/// Throws ArgumentError unless there is one panorama an episode and one rollout of the right length a part.
+void check_inputs(const Batch& batch, const Panoramas& real, const Imagination& imagined);
+
+/// Views of each distinct observation once, [distinct, bytes of the maker].
+void make_views(const Batch& batch, const ViewIndex& index, const Panoramas& real, const Imagination& imagined,
+                const ViewMaker& maker, std::uint8_t* out);
+
+/// Views of every candidate and step, [candidates, steps, bytes of the maker], zeros behind the end of a plan. Each
+/// distinct observation is converted once and copied to where it repeats.
+void make_dense_views(const Batch& batch, const ViewIndex& index, const Panoramas& real, const Imagination& imagined,
+                      const ViewMaker& maker, std::uint8_t* out);
+
+/// What each row of the batch begins with: the real panorama after its leading turns, [rows, bytes of the maker].
+void make_observations(const Batch& batch, const Panoramas& real, const ViewMaker& maker, std::uint8_t* out);
+
+/// The same for depth, distances float [episodes, H, W] -> [rows, height, width]; see ViewMaker::depth.
+void make_depths(const Batch& batch, const float* distances, Size size, const ViewMaker& maker, float* out);
+
+}  // namespace wiw

@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "wiw/core/image.hpp"
+
+namespace wiw {
+
+/// Resizes three-channel bytes, each axis for itself: by area average where the image shrinks, linearly (pixel centres
+/// at half integers) where it grows. Weights are exact fractions, so the result is the true mean, rounded.
+class Resizer {
+ public:
+  /// With `wrap` the columns close to a circle, as in a panorama. Throws ArgumentError for empty sizes.
+  Resizer(Size from, Size to, bool wrap);
+
+  /// Columns of `source` are read as if it had been rolled to the right by `shift` in [0, width). Safe to call from
+  /// several threads.
+  void operator()(const std::uint8_t* source, int shift, std::uint8_t* out) const;
+
+  [[nodiscard]] Size from() const { return from_; }
+  [[nodiscard]] Size to() const { return to_; }
+
+ private:
+  struct Tap {
+    int index;
+    std::uint16_t weight;
+  };
+  /// Output i is the sum over taps[begin[i] .. begin[i + 1]) divided by `total`.
+  struct Axis {
+    std::vector<Tap> taps;
+    std::vector<std::size_t> begin;
+    std::uint32_t total = 0;
+  };
+  static Axis make_axis(int from, int to, bool wrap);
+
+  Size from_;
+  Size to_;
+  Axis rows_;
+  Axis columns_;
+};
+
+}  // namespace wiw
