@@ -88,7 +88,8 @@ void bind_env(py::module_& module) {
       .def(
           "step", [](NavigationEnv& env, int action) { return env.step(to_action(action)); }, py::arg("action"),
           "Carries out one primitive; True if the pose changed.")
-      .def_property_readonly("position", &NavigationEnv::position, "float64 [3] world metres, on the floor.")
+      .def_property_readonly("position", [](const NavigationEnv& env) { return Eigen::Vector3d(env.position()); },
+                             "float64 [3] world metres, on the floor.")
       .def_property_readonly("yaw", &NavigationEnv::yaw, "Heading in radians, left positive.")
       .def_property_readonly("odometry", &NavigationEnv::odometry,
                              "float64 [3]: x forward, y left, azimuth, in the frame of the reset.")

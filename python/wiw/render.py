@@ -36,6 +36,11 @@ class Renderer:
         self._renderer = _core.render.Renderer(scene, backend, samples)
 
     @property
+    def core(self) -> _core.render.Renderer:
+        """The compiled renderer, for other compiled rooms."""
+        return self._renderer
+
+    @property
     def description(self) -> str:
         """The back end in words, e.g. "cpu (Embree 3.13.5, avx512)"."""
         return self._renderer.description

@@ -7,15 +7,17 @@ World frame: metres, Y up, right-handed. See `Scene` for what a scene tells abou
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 
 from wiw import _core
+from wiw.errors import ArgumentError, FileError
 
 Scene = _core.scene.Scene
 
-__all__ = ["Scene", "load"]
+__all__ = ["Scene", "apartment", "load", "open_scene", "resolve"]
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -53,3 +55,46 @@ def load(
     for warning in scene.warnings:
         _log.warning("%s: %s", scene.name, warning)
     return scene
+
+
+def apartment(seed: int, split: str = "val") -> Scene:
+    """A furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
+
+    `split` is "train", "val" or "test". Raises ArgumentError for any other.
+    """
+    return _core.scene.apartment(seed, split)
+
+
+SPLIT_SIZE = 1000
+"""Apartments that a spec without a number stands for."""
+
+
+def resolve(spec: str) -> list[str]:
+    """The single scenes that a scene spec names, in order, none of them loaded.
+
+    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, each named
+    "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
+
+    Raises:
+        ArgumentError: the split or the count is not one.
+        FileError: there is no such file.
+    """
+    if not spec.startswith("apartments"):
+        if not Path(spec).expanduser().is_file():
+            raise FileError(f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]")
+        return [spec]
+    match = re.fullmatch(r"apartments:(train|val|test)(?::([1-9][0-9]*)|/([0-9]+))?", spec)
+    if match is None:
+        raise ArgumentError(f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40 or apartments:val/7")
+    split, count, index = match.groups()
+    if index is not None:
+        return [spec]
+    return [f"apartments:{split}/{i}" for i in range(int(count or SPLIT_SIZE))]
+
+
+def open_scene(name: str) -> Scene:
+    """Loads one scene of `resolve`."""
+    if name.startswith("apartments:"):
+        split, _, index = name.removeprefix("apartments:").partition("/")
+        return apartment(int(index), split)
+    return load(name)

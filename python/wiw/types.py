@@ -119,6 +119,8 @@ class Rollout:
     """uint8 [K, H, W, 3] (or [K, V, H, W, 3] for several views): frame k - 1 is what follows action k."""
     real: NDArray[np.bool_]
     """bool [K]: True where the frame is the real panorama turned, not imagination."""
+    view: str = "front"
+    """"front", "surround" or "panorama"; a perspective model gives "front" whatever was asked."""
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from wiw.nav import NavMesh
 from wiw.render import Renderer
-from wiw.scenes import Scene, resolve
+from wiw.scenes import Scene, open_scene
 
 CAPACITY = 4
 """Worlds kept: enough for the live episodes of a run that goes scene by scene (an apartment takes about 100 MB)."""
@@ -33,7 +33,7 @@ def world(scene: str, backend: str = "auto") -> World:
     if key in _worlds:
         _worlds.move_to_end(key)
         return _worlds[key]
-    loaded = resolve(scene)[0].load()
+    loaded = open_scene(scene)
     made = World(scene, loaded, Renderer(loaded, backend=backend), NavMesh.build(loaded))
     _worlds[key] = made
     while len(_worlds) > CAPACITY:

@@ -112,9 +112,12 @@ def _solve(points: NDArray[np.float64], pixels: NDArray[np.float32], odometry: N
     focal = VIEW / 2
     intrinsics = np.array([[focal, 0, VIEW / 2 - 0.5], [0, focal, VIEW / 2 - 0.5], [0, 0, 1]])
     cv2.setRNGSeed(0)
-    found, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels.astype(np.float64), intrinsics, None, iterationsCount=300, reprojectionError=4.0, flags=cv2.SOLVEPNP_SQPNP
-    )
+    try:
+        found, rotation, translation, inliers = cv2.solvePnPRansac(
+            points, pixels.astype(np.float64), intrinsics, None, iterationsCount=300, reprojectionError=4.0, flags=cv2.SOLVEPNP_EPNP
+        )
+    except cv2.error:  # the solver's word for points that determine no pose, e.g. all on one spot
+        return None
     if not found or inliers is None or len(inliers) < INLIERS:
         return None
     centre = -cv2.Rodrigues(rotation)[0].T @ translation[:, 0]

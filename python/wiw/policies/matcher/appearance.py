@@ -50,7 +50,7 @@ def goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
     window = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
     weights = mask[:, window].astype(np.float32)
     histogram = np.zeros(int(np.prod(BINS)), np.float32)
-    np.add.at(histogram, _bins(_lab(band))[:, window][weights > 0], 1.0)
+    np.add.at(histogram, _bins(_lab(band[ROWS]))[:, window][weights > 0], 1.0)
     return GoalTemplate(
         colors=_normalised(features.colors[0][..., window], weights),
         edges=_normalised(features.edges[0][..., window], weights),
@@ -91,13 +91,14 @@ def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32
 
 
 def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A 90-degree view uint8 [S, S, 3] drawn into an empty panorama uint8 [64, 128, 3], and the band's mask [32, 128]."""
+    """A 90-degree view uint8 [S, S, 3] as a panorama uint8 [64, 128, 3], and the band's mask [32, 128] of what it shows.
+
+    Its border is continued outside, so that blurring finds no edge there.
+    """
     u, v, inside = _front_map()
     size = image.shape[0]
     small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA) if size != 64 else image
-    drawn = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    drawn[~inside] = 0
-    return drawn, inside[ROWS]
+    return cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), inside[ROWS]
 
 
 @cache

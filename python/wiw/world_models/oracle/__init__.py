@@ -38,9 +38,7 @@ class Oracle(WorldModel):
         for name, views in jobs.items():
             if views:
                 rows, steps, poses = zip(*views, strict=True)
-                frames[list(rows), list(steps)] = _panoramas(renderers[name], np.stack(poses), image.shape[1:3])
+                pictures = np.empty((len(views), *image.shape[1:]), np.uint8)
+                renderers[name].panorama(np.stack(poses), image.shape[1:3], pictures, None, None)
+                frames[list(rows), list(steps)] = pictures
         return frames
-
-
-def _panoramas(renderer: object, poses: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.uint8]:
-    return renderer.panorama(poses, (size[0], size[1]), ["color"])["color"]  # type: ignore[attr-defined, no-any-return]

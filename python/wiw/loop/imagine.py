@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One batch of imagination: plans in, imagined views out; the world model is entered once for all live episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw import action
+from wiw._core import core, planner
+from wiw.errors import ArgumentError
+from wiw.loop.clock import Clock
+from wiw.policies.base import FrameSpec
+from wiw.types import Conditioning, Control, Proposal, Rollout
+from wiw.world_models.base import Accepts, WorldModel, checked_rollout
+
+
+@dataclass(frozen=True)
+class Imagination:
+    """Answer to one batch of plans."""
+
+    rollouts: list[list[Rollout]]
+    """[episode][candidate]."""
+    calls: dict[str, int]
+    """What an episode's share of the batch cost: rows asked and frames imagined, over all live episodes."""
+
+
+def imagine(
+    model: WorldModel, queries: Sequence[Any], proposals: Sequence[Sequence[Proposal]], frames: FrameSpec, clock: Clock
+) -> Imagination:
+    """Imagines every proposal of every episode and shows the futures in the views that the reviser asked for."""
+    accepts = model.accepts
+    with clock("platform"):
+        batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], _spec(accepts))
+        panoramas = np.stack([query.observation.panorama for query in queries])
+        conditioning = _conditioning(accepts, batch, queries, panoramas)
+        seeds = _seeds(batch, queries, proposals)
+    answers: list[NDArray[np.uint8]] = []
+    for part in batch.parts:
+        with clock("platform"):
+            observations = _at_start(conditioning, part, answers, accepts)
+            controls = _controls(accepts, part)
+        with clock("world_model"):
+            answers.append(checked_rollout(model, observations, controls, seeds[part.rows]))
+    with clock("platform"):
+        kind = "perspective" if accepts.view == "perspective" else "panorama"
+        view = "front" if kind == "perspective" else frames.view
+        size = frames.size if view == frames.view else (384, 384)
+        shown = batch.views(panoramas, answers, _maker(view, size), kind)
+        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch))
+
+
+def _spec(accepts: Accepts) -> Any:
+    return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
+
+
+@cache
+def _maker(view: str, size: tuple[int, int]) -> Any:
+    return planner.ViewMaker(view, size)
+
+
+def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any], panoramas: NDArray[np.uint8]) -> Conditioning:
+    """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
+    maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
+    depth = simulators = None
+    if "depth" in accepts.needs:
+        depths = [query.observation.depth for query in queries]
+        if any(value is None for value in depths):
+            raise ArgumentError("the world model needs depth: make the environment with depth=True")
+        depth = batch.depths(np.stack(depths), maker)
+    if "simulator" in accepts.needs:
+        simulators = [_turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)]
+    return Conditioning(batch.observations(panoramas, maker), depth=depth, simulators=simulators)
+
+
+def _turned(simulator: Any, turns: int) -> Any:
+    """A fork of the simulator after `turns` left turns."""
+    if simulator is None:
+        raise ArgumentError("the world model needs the simulator: pass decide(..., simulator=env.fork())")
+    fork = simulator.fork()
+    for _ in range(abs(int(turns))):
+        fork.step(int(action.TURN_LEFT if turns > 0 else action.TURN_RIGHT))
+    return fork
+
+
+def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8]], accepts: Accepts) -> Conditioning:
+    """The rows of one call; a call that continues a long plan begins at the frame where the one before ended."""
+    if part.first == 0:
+        depth = None if whole.depth is None else whole.depth[part.rows]
+        simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
+        return Conditioning(whole.image[part.rows], depth=depth, simulators=simulators)
+    if accepts.needs:
+        raise ArgumentError(f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
+                            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon")
+    return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
+
+
+def _controls(accepts: Accepts, part: Any) -> list[Control]:
+    return [
+        Control(
+            actions=actions,
+            trajectory=trajectory,
+            viewpoints=viewpoints,
+            text=action.to_text(actions[:length]) if accepts.control == "text" else "",
+            ids=_ids(accepts, actions),
+            length=int(length),
+            shared=int(shared),
+        )
+        for actions, trajectory, viewpoints, length, shared in zip(
+            part.actions, part.trajectories, part.viewpoints, part.length, part.shared, strict=True
+        )
+    ]
+
+
+def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
+    if accepts.vocabulary is None:
+        return None
+    return action.to_controls(action.with_null(actions) if accepts.null_first else actions, accepts.vocabulary)
+
+
+def _seeds(batch: Any, queries: Sequence[Any], proposals: Sequence[Sequence[Proposal]]) -> NDArray[np.uint64]:
+    """uint64 [rows]: keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
+    keys = [
+        core.fold_key([query.key.seed, query.key.episode, query.key.decision, candidate])
+        for query, plans in zip(queries, proposals, strict=True)
+        for candidate in range(len(plans))
+    ]
+    return np.array(keys, np.uint64)[batch.row_owner]
+
+
+def _unpack(batch: Any, shown: NDArray[np.uint8], view: str, proposals: Sequence[Sequence[Proposal]]) -> list[list[Rollout]]:
+    real, lengths = batch.real, batch.lengths
+    flat = iter(range(len(lengths)))
+    return [
+        [Rollout(shown[i, : lengths[i]], real[i, : lengths[i]], view) for i in (next(flat) for _ in plans)]
+        for plans in proposals
+    ]
+
+
+def _cost(batch: Any) -> dict[str, int]:
+    """Rows asked of the world model and frames that no other row answers."""
+    return {"rows": int(batch.rows), "frames": int((batch.row_length - batch.row_shared).sum())}
