@@ -1,17 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures for all tests."""
+from __future__ import annotations
 
 import os
 from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[1]
+
+COLORS = {"floor": (0.6, 0.5, 0.4), "wall": (0.8, 0.8, 0.75), "red": (0.8, 0.2, 0.2), "green": (0.2, 0.7, 0.3), "blue": (0.2, 0.3, 0.8)}
+BOXES = {  # name: material, least corner, greatest corner; metres, Y up
+    "floor": ("floor", (-4, -0.1, -2), (4, 0, 2)),
+    "ceiling": ("wall", (-4, 2.5, -2), (4, 2.6, 2)),
+    "wall_w": ("wall", (-4.1, 0, -2), (-4, 2.5, 2)),
+    "wall_e": ("blue", (4, 0, -2), (4.1, 2.5, 2)),
+    "wall_n": ("wall", (-4, 0, -2.1), (4, 2.5, -2)),
+    "wall_s": ("green", (-4, 0, 2), (4, 2.5, 2.1)),
+    "partition_a": ("wall", (-0.05, 0, -2), (0.05, 2.5, 0.6)),
+    "partition_b": ("wall", (-0.05, 0, 1.6), (0.05, 2.5, 2)),
+    "table": ("red", (-3, 0, -1.5), (-2.2, 0.7, -0.9)),
+    "shelf": ("green", (3.4, 0, -1.8), (3.9, 1.8, -0.8)),
+    "chest": ("red", (1.4, 0, -1.9), (2.2, 0.6, -1.5)),
+    "picture": ("blue", (-3.99, 1.0, 0.2), (-3.97, 1.6, 1.0)),
+}
+
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """Folder of real inputs: $WIW_TEST_DATA, or shared/data beside the checkout; tests that need it skip without."""
-    root = Path(__file__).resolve().parents[1]
-    folder = Path(os.environ.get("WIW_TEST_DATA", root.parent / "shared" / "data"))
-    if not folder.is_dir():
-        pytest.skip(f"no real inputs at {folder}; set WIW_TEST_DATA to the folder that holds them")
-    return folder
+    """Real inputs, where the machine has them."""
+    for folder in (os.environ.get("WIW_TEST_DATA"), ROOT.parent / "shared/data"):
+        if folder and Path(folder).is_dir():
+            return Path(folder)
+    pytest.skip("no real data: set WIW_TEST_DATA to a folder with small_house, nav and openeqa")
+
+
+@pytest.fixture(scope="session")
+def two_rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Path of an OBJ with two furnished rooms of 4 x 4 m, joined by a door: a scene spec that loads in milliseconds."""
+    folder = tmp_path_factory.mktemp("scene")
+    materials = "".join(f"newmtl {name}\nKd {r} {g} {b}\n" for name, (r, g, b) in COLORS.items())
+    (folder / "two_rooms.mtl").write_text(materials)
+    lines, base = ["mtllib two_rooms.mtl"], 1
+    for name, (material, low, high) in BOXES.items():
+        lines += [f"o {name}", f"usemtl {material}"]
+        lines += [f"v {(low, high)[x][0]} {(low, high)[y][1]} {(low, high)[z][2]}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+        quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+        lines += ["f " + " ".join(str(base + i) for i in quad) for quad in quads]
+        base += 8
+    (folder / "two_rooms.obj").write_text("\n".join(lines))
+    return str(folder / "two_rooms.obj")

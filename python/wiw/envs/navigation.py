@@ -205,6 +205,6 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         spaces: dict[str, gymnasium.Space[Any]] = {
             "panorama": box(0, 255, (576, 1024, 3), np.uint8),
             "front": box(0, 255, (480, 480, 3), np.uint8),
-            "odometry": box(-np.inf, np.inf, (3,), np.float64),
+            "odometry": box(-1e4, 1e4, (3,), np.float64),
         }
-        return {**spaces, "depth": box(0, np.inf, (576, 1024), np.float32)} if depth else spaces
+        return {**spaces, "depth": box(0, 1e4, (576, 1024), np.float32)} if depth else spaces

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import wiw
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.imagenav import camera_pose, ideal_primitives
+from wiw.errors import ArgumentError
+from wiw.types import Episode
+
+
+@pytest.fixture
+def env(two_rooms: str):
+    return wiw.make("ImageNav-v0", scenes=two_rooms, seed=3)
+
+
+def start_at(env, position, yaw, goal=(3.0, 0.0, 1.0)):
+    episode = Episode("t", env.task.scenes, position, yaw, goal, 0.0, 5.0)
+    env.begin(episode)
+    return env
+
+
+def test_gymnasium_accepts_it(env) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*Box.*(high|low).*infinity.*")
+        warnings.filterwarnings("ignore", message=".*spec.*")
+        warnings.filterwarnings("ignore", message=".*not an image.*|.*flatten.*")
+        check_env(env, skip_render_check=True)
+
+
+def test_observations_have_the_documented_shapes(two_rooms: str) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, seed=3).task.environment(depth=True)
+    observation, info = env.reset(options={"episode": 0})
+    assert {k: (v.shape, v.dtype) for k, v in observation.items()} == {
+        "panorama": ((576, 1024, 3), np.uint8),
+        "front": ((480, 480, 3), np.uint8),
+        "odometry": ((3,), np.float64),
+        "depth": ((576, 1024), np.float32),
+    }
+    assert env.observation_space.contains(observation)
+    assert info["key"] == wiw.types.Key(3, 0)
+    assert env.goal.image.shape == (480, 480, 3)
+
+
+def test_forward_is_twenty_centimetres_and_sixteen_turns_are_a_circle(env) -> None:
+    start_at(env, (-2.0, 0.0, 0.5), 0.3)
+    before = env.truth()
+    env.run([FORWARD])
+    moved = env.truth().position - before.position
+    np.testing.assert_allclose(np.linalg.norm(moved), 0.2, atol=1e-5)
+    np.testing.assert_allclose(moved[[0, 2]], [-0.2 * np.sin(0.3), -0.2 * np.cos(0.3)], atol=1e-5)
+    env.run([TURN_LEFT] * 16)
+    assert env.truth().yaw == before.yaw
+
+
+def test_odometry_is_the_way_since_the_start(env) -> None:
+    start_at(env, (-2.0, 0.0, 0.5), 1.1)
+    segment = env.run([FORWARD, TURN_LEFT, TURN_LEFT, FORWARD])
+    expected = wiw.action.to_trajectory([FORWARD, TURN_LEFT, TURN_LEFT, FORWARD])[-1]
+    np.testing.assert_allclose(segment.observation.odometry, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("motion", ["refuse", "slide"])
+def test_walls_stop_or_deflect(two_rooms: str, motion: str) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, motion=motion)
+    start_at(env, (-2.0, 0.0, 1.0), np.pi + 0.6)
+    env.run([FORWARD] * 12)
+    position = env.truth().position
+    assert position[2] < 2.0
+    path = np.stack(env.trip.positions)
+    refused = (np.linalg.norm(np.diff(path, axis=0), axis=1) == 0).any()
+    assert refused == (motion == "refuse")
+
+
+def test_success_is_entering_the_sphere_and_ends_the_segment(env) -> None:
+    start_at(env, (2.0, 0.0, 1.0), -np.pi / 2, goal=(3.0, 0.0, 1.0))
+    segment = env.run([FORWARD] * 10)
+    assert segment.terminated
+    assert len(segment.executed) == 3  # 1.0 m away: after 0.6 m the agent is within 0.5 m
+    result = env.result()
+    assert result["success"] == 1 and result["actions"] == 3
+    np.testing.assert_allclose(result["travelled"], 0.6, atol=1e-5)
+
+
+def test_official_rules_look_only_where_a_decision_is_due(two_rooms: str) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, preset="official")
+    start_at(env, (1.0, 0.0, 1.0), -np.pi / 2, goal=(1.6, 0.0, 1.0))
+    assert not env.run([FORWARD] * 7).terminated  # passes through the sphere and out of it again
+    assert env.task.rules.decisions == 21
+
+
+def test_the_budget_truncates(env) -> None:
+    start_at(env, (-2.0, 0.0, 0.5), 0.0)
+    for _ in range(20):
+        segment = env.run([TURN_LEFT, TURN_RIGHT])
+    assert segment.truncated and not segment.terminated
+
+
+def test_stop_ends_the_episode(env) -> None:
+    env.reset(options={"episode": 0})
+    _, reward, terminated, _, info = env.step(wiw.envs.navigation.PRIMITIVES.index(STOP))
+    assert terminated and reward == 0 and info["result"]["success"] == 0
+
+
+def test_a_fork_moves_alone(env) -> None:
+    env.reset(options={"episode": 0})
+    before = env.truth().position
+    fork = env.fork()
+    fork.step(int(TURN_LEFT))
+    fork.step(int(FORWARD))
+    np.testing.assert_array_equal(env.truth().position, before)
+
+
+def test_using_it_before_reset_says_so(env) -> None:
+    with pytest.raises(ArgumentError, match="reset"):
+        env.truth()
+    with pytest.raises(ArgumentError, match="unknown rules"):
+        wiw.make("ImageNav-v0", raduis=1.0)
+
+
+def test_episodes_are_out_of_sight_and_within_reach(two_rooms: str) -> None:
+    task = wiw.make("ImageNav-v0", scenes=two_rooms, seed=5).task
+    episodes = task.episodes(6)
+    assert episodes == task.episodes(6) and len({e.episode_id for e in episodes}) == 6
+    assert task.episodes(3) == episodes[:3]
+    for episode in episodes:
+        assert 2 <= episode.geodesic <= 8
+        assert episode.info["ideal_primitives"] <= 42
+        assert np.sign(episode.start_position[0]) != np.sign(episode.goal_position[0])  # in different rooms
+
+
+def test_ideal_primitives_of_a_bend() -> None:
+    path = np.array([[0.0, 0, 0], [0, 0, -1], [-1, 0, -1]])
+    assert ideal_primitives(path, 0.0) == 10 + 4
+    assert ideal_primitives(path, np.pi) == 8 + 10 + 4
+
+
+def test_camera_pose_looks_where_yaw_says() -> None:
+    pose = camera_pose(np.zeros(3), np.pi / 2)
+    np.testing.assert_allclose(-pose[:3, 2], [-1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(pose[:3, 3], [0, 1, 0])
+
+
+def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
+    """Moving the whole episode elsewhere must not change a bit of what policy and model see, but for the pixels."""
+    seen = []
+
+    class Spy(wiw.Policy):
+        needs = ("depth",)
+
+        def propose(self, situations, candidates, horizon):
+            for s in situations:
+                seen.append((s.observation.odometry.copy(), s.key, s.goal.task, s.goal.text))
+                names = {f.name for f in dataclasses.fields(s.observation)} | {f.name for f in dataclasses.fields(s.goal)}
+                assert names == {"panorama", "front", "odometry", "depth", "task", "image", "text"}
+            return [[wiw.types.Proposal([TURN_LEFT, FORWARD])] for _ in situations]
+
+        def score(self, situations, proposals, rollouts):
+            return [np.zeros(len(plans)) for plans in proposals]
+
+    class SpyModel(wiw.WorldModel):
+        accepts = wiw.accepts(control="trajectory", needs=("depth",))
+
+        def rollout(self, observations, controls, seeds):
+            assert observations.simulators is None
+            return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+
+    records = []
+    for start, goal in (((-2.0, 0.0, 0.5), (3.0, 0.0, 1.0)), ((2.5, 0.0, 0.5), (-3.0, 0.0, 1.0))):
+        seen.clear()
+        env = start_at(wiw.make("ImageNav-v0", scenes=two_rooms).task.environment(depth=True), start, 0.4, goal)
+        agent = wiw.Agent(Spy(), SpyModel())
+        decision = agent.decide(env._observe(), env.goal, wiw.types.Key(0, 0))
+        env.run(decision.actions)
+        records.append([np.concatenate([np.ravel(x[0]) for x in seen]), seen[0][1:]])
+    np.testing.assert_array_equal(records[0][0], records[1][0])
+    assert records[0][1] == records[1][1]
