@@ -28,6 +28,7 @@ class NavigationTask(Protocol):
     backend: str
     motion: str
     budget: int
+    rules: Any
 
     def episode(self, index: int) -> Episode: ...
     def goal(self, world: World, episode: Episode) -> Goal: ...
@@ -43,6 +44,8 @@ class Trip:
     world: World
     positions: list[NDArray[np.float64]]
     """After each primitive, beginning with the start."""
+    decisions: int = 0
+    """Segments carried out by `run`."""
     at_decision: bool = True
     """Whether the agent stands at the end of an executed segment."""
     stopped: bool = False
@@ -116,7 +119,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         """Carries out one primitive: 0 forward, 1 turn left, 2 turn right, 3 stop."""
         if not self.action_space.contains(action):
             raise ArgumentError(f"step: expected an action from 0 to {len(PRIMITIVES) - 1}, got {action!r}")
-        segment = self.run([PRIMITIVES[action]])
+        segment = self._carry_out([PRIMITIVES[action]])
         info = {"result": self.result()} if segment.terminated or segment.truncated else {}
         return segment.observation.as_dict(), float(self.trip.success), segment.terminated, segment.truncated, info
 
@@ -130,14 +133,18 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         """Starts a given episode and observes."""
         place = world(episode.scene, self.task.backend)
         config = _env.NavigationConfig(motion=_env.Motion.__members__[self.task.motion])
-        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh.core, config)
+        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh, config)
         self._core.reset(np.asarray(episode.start_position), episode.start_yaw)
         self._trip = Trip(episode, place, [self._core.position])
         self._goal = self.task.goal(place, episode)
         return self._observe()
 
     def run(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
-        """Carries out primitives until the plan, the budget or the episode ends; observes once, at the end."""
+        """Carries out one decision: primitives until they, the budget or the episode end; observes once, at the end."""
+        self.trip.decisions += 1
+        return self._carry_out(actions)
+
+    def _carry_out(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
         trip, executed = self.trip, []
         first = len(trip.positions) - 1
         done = False
@@ -151,7 +158,8 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
             if done or trip.actions >= self.task.budget:
                 break
         path = np.stack(trip.positions[first:])
-        return Segment(self._observe(), np.array(executed, np.int8), path, done, not done and trip.actions >= self.task.budget)
+        spent = trip.actions >= self.task.budget or trip.decisions >= self.task.rules.decisions
+        return Segment(self._observe(), np.array(executed, np.int8), path, done, spent and not done)
 
     @property
     def goal(self) -> Goal:
