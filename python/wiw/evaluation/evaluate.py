@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs an agent, or several that differ in one thing, on the same episodes and records everything."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError, StoreError
+from wiw.evaluation.platform import describe_platform
+from wiw.evaluation.progress import Tracker, make_board
+from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
+from wiw.evaluation.rows import DecisionRow
+from wiw.evaluation.runlog import RunLog
+from wiw.evaluation.scene_map import keep_scene_maps
+from wiw.evaluation.store import RunStore, store_path
+from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
+from wiw.types import Episode
+
+
+def evaluate(
+    env_or_task: Any,
+    agent: Any,
+    episodes: int = 20,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    progress: bool = True,
+    arms: Sequence[str] | None = None,
+    *,
+    live: int = 4,
+    keep_images: int = 2,
+    resume: bool = False,
+) -> RunLog:
+    """Runs an agent on the first `episodes` episodes of a task.
+
+        log = wiw.evaluate(env, agent, episodes=20)
+        log = wiw.evaluate(env, agent, episodes=20, arms=["none", "copy", "warp", "oracle"])
+
+    All randomness is keyed by (seed, episode, decision, candidate): neither `workers` nor `live` changes a result.
+
+    Args:
+        env_or_task: an environment from `wiw.make`, its task, or a `TaskRecipe`.
+        agent: a `wiw.Agent` or an `AgentRecipe`.
+        episodes: how many.
+        seed: of the run; None means the task's own.
+        out: folder of the run; None means `runs/<task>-<time>`.
+        workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
+        progress: whether to show bars.
+        arms: world models to run on the same episodes with this agent's policies; None means the agent's own.
+        live: episodes kept live at a time in each process, so that model calls are batched.
+        keep_images: how many episodes keep pictures for the report, spread evenly.
+        resume: whether to go on with the run in `out` where it was stopped.
+
+    Raises:
+        StoreError: `out` holds a run and `resume` is off, or a run of another configuration.
+        ContractError: a policy or a world model broke its contract.
+        InfrastructureError: worker processes cannot be started or given their work.
+    """
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume)
+    return _run(task_recipe(env_or_task), arm_recipes(agent, arms), options)
+
+
+def run_arms(
+    env_or_task: Any,
+    agents: Mapping[str, Any],
+    episodes: int = 20,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    progress: bool = True,
+    *,
+    live: int = 4,
+    keep_images: int = 2,
+    resume: bool = False,
+) -> RunLog:
+    """Runs several named agents on the same episodes; see `evaluate` for the rest."""
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume)
+    return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
+
+
+def resume_run(
+    run: str | Path, workers: int | None = None, progress: bool = True, retry_failed: bool = False
+) -> RunLog:
+    """Goes on with a run of named parts: only episodes that have not ended are run.
+
+    Args:
+        run: the run's folder.
+        workers: processes; None means as many as it was begun with.
+        progress: whether to show bars.
+        retry_failed: whether to run episodes again whose infrastructure failed.
+
+    Raises:
+        StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory.
+    """
+    store = RunStore.resume(run)
+    info = store.info
+    if info["task"] is None or None in info["agents"].values():
+        store.close()
+        raise StoreError(
+            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
+            "call the same wiw.evaluate(..., out=..., resume=True) again"
+        )
+    task = TaskRecipe(**info["task"])
+    agents = {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+    return _finish(store, task, agents, workers or info["workers"], progress, retry_failed=retry_failed)
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What `evaluate` and `run_arms` have in common."""
+
+    episodes: int
+    seed: int | None
+    out: str | Path | None
+    workers: int
+    progress: bool
+    live: int
+    keep_images: int
+    resume: bool
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
+            if getattr(self, name) < least:
+                raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {getattr(self, name)}")
+
+
+def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
+    built = task.build()
+    seed = int(getattr(built, "seed", 0)) if options.seed is None else options.seed
+    config = {
+        "task": built.describe(),
+        "seed": seed,
+        "episodes": options.episodes,
+        "arms": _describe_arms(agents, built),
+    }
+    if options.resume and options.out is not None and store_path(options.out).exists():
+        store = RunStore.resume(options.out, config)
+    else:
+        folder = options.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
+        info = {
+            "platform": describe_platform(),
+            "task": task.to_json(),
+            "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
+            "pictures": _spread(options.episodes, options.keep_images),
+            "live": options.live,
+            "workers": options.workers,
+            "command": sys.argv,
+        }
+        store = RunStore.create(folder, config, info, built.episodes(options.episodes))
+    return _finish(store, task, agents, options.workers, options.progress)
+
+
+def _describe_arms(agents: Mapping[str, Any], task: Any) -> list[dict[str, Any]]:
+    """What each arm is, for the record; one agent at a time exists, for models may fill the memory."""
+    return [{"name": arm, "agent": recipe.build(task.defaults).describe()} for arm, recipe in agents.items()]
+
+
+def _spread(episodes: int, count: int) -> list[int]:
+    """`count` indices spread evenly over the episodes."""
+    count = min(count, episodes)
+    return sorted({round(i * (episodes - 1) / max(1, count - 1)) for i in range(count)})
+
+
+def _finish(
+    store: RunStore,
+    task: Any,
+    agents: Mapping[str, Any],
+    workers: int,
+    progress: bool,
+    *,
+    retry_failed: bool = False,
+) -> RunLog:
+    """Runs what is missing, closes the store and opens it for reading."""
+    info = store.info
+    plan = Plan(task, agents, store.config["seed"], info["live"], frozenset(info["pictures"]))
+    pending = {arm: store.pending(arm, retry_failed) for arm in agents}
+    board = make_board(progress and any(pending.values()))
+    try:
+        for arm, indices in pending.items():
+            store.discard(arm, indices)
+        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
+        _run_jobs(plan, store.episodes(), pending, desk, workers)
+        keep_scene_maps(store, task)
+    finally:
+        board.close()
+        store.close()
+    return RunLog(RunStore.read(store.path))
+
+
+def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[int]], desk: _Desk, workers: int) -> None:
+    sizes = {
+        arm: len(left) if workers == 1 else max(plan.live, math.ceil(len(left) / (3 * workers)))
+        for arm, left in pending.items()
+    }
+    jobs = [
+        Job(arm, tuple((index, episodes[index]) for index in left[first : first + sizes[arm]]))
+        for arm, left in pending.items()
+        for first in range(0, len(left), max(1, sizes[arm]))
+    ]
+    if workers == 1 or len(jobs) == 0:
+        run_here(plan, jobs, desk)
+    else:
+        run_in_workers(plan, jobs, desk, workers)
+
+
+def _budget(store: RunStore) -> int:
+    """Most decisions of an episode, as far as the task tells."""
+    return int(store.config["task"].get("decisions", 20))
+
+
+class _Desk:
+    """Writes rows to the store and tells the bars."""
+
+    def __init__(self, store: RunStore, tracker: Tracker) -> None:
+        self._store, self._tracker = store, tracker
+
+    def write(self, row: Row) -> None:
+        self._store.write(row)
+        if isinstance(row, DecisionRow):
+            self._tracker.decision(row.arm, row.episode)
+        else:
+            self._tracker.episode(row.arm, row.result)
+
+    def discard(self, arm: str, episodes: Iterable[int]) -> None:
+        episodes = list(episodes)
+        self._store.discard(arm, episodes)
+        for episode in episodes:
+            self._tracker.forget(arm, episode)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""On what a run was made: enough to tell two machines apart."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+from typing import Any
+
+
+def describe_platform() -> dict[str, Any]:
+    """JSON-able: Python, packages, processor, cores, instruction set."""
+    from wiw._core import core
+
+    return {
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "processor": processor_name(),
+        "cores": len(os.sched_getaffinity(0)),
+        "isa": core.active_isa(),
+        "packages": {name: _version(name) for name in ("numpy", "scipy", "opencv-python-headless", "torch")},
+    }
+
+
+def processor_name() -> str:
+    """As Linux names it, e.g. "AMD EPYC 7B13"."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file on disk
+            names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    except OSError:
+        names = []
+    return names[0] if names else platform.machine()
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

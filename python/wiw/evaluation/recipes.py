@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How tasks and agents are made again: in worker processes, and when a run is resumed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError
+
+
+@dataclass(frozen=True)
+class TaskRecipe:
+    """A task by name and options."""
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    def build(self) -> Any:
+        """The task."""
+        from wiw.registry import TASKS
+
+        return TASKS.make(self.name, **self.options)
+
+    def to_json(self) -> dict[str, Any]:
+        """For the run store; `TaskRecipe(**...)` is the way back."""
+        return {"name": self.name, "options": dict(self.options)}
+
+
+@dataclass(frozen=True)
+class AgentRecipe:
+    """An agent by the names (or `path.py:Class`) of its parts; see `wiw.Agent` for the rest.
+
+    `wiw.evaluate` takes it wherever it takes an agent. Unlike an agent in memory it can always be sent to worker
+    processes, and `wiw resume` can build it again.
+    """
+
+    policy: str
+    model: str | None = None
+    revision: str | None = None
+    candidates: int | None = None
+    horizon: int | None = None
+    execute: int | None = None
+
+    def build(self, defaults: Mapping[str, Any]) -> Any:
+        """The agent; what is None is taken from the task's defaults (M, L and the executed primitives)."""
+        from wiw.loop.agent import Agent
+
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        if "horizon" in given:  # the task's number of executed primitives belongs to the task's horizon
+            defaults = {name: value for name, value in defaults.items() if name != "execute"}
+        return Agent(**{**defaults, **given})
+
+    def with_model(self, model: str) -> AgentRecipe:
+        """The same agent with another world model."""
+        return replace(self, model=None if model == "none" else model)
+
+    def to_json(self) -> dict[str, Any]:
+        """For the run store; `AgentRecipe(**...)` is the way back."""
+        return asdict(self)
+
+    @property
+    def arm(self) -> str:
+        """Short name of the world model: "none", "warp", or the class behind a path."""
+        return "none" if self.model is None else self.model.rpartition(":")[2]
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A task or an agent that exists in memory. It reaches worker processes by pickling, and no later process."""
+
+    thing: Any
+
+    def build(self, *_: Any) -> Any:
+        """The thing itself."""
+        return self.thing
+
+    def to_json(self) -> None:
+        """Nothing: an object in memory cannot be written down."""
+
+
+def task_recipe(task: Any) -> TaskRecipe | Ready:
+    """A recipe of a task, or of a gymnasium environment's task."""
+    if isinstance(task, TaskRecipe):
+        return task
+    unwrapped = getattr(task, "unwrapped", task)
+    return Ready(getattr(unwrapped, "task", unwrapped))
+
+
+def agent_recipe(agent: Any) -> AgentRecipe | Ready:
+    """A recipe of an agent."""
+    return agent if isinstance(agent, AgentRecipe) else Ready(agent)
+
+
+def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
+    """The same agent with each of several world models, by arm name; with the model it has where `arms` is None.
+
+    Raises:
+        ArgumentError: an arm is named twice, or none is.
+    """
+    if arms is None:
+        return {_own_arm(agent): agent_recipe(agent)}
+    models = [str(name) for name in arms]
+    made = {AgentRecipe("", model).arm if model != "none" else "none": _with_model(agent, model) for model in models}
+    if not models or len(made) < len(models):
+        raise ArgumentError(f"arms: expected different world models, got {models}")
+    return made
+
+
+def _own_arm(agent: Any) -> str:
+    if isinstance(agent, AgentRecipe):
+        return agent.arm
+    model = getattr(agent, "model", None)
+    return "none" if model is None else type(model).__name__.lower()
+
+
+def _with_model(agent: Any, model: str) -> AgentRecipe | Ready:
+    if isinstance(agent, AgentRecipe):
+        return agent.with_model(model)
+    from wiw.loop.agent import Agent
+
+    own_reviser = agent.revision is agent.policy  # what a policy revises with may depend on there being a world model
+    return Ready(
+        Agent(
+            agent.policy,
+            None if model == "none" else model,
+            None if own_reviser else agent.revision,
+            agent.candidates,
+            agent.horizon,
+            agent.execute,
+        )
+    )
+
+
+def absolute(model: str) -> str:
+    """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
+    path, colon, name = model.rpartition(":")
+    return f"{Path(path).expanduser().resolve()}:{name}" if colon and path.endswith(".py") else model

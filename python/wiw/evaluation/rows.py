@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What of a decision goes into the run store: one row of plain values, and pictures as JPEG for chosen episodes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, StoreError
+from wiw.types import DecisionRecord, EpisodeResult, Truth
+
+STRIP_HEIGHT = 192
+JPEG_QUALITY = 85
+
+
+@dataclass(frozen=True)
+class DecisionRow:
+    """One row of table `decision`, ready to be written, with its pictures."""
+
+    arm: str
+    episode: int
+    decision: int
+    values: dict[str, Any]
+    """The other columns by name."""
+    images: dict[str, bytes]
+    """JPEG by name: "panorama", "goal", "imagined/0" and so on."""
+
+
+@dataclass(frozen=True)
+class OutcomeRow:
+    """One row of table `outcome`: how an episode ended."""
+
+    arm: str
+    result: EpisodeResult
+
+
+def to_json(value: Any) -> str:
+    """Standard JSON of arrays and numbers; what is not finite becomes null.
+
+    Raises:
+        ArgumentError: a value has no JSON form.
+    """
+    try:
+        return json.dumps(_plain(value), allow_nan=False, separators=(",", ":"), ensure_ascii=False)
+    except TypeError as error:
+        raise ArgumentError(f"a record must consist of numbers, text, lists and mappings: {error}") from None
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> DecisionRow:
+    """The row of a decision; pictures only where they are wanted, for they are most of the bytes."""
+    decision = record.decision
+    proposals = [{"actions": p.actions, "prior": p.prior, "note": p.note} for p in decision.proposals]
+    real = None if decision.rollouts is None else [rollout.real for rollout in decision.rollouts]
+    values: dict[str, Any] = {
+        "actions": to_json(decision.actions),
+        "execute": int(decision.execute),
+        "executed": to_json(record.executed),
+        "chosen": None if decision.chosen is None else int(decision.chosen),
+        "scores": None if decision.scores is None else to_json(decision.scores),
+        "proposals": to_json(proposals),
+        "real_frames": None if real is None else to_json(real),
+        "note": decision.note,
+        "path": to_json(record.path),
+        "seconds": to_json(dict(decision.seconds)),
+        "calls": to_json(dict(decision.calls)),
+        **_truth("before", record.before),
+        **_truth("after", record.after),
+    }
+    images = dict(_images(record)) if with_images else {}
+    return DecisionRow(arm, int(record.episode), int(record.index), values, images)
+
+
+def _truth(when: str, truth: Truth) -> dict[str, float]:
+    x, y, z = (float(value) for value in truth.position)
+    return {
+        f"{when}_x": x,
+        f"{when}_y": y,
+        f"{when}_z": z,
+        f"{when}_yaw": float(truth.yaw),
+        f"{when}_distance": float(truth.distance_to_goal),
+        f"{when}_geodesic": float(truth.geodesic_to_goal),
+    }
+
+
+def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
+    decision = record.decision
+    if decision.observation is not None:
+        yield "panorama", encode_jpeg(decision.observation.panorama)
+    if decision.goal is not None and decision.goal.image is not None and record.index == 0:
+        yield "goal", encode_jpeg(decision.goal.image)
+    for index, rollout in enumerate(decision.rollouts or ()):
+        yield f"imagined/{index}", encode_jpeg(strip(rollout.frames))
+
+
+def strip(frames: NDArray[np.uint8], height: int = STRIP_HEIGHT) -> NDArray[np.uint8]:
+    """Frames side by side, uint8 [height, K * width, 3]; several views of a frame stand above one another.
+
+    Args:
+        frames: uint8 [K, H, W, 3] or [K, V, H, W, 3].
+        height: of one view, in pixels.
+    """
+    views = frames[:, None] if frames.ndim == 4 else frames
+    width = max(1, round(height * views.shape[3] / views.shape[2]))
+    columns = [
+        np.concatenate([cv2.resize(view, (width, height), interpolation=cv2.INTER_AREA) for view in frame])
+        for frame in views
+    ]
+    return np.ascontiguousarray(np.concatenate(columns, axis=1))
+
+
+def encode_jpeg(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
+    """JPEG bytes of an RGB image."""
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return bytes(data)
+
+
+def decode_jpeg(data: bytes) -> NDArray[np.uint8]:
+    """RGB image [H, W, 3] from JPEG bytes."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise StoreError(f"a picture of {len(data)} bytes is no JPEG; the run store is damaged")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as its user reads it: summary, table, episodes, decisions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError
+from wiw.evaluation.store import RunStore
+from wiw.evaluation.summary import Summary, summarise
+
+
+class Records(list[dict[str, Any]]):
+    """A list of plain dicts that turns into a pandas DataFrame on request."""
+
+    def to_pandas(self) -> Any:
+        """The records as a DataFrame, nested metrics as columns.
+
+        Raises:
+            ArgumentError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise ArgumentError("to_pandas needs pandas, which is not installed: pip install pandas") from None
+        return pandas.DataFrame([_flat(record) for record in self])
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    metrics = record.get("metrics", {})
+    return {**{name: value for name, value in record.items() if name != "metrics"}, **metrics}
+
+
+class RunLog:
+    """A run on disk, whether finished or not. Made by `wiw.evaluate` and `wiw.load_run`."""
+
+    def __init__(self, store: RunStore) -> None:
+        self.store = store
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self.store.path.parent
+
+    @property
+    def arms(self) -> list[str]:
+        """Names of the arms, in the order of the table."""
+        return [arm["name"] for arm in self.store.config["arms"]]
+
+    @property
+    def episodes(self) -> Records:
+        """Ended episodes of all arms: arm, episode, scene, status, metrics, seconds, error."""
+        return Records(self.store.outcomes())
+
+    @property
+    def decisions(self) -> Records:
+        """Decisions of all ended episodes: proposals, scores, choice, what was executed, truth before and after."""
+        return Records(self.store.decisions())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every arm has ended every episode."""
+        return not any(self.store.pending(arm) for arm in self.arms)
+
+    def numbers(self) -> Summary:
+        """Means, intervals and paired differences, without printing."""
+        return summarise(self.arms, self.store.outcomes(), len(self.store.episodes()), self.store.config["seed"])
+
+    def summary(self) -> Summary:
+        """Prints the table of arms and the paired differences, and returns them as numbers."""
+        numbers = self.numbers()
+        if not in_notebook():
+            from rich.console import Console
+
+            Console().print(numbers)
+        return numbers
+
+    def table(self) -> Records:
+        """The table of arms as plain values: one dict an arm, with `<metric>`, `<metric>_low` and `<metric>_high`."""
+        lines = []
+        for arm in self.numbers().arms:
+            line: dict[str, Any] = {"arm": arm.name, "role": arm.role, "n": arm.done, "failed": arm.failed}
+            for metric, estimate in arm.estimates.items():
+                line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
+            lines.append(line)
+        return Records(lines)
+
+    def close(self) -> None:
+        """Closes the run's file."""
+        self.store.close()
+
+    def __repr__(self) -> str:
+        ended = {arm: sum(record["arm"] == arm for record in self.episodes) for arm in self.arms}
+        return f"RunLog({str(self.path)!r}, ended: {ended} of {len(self.store.episodes())})"
+
+
+def load_run(path: str | Path) -> RunLog:
+    """A run from its folder, also while it is still running.
+
+    Raises:
+        StoreError: nothing there, damaged, or of another version.
+    """
+    return RunLog(RunStore.read(path))
+
+
+def in_notebook() -> bool:
+    """Whether the value of a cell is shown by itself, so that printing it would show it twice."""
+    try:
+        from IPython import get_ipython
+    except ModuleNotFoundError:
+        return False
+    return type(get_ipython()).__name__ == "ZMQInteractiveShell"

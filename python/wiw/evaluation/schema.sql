@@ -1,0 +1,65 @@
+-- A run: one experiment, one or more arms on the same episodes. Version 1 (PRAGMA user_version).
+CREATE TABLE run (
+    id INTEGER PRIMARY KEY CHECK (id = 1),
+    created TEXT NOT NULL,          -- ISO 8601, UTC
+    wiw_version TEXT NOT NULL,
+    config TEXT NOT NULL,           -- JSON: task, arms, seed; what must not differ when a run is resumed
+    info TEXT NOT NULL              -- JSON: platform, how to rebuild task and agents, which episodes keep pictures
+);
+
+CREATE TABLE episode (              -- the episodes that every arm runs
+    episode INTEGER PRIMARY KEY,
+    episode_id TEXT NOT NULL,
+    scene TEXT NOT NULL,
+    start_x REAL NOT NULL, start_y REAL NOT NULL, start_z REAL NOT NULL, start_yaw REAL NOT NULL,  -- metres, radians
+    goal_x REAL NOT NULL, goal_y REAL NOT NULL, goal_z REAL NOT NULL, goal_yaw REAL NOT NULL,
+    geodesic REAL NOT NULL,         -- metres
+    info TEXT NOT NULL              -- JSON
+);
+
+CREATE TABLE outcome (              -- how an episode ended in an arm; absent while it is to be run
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL REFERENCES episode (episode),
+    status TEXT NOT NULL CHECK (status IN ('done', 'failed')),  -- failed: infrastructure, never the task
+    metrics TEXT NOT NULL,          -- JSON: name to number
+    seconds REAL NOT NULL,
+    error TEXT NOT NULL,
+    PRIMARY KEY (arm, episode)
+) WITHOUT ROWID;
+
+CREATE TABLE decision (
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL REFERENCES episode (episode),
+    decision INTEGER NOT NULL,      -- 0, 1, ... within the episode
+    actions TEXT NOT NULL,          -- JSON: primitive ids of the plan chosen or written anew
+    execute INTEGER NOT NULL,       -- how many of them were to be carried out
+    executed TEXT NOT NULL,         -- JSON: primitive ids that were
+    chosen INTEGER,                 -- index into proposals; NULL: written anew
+    scores TEXT,                    -- JSON: one a proposal
+    proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note}]
+    real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
+    note TEXT NOT NULL,
+    path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
+    seconds TEXT NOT NULL,          -- JSON: wall time by stage
+    calls TEXT NOT NULL,            -- JSON: rows and frames asked of the world model
+    before_x REAL NOT NULL, before_y REAL NOT NULL, before_z REAL NOT NULL, before_yaw REAL NOT NULL,
+    before_distance REAL, before_geodesic REAL,
+    after_x REAL NOT NULL, after_y REAL NOT NULL, after_z REAL NOT NULL, after_yaw REAL NOT NULL,
+    after_distance REAL, after_geodesic REAL,
+    PRIMARY KEY (arm, episode, decision)
+) WITHOUT ROWID;
+
+CREATE TABLE image (
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL,
+    decision INTEGER NOT NULL,
+    name TEXT NOT NULL,             -- panorama | goal (with decision 0) | imagined/<proposal>
+    jpeg BLOB NOT NULL,
+    PRIMARY KEY (arm, episode, decision, name)
+);
+
+CREATE TABLE scene_map (            -- how a scene looks from above, for the episodes with pictures
+    scene TEXT PRIMARY KEY,
+    webp BLOB NOT NULL,             -- transparent outside the scene
+    world_to_pixel TEXT NOT NULL    -- JSON: 2x3, pixel = A [x, z, 1]
+);

@@ -1,0 +1,365 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run store: one SQLite file that survives being killed at any moment, written by one process.
+
+Every decision and every episode's end is a transaction of its own in WAL mode: a killed run loses at most what it was
+about to write. Episodes without an outcome are partial; resuming discards and redoes them.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import wiw
+from wiw.errors import StoreError
+from wiw.evaluation.rows import DecisionRow, OutcomeRow, to_json
+from wiw.types import Episode
+
+SCHEMA_VERSION = 1
+APPLICATION_ID = 0x77697721
+"""Marks the file as a run store (SQLite's application_id)."""
+FILE_NAME = "run.sqlite"
+_SCHEMA = Path(__file__).with_name("schema.sql")
+
+
+def store_path(run: str | Path) -> Path:
+    """The store's file, from a run's folder or the file itself."""
+    path = Path(run).expanduser()
+    return path if path.suffix == ".sqlite" else path / FILE_NAME
+
+
+class RunStore:
+    """An open run store. Use `create`, `resume` or `read`; works as a context manager."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, lock: Any = None) -> None:
+        self.path = path
+        self._connection = connection
+        self._lock = lock
+
+    @classmethod
+    def create(
+        cls, run: str | Path, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
+    ) -> RunStore:
+        """A new store for writing.
+
+        Raises:
+            StoreError: a run is already there, or the folder cannot be written.
+        """
+        path = store_path(run)
+        if path.exists() and not _blank(path):
+            raise StoreError(
+                f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
+                "(or evaluate(..., resume=True)), or give another output folder"
+            )
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(
+                f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
+            ) from error
+        store = cls(path, _connect(path), _lock(path))
+        with _explained(path), store._connection as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            for statement in _SCHEMA.read_text().split(";\n"):
+                connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            created = datetime.now(timezone.utc).isoformat(timespec="seconds")
+            connection.execute(
+                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(info))
+            )
+            connection.executemany(
+                "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [_episode_values(index, episode) for index, episode in enumerate(episodes)],
+            )
+        return store
+
+    @classmethod
+    def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:
+        """An existing store for writing; partial episodes are discarded.
+
+        Raises:
+            StoreError: missing, damaged, of another version, of another configuration than `config`, or in use.
+        """
+        path = store_path(run)
+        lock = _lock(path) if path.exists() else None
+        store = cls._open(path, lock)
+        if store.wiw_version != wiw.__version__:
+            raise StoreError(
+                f"{path} was begun by wiw {store.wiw_version}, this is {wiw.__version__}: results of two versions "
+                "must not be mixed; install that version or start a new run"
+            )
+        if config is not None:
+            _require_same(path, store.config, json.loads(to_json(config)))
+        with _explained(path), store._connection as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            for table in ("decision", "image"):
+                connection.execute(
+                    f"DELETE FROM {table} AS d WHERE NOT EXISTS "
+                    "(SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)"
+                )
+        return store
+
+    @classmethod
+    def read(cls, run: str | Path) -> RunStore:
+        """An existing store for reading, also while it is being written.
+
+        Raises:
+            StoreError: missing, damaged or of another version.
+        """
+        return cls._open(store_path(run), None)
+
+    @classmethod
+    def _open(cls, path: Path, lock: Any) -> RunStore:
+        if not path.is_file():
+            raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
+        with _explained(path):
+            connection = _connect(path, read_only=lock is None)
+            (application,) = connection.execute("PRAGMA application_id").fetchone()
+            (version,) = connection.execute("PRAGMA user_version").fetchone()
+            if application != APPLICATION_ID:
+                raise StoreError(
+                    f"{path} is no run store of wiw (application id {application:#x}); was its creation cut off?"
+                )
+            if version != SCHEMA_VERSION:
+                raise StoreError(
+                    f"{path} has schema version {version}, this wiw reads {SCHEMA_VERSION}; use the wiw that wrote it"
+                )
+            return cls(path, connection, lock)
+
+    # -- what the run is -------------------------------------------------------------------------------------------
+
+    @property
+    def wiw_version(self) -> str:
+        """Version of wiw that began the run."""
+        return str(self._value("wiw_version"))
+
+    @property
+    def created(self) -> str:
+        """When the run began, ISO 8601 in UTC."""
+        return str(self._value("created"))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Task, arms and seed."""
+        return dict(json.loads(self._value("config")))
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Platform, how to rebuild task and agents, which episodes keep pictures."""
+        return dict(json.loads(self._value("info")))
+
+    def episodes(self) -> list[Episode]:
+        """The episodes that every arm runs; their place in the list is their index."""
+        return [_episode(row) for row in self._rows("SELECT * FROM episode ORDER BY episode")]
+
+    def outcomes(self) -> list[dict[str, Any]]:
+        """Ended episodes of all arms."""
+        rows = self._rows(
+            "SELECT o.*, e.episode_id, e.scene, e.geodesic FROM outcome o JOIN episode e USING (episode) "
+            "ORDER BY arm, episode"
+        )
+        return [{**row, "metrics": json.loads(row["metrics"])} for row in rows]
+
+    def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
+        """Decisions of ended episodes, of one arm or episode if named, in order."""
+        rows = self._rows(
+            "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (?1 IS NULL OR arm = ?1) "
+            "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
+            (arm, episode),
+        )
+        for row in rows:
+            for column in ("actions", "executed", "scores", "proposals", "real_frames", "path", "seconds", "calls"):
+                row[column] = None if row[column] is None else json.loads(row[column])
+        return rows
+
+    def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
+        """JPEG by name, empty where no pictures were kept."""
+        rows = self._rows(
+            "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
+            (arm, episode, decision),
+        )
+        return {row["name"]: row["jpeg"] for row in rows}
+
+    def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
+        """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
+        for row in self._rows("SELECT * FROM scene_map WHERE scene = ?", (scene,)):
+            return row["webp"], json.loads(row["world_to_pixel"])
+        return None
+
+    def pending(self, arm: str, retry_failed: bool = False) -> list[int]:
+        """Indices of the episodes still to be run in an arm."""
+        status = "AND status = 'done'" if retry_failed else ""
+        rows = self._rows(
+            f"SELECT episode FROM episode WHERE episode NOT IN "
+            f"(SELECT episode FROM outcome WHERE arm = ? {status}) ORDER BY episode",
+            (arm,),
+        )
+        return [row["episode"] for row in rows]
+
+    # -- writing ---------------------------------------------------------------------------------------------------
+
+    def write(self, row: DecisionRow | OutcomeRow) -> None:
+        """Writes one decision with its pictures, or one episode's end, as one transaction."""
+        with self._writing() as connection:
+            if isinstance(row, DecisionRow):
+                key = {"arm": row.arm, "episode": row.episode, "decision": row.decision}
+                _insert(connection, "decision", {**key, **row.values})
+                for name, jpeg in row.images.items():
+                    _insert(connection, "image", {**key, "name": name, "jpeg": jpeg})
+            else:
+                result = row.result
+                _insert(
+                    connection,
+                    "outcome",
+                    {
+                        "arm": row.arm,
+                        "episode": result.episode,
+                        "status": result.status,
+                        "metrics": to_json(dict(result.metrics)),
+                        "seconds": result.seconds,
+                        "error": result.error,
+                    },
+                )
+
+    def discard(self, arm: str, episodes: Iterable[int]) -> None:
+        """Forgets what was written of episodes that are to be run again."""
+        with self._writing() as connection:
+            for table in ("decision", "image", "outcome"):
+                connection.executemany(
+                    f"DELETE FROM {table} WHERE arm = ? AND episode = ?", [(arm, i) for i in episodes]
+                )
+
+    def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
+        """Keeps how a scene looks from above."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT OR REPLACE INTO scene_map VALUES (?, ?, ?)", (scene, webp, to_json(world_to_pixel))
+            )
+
+    def close(self) -> None:
+        """Closes the file and lets others write."""
+        self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> RunStore:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with _explained(self.path), self._connection as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection
+
+    def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[dict[str, Any]]:
+        with _explained(self.path):
+            return [dict(row) for row in self._connection.execute(query, values)]
+
+    def _value(self, column: str) -> Any:
+        rows = self._rows("SELECT * FROM run")
+        if not rows:
+            raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
+        return rows[0][column]
+
+
+def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
+    with _explained(path):
+        mode = "ro" if read_only else "rwc"
+        uri = f"{path.absolute().as_uri()}?mode={mode}"
+        connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
+        connection.row_factory = sqlite3.Row
+        if not read_only:
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+            connection.execute("PRAGMA foreign_keys = ON")
+        return connection
+
+
+def _blank(path: Path) -> bool:
+    """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
+    with _explained(path):
+        connection = _connect(path)
+        (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        connection.close()
+    return bool(tables == 0)
+
+
+def _lock(path: Path) -> Any:
+    """An advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
+    handle = path.with_suffix(".lock").open("w")
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        handle.close()
+        raise StoreError(f"{path} is being written by another process; wait for it to end or stop it") from None
+    return handle
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.DatabaseError as error:
+        raise StoreError(
+            f"{path}: {error}; expected a readable, undamaged run store with room to write "
+            "(check the disk's free space, or restore the file)"
+        ) from error
+
+
+def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
+    marks = ", ".join("?" for _ in values)
+    connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values()))
+
+
+def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
+    if stored == wanted:
+        return
+    differing = sorted(name for name in stored.keys() | wanted.keys() if stored.get(name) != wanted.get(name))
+    detail = "; ".join(
+        f"{name}: the run has {to_json(stored.get(name))}, now {to_json(wanted.get(name))}" for name in differing
+    )
+    raise StoreError(
+        f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
+    )
+
+
+def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
+    values = asdict(episode)
+    return (
+        index,
+        values["episode_id"],
+        values["scene"],
+        *map(float, values["start_position"]),
+        float(values["start_yaw"]),
+        *map(float, values["goal_position"]),
+        float(values["goal_yaw"]),
+        float(values["geodesic"]),
+        to_json(values["info"]),
+    )
+
+
+def _episode(row: dict[str, Any]) -> Episode:
+    return Episode(
+        row["episode_id"],
+        row["scene"],
+        (row["start_x"], row["start_y"], row["start_z"]),
+        row["start_yaw"],
+        (row["goal_x"], row["goal_y"], row["goal_z"]),
+        row["goal_yaw"],
+        row["geodesic"],
+        json.loads(row["info"]),
+    )

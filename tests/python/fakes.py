@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A task without a world, for tests of everything around the loop: walk along a line to a goal at its end.
+
+The agent draws each plan from the decision's key, so a run's results are a function of (seed, episode, decision) alone.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wiw._core import core
+from wiw.types import Decision, Episode, Goal, Observation, Proposal, Rollout, Truth
+
+FORWARD, LEFT = 1, 2
+STEP = 0.2
+
+
+@dataclass
+class Outcome:
+    observation: Observation
+    executed: Any
+    path: Any
+    terminated: bool
+    truncated: bool
+
+
+class LineEnv:
+    def __init__(self, task: LineTask) -> None:
+        self.task = task
+
+    def begin(self, episode: Episode) -> Observation:
+        if episode.episode_id in self.task.broken:
+            raise OSError(f"no such scene: {episode.scene}")
+        self.episode, self.x, self.actions = episode, 0.0, 0
+        self.goal = Goal("line", image=np.full((48, 48, 3), 200, np.uint8))
+        return self._observe()
+
+    def run(self, actions: Any) -> Outcome:
+        path = [self._position()]
+        for action in actions:
+            self.x += STEP * (action == FORWARD)
+            self.actions += 1
+            path.append(self._position())
+        done = self._left() < 0.5
+        time.sleep(self.task.delay)
+        return Outcome(
+            self._observe(), np.asarray(actions), np.array(path), done, not done and self.actions >= self.task.budget
+        )
+
+    def truth(self) -> Truth:
+        return Truth(self._position(), 0.0, self._left(), self._left())
+
+    def result(self) -> dict[str, float]:
+        success = float(self._left() < 0.5)
+        travelled = max(self.x, 1e-9)
+        return {
+            "success": success,
+            "actions": float(self.actions),
+            "travelled": self.x,
+            "shortest": self.episode.geodesic,
+            "spl": success * self.episode.geodesic / max(travelled, self.episode.geodesic),
+            "distance_to_goal": self._left(),
+        }
+
+    def close(self) -> None:
+        pass
+
+    def _left(self) -> float:
+        return abs(self.episode.geodesic - self.x)
+
+    def _position(self) -> Any:
+        return np.array([self.x, 0.0, 0.0])
+
+    def _observe(self) -> Observation:
+        panorama = np.full((32, 64, 3), min(255, int(20 * self.x)), np.uint8)
+        return Observation(panorama, panorama[:32, :32], np.array([self.x, 0.0, 0.0]))
+
+
+@dataclass
+class LineTask:
+    """Goals from 1 to 3 m ahead, two episodes a scene."""
+
+    seed: int = 0
+    budget: int = 15
+    broken: tuple[str, ...] = ()
+    delay: float = 0.0
+    name: str = "line"
+    defaults: dict[str, int] = field(default_factory=lambda: {"candidates": 2, "horizon": 5, "execute": 3})
+
+    def describe(self) -> dict[str, Any]:
+        return {"task": self.name, "seed": self.seed, "budget": self.budget, "decisions": 8}
+
+    def environment(self, depth: bool = False) -> LineEnv:
+        return LineEnv(self)
+
+    def episodes(self, count: int) -> list[Episode]:
+        lengths = 1 + 2 * core.uniform(core.fold_key([self.seed, 7]), count)
+        return [
+            Episode(f"{i:04d}", f"line/{i // 2}", (0.0, 0.0, 0.0), 0.0, (float(d), 0.0, 0.0), 0.0, float(d))
+            for i, d in enumerate(lengths)
+        ]
+
+
+@dataclass
+class LineAgent:
+    """Goes forward with probability `drive`; `kill` names episodes that kill their process at decision 1."""
+
+    drive: float = 0.7
+    kill: tuple[int, ...] = ()
+    marker: str = ""
+    """File whose absence lets `kill` strike only once."""
+    needs: tuple[str, ...] = ()
+    model: Any = None
+
+    def describe(self) -> dict[str, Any]:
+        return {"policy": "line", "drive": self.drive}
+
+    def decide_batch(self, queries: Any) -> list[Decision]:
+        return [self._decide(query) for query in queries]
+
+    def forget(self, key: Any) -> None:
+        pass
+
+    def _decide(self, query: Any) -> Decision:
+        key = query.key
+        if key.episode in self.kill and key.decision == 1:
+            self._die()
+        plans = []
+        for candidate in range(2):
+            draws = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), 5)
+            plans.append(Proposal(np.where(draws < self.drive, FORWARD, LEFT), prior=float(draws[0]), note="drawn"))
+        scores = np.array([float((plan.actions == FORWARD).sum()) for plan in plans])
+        chosen = int(scores.argmax())
+        frames = np.full((5, 24, 24, 3), 90, np.uint8)
+        return Decision(
+            plans[chosen].actions,
+            3,
+            tuple(plans),
+            tuple(Rollout(frames, np.zeros(5, bool)) for _ in plans),
+            scores,
+            chosen,
+            query.observation,
+            query.goal,
+            key,
+            {"propose": 0.001},
+            {"rows": 2, "frames": 10},
+        )
+
+    def _die(self) -> None:
+        if self.marker:
+            if Path(self.marker).exists():
+                return
+            Path(self.marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)

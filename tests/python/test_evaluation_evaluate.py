@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fakes import LineAgent, LineTask
+
+from wiw.errors import ArgumentError, ContractError, InfrastructureError, StoreError
+from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
+from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
+from wiw.evaluation.runlog import load_run
+
+HERE = Path(__file__).parent
+TIMINGS = ("seconds",)
+
+
+def facts(log):
+    """Everything a run found out, without how long it took."""
+    keep = [{k: v for k, v in row.items() if k not in TIMINGS} for row in [*log.episodes, *log.decisions]]
+    pictures = [log.store.images(d["arm"], d["episode"], d["decision"]) for d in log.decisions]
+    return keep, pictures
+
+
+def run(out, workers=1, live=4, agent=None, task=None, episodes=8, **options):
+    arms = {"none": LineAgent(0.5), "warp": agent or LineAgent(0.8)}
+    return run_arms(task or LineTask(), arms, episodes, out=out, workers=workers, live=live, progress=False, **options)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    return run(tmp_path_factory.mktemp("reference") / "run")
+
+
+def test_every_arm_ends_every_episode(reference):
+    assert reference.complete and len(reference.episodes) == 16
+    lines = reference.numbers()
+    assert lines["warp"].estimates["success"].value > lines["none"].estimates["success"].value
+
+
+@pytest.mark.parametrize(("workers", "live"), [(1, 1), (1, 8), (2, 2), (3, 1)])
+def test_results_do_not_depend_on_workers_or_batches(reference, tmp_path, workers, live):
+    assert facts(run(tmp_path / "run", workers, live)) == facts(reference)
+
+
+def test_results_depend_on_the_seed(reference, tmp_path):
+    assert facts(run(tmp_path / "run", seed=1)) != facts(reference)
+
+
+def test_pictures_are_kept_for_chosen_episodes(reference, tmp_path):
+    assert reference.store.info["pictures"] == [0, 7]
+    assert reference.store.images("warp", 7, 0) and not reference.store.images("warp", 3, 0)
+    assert not run(tmp_path / "run", episodes=2, keep_images=0).store.images("warp", 0, 0)
+
+
+def test_broken_episodes_fail_for_infrastructure_and_the_rest_goes_on(tmp_path):
+    log = run(tmp_path / "run", task=LineTask(broken=("0002",)), workers=2)
+    failed = [row for row in log.episodes if row["status"] == "failed"]
+    assert [row["episode"] for row in failed] == [2, 2]
+    assert "no such scene" in failed[0]["error"] and failed[0]["metrics"] == {}
+    assert log.numbers()["warp"].done == 7
+
+
+def test_a_worker_that_dies_once_costs_nothing(reference, tmp_path):
+    agent = LineAgent(0.8, kill=(3,), marker=str(tmp_path / "struck"))
+    assert facts(run(tmp_path / "run", workers=2, agent=agent)) == facts(reference)
+    assert (tmp_path / "struck").exists()
+
+
+def test_an_episode_that_kills_two_workers_is_recorded_as_failed(tmp_path):
+    log = run(tmp_path / "run", workers=2, agent=LineAgent(0.8, kill=(3,)))
+    failed = [row for row in log.episodes if row["status"] == "failed"]
+    assert [(row["arm"], row["episode"]) for row in failed] == [("warp", 3)]
+    assert "SIGKILL" in failed[0]["error"]
+    assert log.complete and log.numbers()["warp"].done == 7
+
+
+class Sloppy(LineAgent):
+    """An agent whose world model broke its contract."""
+
+    def decide_batch(self, queries):
+        raise ContractError("Sloppy.rollout: expected uint8, got float32")
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_broken_contract_stops_the_run(tmp_path, workers):
+    with pytest.raises(ContractError, match="got float32"):
+        run(tmp_path / "run", workers, agent=Sloppy())
+    assert not load_run(tmp_path / "run").complete
+
+
+def test_what_cannot_be_pickled_is_refused_with_advice(tmp_path):
+    agent = LineAgent()
+    agent.model = lambda: None
+    with pytest.raises(InfrastructureError, match=r"path\.py:Class.*workers=1"):
+        run(tmp_path / "run", workers=2, agent=agent)
+
+
+def test_arguments_are_checked(tmp_path):
+    with pytest.raises(ArgumentError, match="episodes of at least 1, got 0"):
+        run(tmp_path / "run", episodes=0)
+    with pytest.raises(ArgumentError, match="different world models"):
+        arm_recipes(AgentRecipe("matcher"), ["warp", "warp"])
+
+
+def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
+    first = run(tmp_path / "run")
+    with pytest.raises(StoreError, match="holds a run already"):
+        run(tmp_path / "run")
+    assert facts(run(tmp_path / "run", resume=True)) == facts(first) == facts(reference)
+    with pytest.raises(StoreError, match="another configuration"):
+        run(tmp_path / "run", resume=True, agent=LineAgent(0.9))
+    with pytest.raises(StoreError, match="resume=True"):
+        resume_run(tmp_path / "run")
+
+
+def test_evaluate_takes_one_agent(tmp_path):
+    log = evaluate(LineTask(), LineAgent(1.0), episodes=3, out=tmp_path / "run", progress=False)
+    assert log.arms == ["none"] and log.numbers()["none"].estimates["success"].value == 100.0
+
+
+SCRIPT = """
+import sys
+from fakes import LineAgent, LineTask
+from wiw.evaluation.evaluate import run_arms
+if __name__ == "__main__":
+    out, workers, delay = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
+    arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
+    run_arms(LineTask(delay=delay), arms, 8, out=out, workers=workers, progress=False, resume=True)
+"""
+
+
+def start(folder, workers, delay, out):
+    script = folder / "script.py"
+    script.write_text(SCRIPT)
+    paths = os.pathsep.join([str(HERE), *sys.path])
+    return subprocess.Popen(
+        [sys.executable, script, out, str(workers), str(delay)], env={**os.environ, "PYTHONPATH": paths}
+    )
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_happened(reference, tmp_path, workers):
+    out, draw = tmp_path / "run", random.Random(workers)
+    for _ in range(4):
+        process = start(tmp_path, workers, 0.04, out)
+        deadline = time.monotonic() + 20
+        while not (out / "run.sqlite").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(draw.uniform(0, 0.6))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert start(tmp_path, workers, 0.0, out).wait(60) == 0
+    assert facts(load_run(out)) == facts(reference)
+
+
+def test_recipes_survive_json():
+    agent = AgentRecipe("matcher", "warp", horizon=7)
+    assert AgentRecipe(**agent.to_json()) == agent and agent.arm == "warp"
+    task = TaskRecipe("imagenav", {"scenes": "apartments:val", "seed": 3})
+    assert TaskRecipe(**task.to_json()) == task
+    assert Ready(LineTask()).to_json() is None
+    assert agent.with_model("none").arm == "none" and AgentRecipe("m", "/x/y.py:Mine").arm == "Mine"
+    assert absolute("a.py:Mine") == f"{Path.cwd() / 'a.py'}:Mine" and absolute("pkg.mod:Mine") == "pkg.mod:Mine"

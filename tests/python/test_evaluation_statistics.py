@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from wiw.errors import ArgumentError
+from wiw.evaluation.intervals import agresti_min, clustered_bootstrap, student, wilson
+from wiw.evaluation.statistics import HEADLINES, compare, estimate_difference, estimate_mean, mcnemar
+from wiw.evaluation.summary import notes, summarise
+
+SR, SPL, TRAJ = HEADLINES
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 6), (3, 7), (40, 164), (12, 12)])
+def test_wilson_is_scipys(successes, n):
+    expected = stats.binomtest(successes, n).proportion_ci(method="wilson")
+    assert wilson(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_student_is_scipys():
+    data = np.random.default_rng(0).normal(40, 9, 23)
+    expected = stats.ttest_1samp(data, 0).confidence_interval()
+    assert student(data) == pytest.approx((expected.low, expected.high))
+    assert all(math.isnan(end) for end in student([3.0]))
+
+
+@pytest.mark.parametrize("method", ["bca", "percentile"])
+def test_bootstrap_is_scipys_where_every_episode_is_its_own_scene(method):
+    data = np.random.default_rng(1).exponential(1.0, 40)
+    expected = stats.bootstrap((data,), np.mean, method=method, n_resamples=40_000, rng=5).confidence_interval
+    assert clustered_bootstrap(data, np.arange(40), method=method, resamples=40_000) == pytest.approx(
+        (expected.low, expected.high), abs=0.03
+    )
+
+
+def test_bootstrap_spread_is_the_clustered_standard_error_of_statsmodels():
+    sm = pytest.importorskip("statsmodels.api")
+    rng = np.random.default_rng(2)
+    scenes = np.repeat(np.arange(60), 4)
+    data = rng.normal(0, 1, 60)[scenes] + rng.normal(0, 0.3, 240)
+    fit = sm.OLS(data, np.ones(240)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
+    low, high = clustered_bootstrap(data, scenes)
+    assert high - low == pytest.approx(2 * 1.96 * fit.bse[0], rel=0.06)
+    independent = clustered_bootstrap(data, np.arange(240))
+    assert high - low > 1.6 * (independent[1] - independent[0])
+
+
+def test_bootstrap_weighs_scenes_by_their_episodes():
+    values, scenes = [1.0] * 30 + [0.0] * 2, ["a"] * 30 + ["b"] * 2
+    low, high = clustered_bootstrap(values, scenes, method="percentile")
+    assert (low, high) == (0.0, 1.0)
+    assert estimate_mean(values, scenes, SR).value == pytest.approx(100 * 30 / 32)
+
+
+def test_bootstrap_is_keyed_by_its_seed_and_refuses_nonsense():
+    data, scenes = np.arange(12.0), np.repeat([0, 1, 2], 4)
+    assert clustered_bootstrap(data, scenes, seed=3) == clustered_bootstrap(data, scenes, seed=3)
+    with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
+        clustered_bootstrap(data, np.zeros(12))
+    with pytest.raises(ArgumentError, match="bca or percentile"):
+        clustered_bootstrap(data, scenes, method="magic")
+
+
+def test_mcnemar_is_statsmodels():
+    tables = pytest.importorskip("statsmodels.stats.contingency_tables")
+    rng = np.random.default_rng(3)
+    arm, base = (rng.random(50) < 0.6).astype(float), (rng.random(50) < 0.3).astype(float)
+    table = [[((arm == a) & (base == b)).sum() for b in (0, 1)] for a in (0, 1)]
+    assert mcnemar(arm, base) == pytest.approx(tables.mcnemar(table, exact=True).pvalue)
+    assert mcnemar([1, 0], [1, 0]) == 1.0
+
+
+def test_agresti_min_formula_by_hand():
+    differences = [1.0] * 5 + [-1.0] * 2 + [0.0] * 13
+    b, c, n = 5.5, 2.5, 22
+    half = 1.959964 * math.sqrt((b + c) - (b - c) ** 2 / n) / n
+    assert agresti_min(differences) == pytest.approx(((b - c) / n - half, (b - c) / n + half), abs=1e-6)
+
+
+def test_agresti_min_covers():
+    """Exact coverage over all outcomes of 20 pairs, with 25 % wins and 10 % losses."""
+    n, win, loss = 20, 0.25, 0.10
+    covered = 0.0
+    for wins in range(n + 1):
+        for losses in range(n + 1 - wins):
+            low, high = agresti_min([1.0] * wins + [-1.0] * losses + [0.0] * (n - wins - losses))
+            if low <= win - loss <= high:
+                covered += stats.multinomial.pmf([wins, losses, n - wins - losses], n, [win, loss, 1 - win - loss])
+    assert 0.94 < covered < 0.985
+
+
+def test_coverage_with_few_scenes():
+    """The wider of the two intervals holds the truth where the bootstrap alone does not: 4 scenes of 5 episodes."""
+    rng = np.random.default_rng(4)
+    scenes = list(np.repeat(["a", "b", "c", "d"], 5))
+    rates = rng.beta(2.27, 3.4, (150, 4))  # mean 0.4, intra-scene correlation 0.15
+    held = [
+        (e.low <= 40 <= e.high)
+        for rate in rates
+        for e in [estimate_mean((rng.random((4, 5)) < rate[:, None]).ravel().astype(float), scenes, SR)]
+    ]
+    assert np.mean(held) > 0.88
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from("abc")), min_size=2, max_size=12))
+def test_intervals_hold_their_mean_and_stay_in_range(pairs):
+    values, scenes = zip(*pairs, strict=True)
+    found = estimate_mean(values, scenes, SPL)
+    assert 0 <= found.low <= found.value + 1e-9 and found.value - 1e-9 <= found.high <= 100
+    difference = estimate_difference(values, values[::-1], scenes, SPL)
+    assert -100 <= difference.low <= difference.value + 1e-9 and difference.value - 1e-9 <= difference.high <= 100
+
+
+def test_all_alike_is_not_certainty():
+    zero = estimate_mean([0.0] * 6, ["a", "b"] * 3, SR)
+    assert (zero.value, zero.low) == (0.0, 0.0) and zero.high > 30
+    same = estimate_difference([1.0] * 6, [1.0] * 6, ["a", "b"] * 3, SR)
+    assert same.low < -10 and same.high > 10 and not same.excludes_zero
+
+
+def outcome(arm, episode, success, status="done", actions=30.0):
+    metrics = {"success": success, "actions": actions, "spl": success} if status == "done" else {}
+    return {"arm": arm, "episode": episode, "scene": f"s{episode % 3}", "status": status, "metrics": metrics}
+
+
+def test_failed_episodes_are_left_out_and_counted():
+    outcomes = [outcome("none", i, 0.0) for i in range(4)] + [outcome("warp", i, 1.0) for i in range(3)]
+    outcomes.append(outcome("warp", 3, 0.0, status="failed"))
+    summary = summarise(["none", "warp"], outcomes, episodes=5)
+    assert (summary["warp"].done, summary["warp"].failed, summary["warp"].pending) == (3, 1, 1)
+    assert summary["warp"].estimates["success"].value == 100.0
+    difference = summary.difference("warp", "none")
+    assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
+    assert any("1 episode left out" in note for note in notes(summary))
+
+
+def test_differences_are_paired_by_episode_and_signed_towards_the_better():
+    done = {
+        "a": {i: outcome("a", i, 1.0, actions=20.0) for i in (0, 1, 2)},
+        "b": {i: outcome("b", i, 0.0) for i in (1, 2, 3)},
+    }
+    rate, length = compare("a", "b", done, SR), compare("a", "b", done, TRAJ)
+    assert (rate.estimate.n, rate.wins, rate.estimate.value, rate.p_value) == (2, 2, 100.0, 0.5)
+    assert (length.estimate.value, length.wins, length.p_value) == (-10.0, 2, None)
+    assert compare("a", "b", {"a": {0: done["a"][0]}, "b": {3: done["b"][3]}}, SR) is None
+
+
+def test_one_scene_uses_intervals_over_episodes():
+    found = estimate_mean([1.0, 0.0, 0.0, 1.0], ["house"] * 4, SR)
+    assert found.method == "Wilson" and (found.low / 100, found.high / 100) == pytest.approx(wilson(0.5, 4))
+
+
+def test_empty_run_has_no_numbers():
+    summary = summarise(["none"], [], episodes=3)
+    assert summary["none"].pending == 3 and not summary["none"].estimates and summary.differences == ()
+    with pytest.raises(KeyError, match="it has none"):
+        summary["warp"]
