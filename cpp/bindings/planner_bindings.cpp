@@ -117,8 +117,13 @@ Panoramas to_panoramas(const Bytes& array) {
 /// The answers of a model with the arrays that keep them alive.
 struct Answers {
   Imagination imagination;
-  std::vector<Bytes> arrays;
+  std::vector<py::array> arrays;
 };
+
+/// Dense images; the axes in front of them may have any stride, so broadcast and sliced batches are not copied.
+bool has_dense_images(const py::array& rollout) {
+  return rollout.strides(4) == 1 && rollout.strides(3) == 3 && rollout.strides(2) == 3 * rollout.shape(3);
+}
 
 Answers to_answers(const py::sequence& rollouts, const std::string& frames) {
   Answers answers;
@@ -126,12 +131,20 @@ Answers to_answers(const py::sequence& rollouts, const std::string& frames) {
       frames, {{"panorama", FrameKind::kPanorama}, {"perspective", FrameKind::kPerspective}}, "frames");
   constexpr const char* kExpected = "rollouts uint8 [rows, frames, H, W, 3], one array a part";
   for (const py::handle& item : rollouts) {
-    const Bytes array = to_bytes(py::reinterpret_borrow<py::array>(item), kExpected);
+    auto array = py::reinterpret_borrow<py::array>(item);
+    if (!py::isinstance<py::array_t<std::uint8_t>>(item)) {
+      throw ArgumentError(std::string("expected ") + kExpected + ", got " + std::string(py::str(py::type::of(item))));
+    }
     expect_shape(array, {-1, -1, -1, -1, 3}, kExpected);
-    answers.imagination.rollouts.push_back({array.data(), static_cast<std::size_t>(array.shape(0)),
-                                            static_cast<std::size_t>(array.shape(1)),
-                                            Size{static_cast<int>(array.shape(2)), static_cast<int>(array.shape(3))}});
-    answers.arrays.push_back(array);
+    if (!has_dense_images(array)) array = Bytes(array);
+    answers.imagination.rollouts.push_back(
+        {.data = static_cast<const std::uint8_t*>(array.data()),
+         .rows = static_cast<std::size_t>(array.shape(0)),
+         .frames = static_cast<std::size_t>(array.shape(1)),
+         .size = {static_cast<int>(array.shape(2)), static_cast<int>(array.shape(3))},
+         .row_stride = array.strides(0),
+         .frame_stride = array.strides(1)});
+    answers.arrays.push_back(std::move(array));
   }
   return answers;
 }

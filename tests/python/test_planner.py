@@ -228,8 +228,9 @@ def test_rollouts_that_do_not_fit_are_refused():
         batch.views(panoramas, [frames[:, :2]], MAKER)
     with pytest.raises(ArgumentError, match="1 parts, got 0"):
         batch.views(panoramas, [], MAKER)
-    with pytest.raises(ArgumentError, match="uint8"):
-        batch.views(panoramas, [frames.astype(np.float32)], MAKER)
+    for wrong in (frames.astype(np.float32), frames.tolist()):
+        with pytest.raises(ArgumentError, match="uint8"):
+            batch.views(panoramas, [wrong], MAKER)
     with pytest.raises(ArgumentError, match="one panorama an episode"):
         batch.views(panoramas[:0], [frames], MAKER)
     with pytest.raises(ArgumentError, match="one panorama an episode"):
@@ -241,3 +242,18 @@ def test_rollouts_that_do_not_fit_are_refused():
     out = np.full((2, 2, HEIGHT, WIDTH, 3), 9, np.uint8)
     assert batch.views(panoramas, [frames], MAKER, out=out) is out
     assert not out.any()
+
+
+def test_rollouts_may_be_views_of_other_arrays():
+    panoramas = panoramas_of(1)
+    batch = planner.Batch.build([[[1, 1], [1, 2]]])
+    dense = np.random.default_rng(3).integers(0, 256, (2, 3, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    padded = np.zeros((2, 6, HEIGHT + 1, WIDTH, 3), np.uint8)
+    padded[:, ::2, :HEIGHT] = dense
+    reversed_rows = dense[::-1, ::-1].copy()[::-1, ::-1]
+    channels_first = np.ascontiguousarray(dense.transpose(0, 1, 4, 2, 3)).transpose(0, 1, 3, 4, 2)
+    wanted = batch.views(panoramas, [dense], MAKER)
+    for rollout in (padded[:, ::2, :HEIGHT], reversed_rows, channels_first):
+        np.testing.assert_array_equal(batch.views(panoramas, [rollout], MAKER), wanted)
+    still = np.broadcast_to(dense[:, :1], dense.shape)
+    np.testing.assert_array_equal(batch.views(panoramas, [still], MAKER)[:, 1], dense[:, 0])

@@ -23,9 +23,7 @@ void convert(const Batch& batch, const ViewIndex::Distinct& distinct, const Pano
   }
   const Batch::Place place = batch.place(source);
   const Rollout& rollout = imagined.rollouts[static_cast<std::size_t>(place.part)];
-  const std::size_t frame =
-      static_cast<std::size_t>(place.index) * rollout.frames + static_cast<std::size_t>(place.frame);
-  const std::uint8_t* pixels = rollout.data + 3 * rollout.size.pixels() * frame;
+  const std::uint8_t* pixels = rollout.data + place.index * rollout.row_stride + place.frame * rollout.frame_stride;
   if (imagined.kind == FrameKind::kPanorama) {
     maker.from_panorama(pixels, rollout.size, 0, out);
   } else {

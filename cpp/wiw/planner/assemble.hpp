@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <span>
 #include <vector>
@@ -31,12 +32,15 @@ struct Panoramas {
   Size size;
 };
 
-/// What the model answered to one part: uint8 [rows, frames, H, W, 3].
+/// What the model answered to one part: uint8 [rows, frames, H, W, 3]. Images are dense; rows and frames may lie any
+/// number of bytes apart, also none (a model that repeats an image need not copy it).
 struct Rollout {
   const std::uint8_t* data = nullptr;
   std::size_t rows = 0;
   std::size_t frames = 0;
   Size size;
+  std::ptrdiff_t row_stride = 0;
+  std::ptrdiff_t frame_stride = 0;
 };
 
 /// What the model answered to each part of a batch.
