@@ -135,6 +135,14 @@ void remap(const BilinearTable& table, ImageView<const float> source, std::span<
   }
 }
 
+void remap_blocks(ImageView<const std::uint8_t> source, std::span<const std::uint32_t> texel,
+                  std::span<const std::uint32_t> fraction14, std::uint8_t* out, Isa isa) {
+  if (source.channels != 3 || source.size.height < 2) {
+    throw ArgumentError("remap_blocks: expected an image of three channels and at least two rows");
+  }
+  run_function(isa)({source.data, source.size.width, 0, texel.data(), fraction14.data(), out, texel.size()});
+}
+
 template <class T>
 void remap(const NearestTable& table, ImageView<const T> source, std::span<const RemapTarget<T>> targets) {
   check_source(table, source);

@@ -22,6 +22,11 @@ void remap(const BilinearTable& table, ImageView<const std::uint8_t> source,
            std::span<const RemapTarget<std::uint8_t>> targets, Isa isa = active_isa());
 void remap(const BilinearTable& table, ImageView<const float> source, std::span<const RemapTarget<float>> targets);
 
+/// The uint8 three-channel kernel on a table made elsewhere, e.g. anew for every image: `texel` and `fraction14` as in
+/// BilinearTable, rows of blocks at most H - 2 (H at least 2). Columns wrap if `texel` names the last one.
+void remap_blocks(ImageView<const std::uint8_t> source, std::span<const std::uint32_t> texel,
+                  std::span<const std::uint32_t> fraction14, std::uint8_t* out, Isa isa = active_isa());
+
 /// Nearest texels, copied: any type, ids included.
 template <class T>
 void remap(const NearestTable& table, ImageView<const T> source, std::span<const RemapTarget<T>> targets);

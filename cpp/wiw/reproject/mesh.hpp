@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "wiw/reproject/view.hpp"
+
+namespace wiw::reproject {
+
+/// Distance that stands for "nothing hit" (sky): far enough not to move with the camera.
+constexpr float kFar = 10000.0F;
+
+/// Vertices and texels of the depth mesh of one kind of source image; what does not depend on its content.
+/// A panorama's vertices are its pixel centres, the last column joined to the first. A pinhole view has a further ring
+/// of vertices on its outer pixel edges, so that the mesh covers the whole image.
+struct MeshLayout {
+  explicit MeshLayout(const View& view);
+
+  View view;
+  int rows = 0;     // of vertices
+  int columns = 0;  // of vertices; a panorama's first column is repeated at the end
+  RayTable rays;    // per vertex row and column
+  // The texel block that a quad reads and the fraction at its left and right (upper and lower) ends, per column (row)
+  // of quads.
+  struct Axis {
+    std::vector<std::int32_t> texel;
+    std::vector<float> begin, span;
+  };
+  Axis across, down;
+};
+
+/// Triangles of a quad with corners 00 01 / 10 11 (row, column).
+constexpr std::uint8_t kUpperLeft = 1;   // 00 01 10
+constexpr std::uint8_t kLowerRight = 2;  // 11 10 01
+
+/// Depth mesh of one image.
+struct DepthMesh {
+  std::vector<float> depth;             // [rows, columns] of vertices, kFar where nothing is hit
+  std::vector<std::uint8_t> triangles;  // [rows - 1, columns - 1] of quads: which triangles are part of a surface
+};
+
+/// Builds the mesh and cuts it where two neighbouring depths differ by more than the fraction `cut` of the farther
+/// one, unless inverse depth goes on in the same slope on either side: on any plane it is linear, so a grazing wall
+/// stays whole.
+DepthMesh build_mesh(const MeshLayout& layout, const float* depth, float cut);
+
+}  // namespace wiw::reproject
