@@ -11,7 +11,6 @@ ROOT = Path(__file__).parents[1]
 COLORS = {"floor": (0.6, 0.5, 0.4), "wall": (0.8, 0.8, 0.75), "red": (0.8, 0.2, 0.2), "green": (0.2, 0.7, 0.3), "blue": (0.2, 0.3, 0.8)}
 BOXES = {  # name: material, least corner, greatest corner; metres, Y up
     "floor": ("floor", (-4, -0.1, -2), (4, 0, 2)),
-    "ceiling": ("wall", (-4, 2.5, -2), (4, 2.6, 2)),
     "wall_w": ("wall", (-4.1, 0, -2), (-4, 2.5, 2)),
     "wall_e": ("blue", (4, 0, -2), (4.1, 2.5, 2)),
     "wall_n": ("wall", (-4, 0, -2.1), (4, 2.5, -2)),

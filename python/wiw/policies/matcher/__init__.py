@@ -55,12 +55,17 @@ class Memory:
 
     goal: appearance.GoalTemplate
     map: ExplorationMap = field(default_factory=ExplorationMap)
-    similarity: float = 0.0
-    """Of the present place, best over headings."""
+    profile: NDArray[np.float32] = field(default_factory=lambda: np.zeros(appearance.COLUMNS, np.float32))
+    """Similarity of the present place at each heading column."""
     gate: float = 0.0
-    heading_histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
+    histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
     """Odometry and similarity of every place the agent has really seen."""
+
+    @property
+    def similarity(self) -> float:
+        """Of the present place, best over headings."""
+        return float(self.profile.max())
 
 
 class Matcher(Policy):
@@ -92,9 +97,9 @@ class Matcher(Policy):
         for i, situation in enumerate(situations):
             memory: Memory = situation.memory
             band = appearance.Band(bands.colors[i : i + 1], bands.edges[i : i + 1], bands.histograms[i : i + 1])
-            memory.similarity = float(appearance.similarity(band, memory.goal).max())
+            memory.profile = appearance.similarity(band, memory.goal)[0]
             memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
-            memory.heading_histogram = headings(appearance.histogram_similarity(band, memory.goal)[0])
+            memory.histogram = at_headings(appearance.histogram_similarity(band, memory.goal)[0])
             observation = situation.observation
             assert observation.depth is not None
             memory.map.update(observation.depth[4::8, 4::8], observation.odometry)
@@ -112,7 +117,7 @@ class Matcher(Policy):
         scores = []
         for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
             memory: Memory = situation.memory
-            gains = [imagined_similarity(memory.goal, future) - memory.similarity for future in futures]
+            gains = [imagined_gain(memory, plan, future) for plan, future in zip(plans, futures, strict=True)]
             weight = options.imagined * (1 + options.near * memory.gate)
             scores.append(np.array([plan.prior + weight * gain for plan, gain in zip(plans, gains, strict=True)]))
         return scores
@@ -139,14 +144,14 @@ class Matcher(Policy):
         turns = np.array([circular_distance(k, 0) for k in range(HEADINGS)])
         calm = 1 - options.calm * memory.gate
         prior = (
-            options.histogram * memory.heading_histogram
+            options.histogram * memory.histogram
             + calm * (options.frontier * progress + options.novelty * novelty)
             - options.turn * turns
         )
         return prior - 2.0 * (runs < STEP), runs
 
 
-def headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+def at_headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
     """[16] values at the headings k = 0, 1, ... left turns from a [128] row over panorama columns."""
     width = len(columns)
     centres = (width // 2 - np.arange(HEADINGS) * width // HEADINGS) % width
@@ -166,9 +171,17 @@ def straight_run(heading: int, horizon: int, free_steps: int) -> NDArray[np.int8
     return np.array(plan[:horizon], np.int8)
 
 
-def imagined_similarity(goal: appearance.GoalTemplate, rollout: Rollout) -> float:
-    """The best similarity that the plan's places reach; frames of turning on the spot show no new place."""
-    places = rollout.frames[~rollout.real]
-    if len(places) == 0:
-        places = rollout.frames[-1:]
-    return float(appearance.similarity(appearance.describe(places), goal).max())
+def imagined_gain(memory: Memory, plan: Proposal, rollout: Rollout) -> float:
+    """How much better the best place of the plan looks than the present one, by what was imagined of it.
+
+    Panoramas are compared over all headings; the front views of a perspective model only with what is seen now in the
+    direction that the plan ends in. Frames of turning on the spot show no new place.
+    """
+    new = ~rollout.real
+    places = rollout.frames[new] if new.any() else rollout.frames[-1:]
+    if rollout.view == "panorama":
+        return float(appearance.similarity(appearance.describe(places), memory.goal).max()) - memory.similarity
+    bands = np.stack([appearance.project_front(frame)[0] for frame in places])
+    ahead = appearance.similarity(appearance.describe(bands), memory.goal)[:, appearance.COLUMNS // 2]
+    turns = int((plan.actions == TURN_LEFT).sum() - (plan.actions == TURN_RIGHT).sum())
+    return float(ahead.max() - at_headings(memory.profile)[turns % HEADINGS])

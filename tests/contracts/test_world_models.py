@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every registered world model keeps the contract; so does a stranger's, found through an entry point."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.errors import RegistryError
+from wiw.loop.clock import Clock
+from wiw.loop.imagine import imagine
+from wiw.policies.base import FrameSpec
+from wiw.tasks.imagenav import ImageNav
+from wiw.types import Proposal
+
+NAMES = [name for name in wiw.registry.list_world_models() if name != "none"]
+PLANS = [[FORWARD] * 3, [TURN_LEFT, FORWARD], [FORWARD, TURN_LEFT, FORWARD, FORWARD]]
+
+
+def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS):
+    task = ImageNav(scenes=two_rooms)
+    queries = []
+    for index in range(episodes):
+        env = task.environment(depth=True)
+        observation = env.begin(task.episode(index))
+        queries.append(wiw.loop.agent.Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
+    model = wiw.world_model(name_or_model)
+    proposals = [[Proposal(plan) for plan in plans] for _ in queries]
+    return imagine(model, queries, proposals, FrameSpec("panorama", (144, 256)), Clock()).rollouts
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_frames_follow_actions_and_do_not_depend_on_the_batch(name: str, two_rooms: str) -> None:
+    whole = imagined(name, two_rooms)
+    assert [[len(r.frames) for r in rows] for rows in whole] == [[3, 2, 4]] * 2
+    alone = imagined(name, two_rooms, episodes=1, plans=PLANS[2:])
+    np.testing.assert_array_equal(alone[0][0].frames, whole[0][2].frames)
+    again = imagined(name, two_rooms)
+    for rows, others in zip(whole, again, strict=True):
+        for a, b in zip(rows, others, strict=True):
+            np.testing.assert_array_equal(a.frames, b.frames)
+
+
+def test_the_floor_stands_still_and_the_references_move(two_rooms: str) -> None:
+    copy, warp, oracle = (imagined(name, two_rooms)[0][0].frames.astype(float) for name in ("copy", "warp", "oracle"))
+    assert np.abs(copy[0] - copy[2]).max() == 0
+    error_copy, error_warp = np.abs(copy[2] - oracle[2]).mean(), np.abs(warp[2] - oracle[2]).mean()
+    assert error_warp < error_copy / 4
+
+
+STRANGER = '''
+import numpy as np
+import wiw
+
+
+class Fog(wiw.WorldModel):
+    """Everything fades."""
+
+    accepts = wiw.accepts(control="trajectory", view="perspective", size=(480, 480), frames=14)
+
+    def rollout(self, observations, controls, seeds):
+        fade = np.linspace(1, 0, 14)[None, :, None, None, None]
+        return (observations.image[:, None] * fade).astype(np.uint8)
+'''
+
+
+@pytest.fixture
+def strangers_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An installed distribution of one file that declares an entry point and nothing else."""
+    (tmp_path / "fog_model.py").write_text(STRANGER)
+    info = tmp_path / "fog_model-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: fog-model\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[wiw.world_models]\nfog = fog_model:Fog\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("fog_model", None)
+
+
+def test_a_stranger_adds_a_model_in_one_file(strangers_package: Path, two_rooms: str) -> None:
+    assert "fog" in wiw.registry.list_world_models()
+    rollouts = imagined("fog", two_rooms)
+    brightness = rollouts[0][0].frames.mean((1, 2, 3))
+    assert brightness[0] > brightness[2]
+    task = ImageNav(scenes=two_rooms, decisions=2)
+    log = wiw.evaluate(task.environment(), wiw.Agent("matcher", "fog"), episodes=2, progress=False)
+    assert len(log.episodes) == 2
+
+
+def test_or_names_a_class_in_a_file(tmp_path: Path, two_rooms: str) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(STRANGER)
+    assert len(imagined(f"{file}:Fog", two_rooms)[0]) == 3
+    with pytest.raises(RegistryError, match="cannot be loaded"):
+        wiw.world_model(f"{file}:Fgo")
+
+
+def test_unknown_names_and_options_are_answered_with_what_is_known() -> None:
+    with pytest.raises(RegistryError, match="Did you mean warp"):
+        wiw.world_model("wrap")
+    with pytest.raises(RegistryError, match="unexpected keyword"):
+        wiw.world_model("copy", depth=3)
+
+
+def test_a_model_without_a_declaration_is_refused_when_it_is_written() -> None:
+    with pytest.raises(wiw.errors.ContractError, match="accepts"):
+
+        class Half(wiw.WorldModel):
+            def rollout(self, observations, controls, seeds):
+                return observations.image
