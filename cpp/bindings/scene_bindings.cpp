@@ -119,13 +119,12 @@ void set_limits(const py::dict& values, wiw::ImportLimits& limits) {
 using Paths = std::vector<std::filesystem::path>;
 
 py::tuple import_scene(const std::filesystem::path& path, const std::optional<std::string>& up,
-                       const std::optional<float> ceiling, const bool smooth_normals, const py::dict& limits,
-                       const Paths& texture_folders, const Paths& model_folders) {
+                       const std::optional<float> ceiling, const py::dict& limits, const Paths& texture_folders,
+                       const Paths& model_folders) {
   wiw::ImportTrace trace;
   wiw::ImportOptions options;
   options.up = up_from_text(up);
   options.ceiling_height = ceiling;
-  options.smooth_normals = smooth_normals;
   options.texture_folders = texture_folders;
   options.model_folders = model_folders;
   options.trace = &trace;
@@ -181,7 +180,7 @@ void bind_scene_class(py::module_& module) {
 void bind_scene(py::module_& module) {
   bind_scene_class(module);
   module.def("import_scene", &import_scene, py::arg("path"), py::kw_only(), py::arg("up") = py::none(),
-             py::arg("ceiling") = py::none(), py::arg("smooth_normals") = false, py::arg("limits") = py::dict(),
-             py::arg("texture_folders") = Paths{}, py::arg("model_folders") = Paths{},
+             py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
+             py::arg("model_folders") = Paths{},
              "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
 }

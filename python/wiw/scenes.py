@@ -27,7 +27,6 @@ def load(
     up: str | None = None,
     ceiling: float | None = None,
     *,
-    smooth_normals: bool = False,
     limits: dict[str, int] | None = None,
     texture_folders: Sequence[str | PathLike[str]] = (),
     model_folders: Sequence[str | PathLike[str]] = (),
@@ -36,7 +35,7 @@ def load(
 
     `up` is "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for names in HM3D's layout). The
     rule that was used is `scene.attributes["up"]`. `ceiling` closes a scene that is open above, in metres above its
-    floor. `smooth_normals` makes normals where a file has none. `limits` raises or lowers the import limits
+    floor. `limits` raises or lowers the import limits
     (file_bytes, triangles, nodes, texture_pixels, texture_bytes). `texture_folders` are searched for textures by base
     name, `model_folders` for `model://` of a world, before the places beside the file.
 
@@ -47,7 +46,6 @@ def load(
         Path(path).expanduser(),
         up=up,
         ceiling=ceiling,
-        smooth_normals=smooth_normals,
         limits=limits or {},
         texture_folders=[Path(folder).expanduser() for folder in texture_folders],
         model_folders=[Path(folder).expanduser() for folder in model_folders],

@@ -10,32 +10,57 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/assimp_scene.hpp"
 #include "wiw/scene/import/ceiling.hpp"
+#include "wiw/scene/import/collada_check.hpp"
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/gltf_json.hpp"
+#include "wiw/scene/import/guarded_io.hpp"
+#include "wiw/scene/import/ply_header.hpp"
 
 namespace wiw {
 namespace {
 
-constexpr unsigned kSteps =
-    aiProcess_Triangulate | aiProcess_JoinIdenticalVertices | aiProcess_SortByPType | aiProcess_TransformUVCoords;
+/// What comes after indexes arrays by what the file says.
+void check_indices(const aiScene& file, const std::filesystem::path& path) {
+  for (unsigned m = 0; m < file.mNumMeshes; ++m) {
+    const aiMesh& mesh = *file.mMeshes[m];
+    const std::string name = "mesh " + std::to_string(m) + " ('" + mesh.mName.C_Str() + "')";
+    if (mesh.mMaterialIndex >= file.mNumMaterials) {
+      throw FileError(path.string(), name + " names a material that is not there (damaged file)");
+    }
+    for (unsigned f = 0; f < mesh.mNumFaces; ++f) {
+      for (unsigned i = 0; i < mesh.mFaces[f].mNumIndices; ++i) {
+        if (mesh.mFaces[f].mIndices[i] < mesh.mNumVertices) continue;
+        throw FileError(path.string(), name + ": face " + std::to_string(f) + " names vertex " +
+                                           std::to_string(mesh.mFaces[f].mIndices[i]) + " of " +
+                                           std::to_string(mesh.mNumVertices) + " (damaged file)");
+      }
+    }
+  }
+}
 
 const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options) {
   // The file's axes are turned by UpAxis alone, so that one rule holds for every format.
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_USE_COLLADA_NAMES, true);
-  importer.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_POINT | aiPrimitiveType_LINE);
-  const aiScene* file =
-      importer.ReadFile(path.string(), kSteps | (options.smooth_normals ? aiProcess_GenSmoothNormals : 0U));
+  importer.SetIOHandler(new GuardedIo(options));  // NOLINT(cppcoreguidelines-owning-memory): the importer owns it
+  const aiScene* file = importer.ReadFile(path.string(), 0);
   if (!file) throw FileError(path.string(), "cannot be read: " + std::string(importer.GetErrorString()));
   if ((file->mFlags & AI_SCENE_FLAGS_INCOMPLETE) || !file->mRootNode) {
     throw FileError(path.string(), "holds no complete scene");
   }
+  check_indices(*file, path);
+  file = importer.ApplyPostProcessing(aiProcess_TransformUVCoords);
+  if (!file) throw FileError(path.string(), "holds no triangles");
   return *file;
 }
 
-void warn_of_basis_textures(const FileContext& context, Scene& scene) {
+/// Refuses damage that assimp does not survive, and warns of what it drops in silence.
+void check_content(const FileContext& context, Scene& scene) {
+  check_signature(context.path, context.format);
+  if (context.format == MeshFormat::kPly) check_ply(context.path);
+  if (context.format == MeshFormat::kDae) check_collada(context.path);
   if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return;
-  const std::size_t count = count_basis_textures(context.path, context.format);
+  const std::size_t count = check_gltf(context.path, context.format);
   if (count == 0) return;
   scene.warnings.push_back(std::to_string(count) + " textures of " + context.path.filename().string() +
                            " are stored in Basis Universal, which cannot be decoded here; drawn without texture "
@@ -47,11 +72,9 @@ void warn_of_basis_textures(const FileContext& context, Scene& scene) {
 ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& options) {
   const MeshFormat format = mesh_format_of(path);
   check_limit(path.string(), "bytes", size_of_file(path), options.limits.file_bytes, "file_bytes");
-  check_signature(path, format);
   const FileContext context{path, format, options};
   auto scene = std::make_shared<Scene>();
-  warn_of_basis_textures(context, *scene);
-  if (options.trace) options.trace->read.push_back(path);
+  check_content(context, *scene);
 
   const auto importer = make_importer();
   const aiScene& file = parse(*importer, path, options);

@@ -25,7 +25,6 @@ struct ImportOptions {
   Up up = Up::kAuto;
   ImportLimits limits;
   std::optional<float> ceiling_height;                 // metres above the floor; adds a ceiling over an open scene
-  bool smooth_normals = false;                         // where a file has none; otherwise the geometric normal is used
   std::vector<std::filesystem::path> texture_folders;  // searched by base name after the file's own folders
   std::vector<std::filesystem::path> model_folders;    // SDF: searched for model://NAME before the world's own folders
   ImportTrace* trace = nullptr;

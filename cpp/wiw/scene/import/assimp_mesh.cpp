@@ -6,11 +6,12 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/assimp_scene.hpp"
+#include "wiw/scene/import/polygon.hpp"
+#include "wiw/scene/import/weld.hpp"
 
 namespace wiw {
 namespace {
 
-using Triangle = Eigen::Matrix<std::uint32_t, 3, 1>;
 using Color = Eigen::Matrix<std::uint8_t, 4, 1>;
 
 Eigen::Vector3f vec(const aiVector3D& v) { return {v.x, v.y, v.z}; }
@@ -31,26 +32,11 @@ std::vector<Eigen::Vector3f> positions_of(const aiMesh& source, const std::strin
   return positions;
 }
 
-bool has_area(const Triangle& t, const std::vector<Eigen::Vector3f>& positions) {
-  const Eigen::Vector3d a = positions[t[0]].cast<double>();
-  const Eigen::Vector3d normal = (positions[t[1]].cast<double>() - a).cross(positions[t[2]].cast<double>() - a);
-  return normal.squaredNorm() > 0.;
-}
-
-std::vector<Triangle> triangles_of(const aiMesh& source, const std::vector<Eigen::Vector3f>& positions,
-                                   const std::string& path, const std::string& name) {
+std::vector<Triangle> triangles_of(const aiMesh& source, const std::vector<Eigen::Vector3f>& positions) {
   std::vector<Triangle> triangles;
   triangles.reserve(source.mNumFaces);
   for (unsigned i = 0; i < source.mNumFaces; ++i) {
-    const aiFace& face = source.mFaces[i];
-    if (face.mNumIndices != 3) continue;
-    const Triangle triangle(face.mIndices[0], face.mIndices[1], face.mIndices[2]);
-    if (triangle.maxCoeff() >= positions.size()) {
-      throw FileError(path, name + ": face " + std::to_string(i) + " names vertex " +
-                                std::to_string(triangle.maxCoeff()) + " of " + std::to_string(positions.size()) +
-                                " (damaged file)");
-    }
-    if (has_area(triangle, positions)) triangles.push_back(triangle);
+    triangulate({source.mFaces[i].mIndices, source.mFaces[i].mNumIndices}, positions, triangles);
   }
   return triangles;
 }
@@ -111,10 +97,9 @@ Mesh convert_mesh(const aiScene& file, unsigned index, const FileContext& contex
   const aiMesh& source = *file.mMeshes[index];
   const std::string path = context.path.string();
   const std::string name = label(source, index);
-  if (source.mMaterialIndex >= file.mNumMaterials) throw FileError(path, name + " names a material that is not there");
   Mesh mesh;
   auto positions = positions_of(source, path, name);
-  mesh.triangles = triangles_of(source, positions, path, name);
+  mesh.triangles = triangles_of(source, positions);
   mesh.positions = std::move(positions);
   mesh.normals = normals_of(source);
   if (source.HasNormals() && mesh.normals.empty()) {
@@ -125,7 +110,7 @@ Mesh convert_mesh(const aiScene& file, unsigned index, const FileContext& contex
   const bool linear = context.format == MeshFormat::kGlb || context.format == MeshFormat::kGltf;
   mesh.colors = colors_of(source, linear);
   mesh.material = static_cast<std::int32_t>(source.mMaterialIndex);
-  return mesh;
+  return weld(mesh);
 }
 
 }  // namespace wiw

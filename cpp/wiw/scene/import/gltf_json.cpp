@@ -40,22 +40,33 @@ std::vector<std::uint8_t> json_of(const std::filesystem::path& path, MeshFormat 
   return bytes;
 }
 
-/// Occurrences of `name` as an object's key. Names in extensionsUsed are array elements, so no colon follows them.
-std::size_t count_keys(std::string_view json, std::string_view name) {
-  std::size_t count = 0;
+/// Calls use(text behind the colon) wherever `name` (with its quotes) is an object's key. Names in extensionsUsed are
+/// array elements, so no colon follows them.
+template <class Use>
+void for_each_key(std::string_view json, std::string_view name, const Use& use) {
+  constexpr std::string_view kSpace = " \t\r\n";
   for (std::size_t at = json.find(name); at != std::string_view::npos; at = json.find(name, at + 1)) {
-    const std::size_t next = json.find_first_not_of(" \t\r\n", at + name.size());
-    if (next != std::string_view::npos && json[next] == ':') ++count;
+    const std::size_t colon = json.find_first_not_of(kSpace, at + name.size());
+    if (colon == std::string_view::npos || json[colon] != ':') continue;
+    const std::size_t value = json.find_first_not_of(kSpace, colon + 1);
+    use(value == std::string_view::npos ? std::string_view() : json.substr(value));
   }
-  return count;
 }
 
 }  // namespace
 
-std::size_t count_basis_textures(const std::filesystem::path& path, MeshFormat format) {
+std::size_t check_gltf(const std::filesystem::path& path, MeshFormat format) {
   const auto bytes = json_of(path, format);
   const std::string_view json(reinterpret_cast<const char*>(bytes.data()), bytes.size());
-  return count_keys(json, "\"KHR_texture_basisu\"") + count_keys(json, "\"GOOGLE_texture_basis\"");
+  for_each_key(json, "\"mimeType\"", [&](std::string_view value) {
+    if (value.starts_with("\"image/") || value.starts_with("\"application/")) return;
+    throw FileError(path.string(), "has an image of unknown type (damaged file)");
+  });
+  std::size_t basis_textures = 0;
+  for (const char* extension : {"\"KHR_texture_basisu\"", "\"GOOGLE_texture_basis\""}) {
+    for_each_key(json, extension, [&](std::string_view) { ++basis_textures; });
+  }
+  return basis_textures;
 }
 
 }  // namespace wiw

@@ -8,8 +8,9 @@
 
 namespace wiw {
 
-/// Number of textures that a glTF file stores in Basis Universal (KHR_texture_basisu or GOOGLE_texture_basis), which
-/// assimp drops without a word. Throws FileError for a GLB whose chunks do not fit its length.
-std::size_t count_basis_textures(const std::filesystem::path& path, MeshFormat format);
+/// Checks the parts of a GLB or glTF file that assimp takes for granted, and returns the number of textures stored in
+/// Basis Universal (KHR_texture_basisu or GOOGLE_texture_basis), which assimp drops without a word. Throws FileError
+/// for chunks that do not fit the file's length and for images of no known type.
+std::size_t check_gltf(const std::filesystem::path& path, MeshFormat format);
 
 }  // namespace wiw

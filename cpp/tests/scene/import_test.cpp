@@ -1,0 +1,240 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/scene/import.hpp"
+
+#include <doctest/doctest.h>
+
+#include <algorithm>
+#include <limits>
+
+#include "scene/samples.hpp"
+#include "wiw/core/error.hpp"
+#include "wiw/scene/measure.hpp"
+
+using wiw::FileError;
+using wiw::load_mesh;
+using wiw::Up;
+
+namespace {
+
+const wiw::Material& material_of(const wiw::Scene& scene, std::size_t mesh = 0) {
+  return scene.materials.at(static_cast<std::size_t>(scene.meshes.at(mesh).material));
+}
+
+bool same_box(const Eigen::AlignedBox3f& box, const Eigen::Vector3f& low, const Eigen::Vector3f& high) {
+  return (box.min() - low).norm() < 1e-5f && (box.max() - high).norm() < 1e-5f;
+}
+
+}  // namespace
+
+TEST_CASE("GLB: geometry, embedded texture, category and the Y-up rule") {
+  const Folder folder;
+  const auto scene = load_mesh(folder.write("room.glb", sample_glb()));
+  CHECK(scene->warnings.empty());
+  CHECK(scene->attributes.at("up") == "Y (glTF specification)");
+  REQUIRE(scene->instances.size() == 1);
+  CHECK(scene->instances[0].name == "Chair_01");
+  CHECK(scene->categories == std::vector<std::string>{"chair"});
+  CHECK(scene->triangle_count() == 2);
+  CHECK(same_box(scene->bounds(), {0, 0, 0}, {1, 1, 0}));
+
+  REQUIRE(scene->textures.size() == 1);
+  const wiw::Texture& texture = scene->textures[0];
+  CHECK(texture.size == wiw::Size{2, 2});
+  const std::vector<int> expected{255, 0, 0, 255, 0, 255, 0, 255, 0, 0, 255, 255, 255, 255, 255, 255};
+  CHECK(std::ranges::equal(texture.rgba, expected));
+  // glTF counts v from the top, as the scene does: the vertex at the origin was written with (0, 1).
+  const wiw::Mesh& mesh = scene->meshes[0];
+  for (std::size_t i = 0; i < mesh.positions.size(); ++i) {
+    CHECK((mesh.uv[i] - Eigen::Vector2f(mesh.positions[i].x(), 1.f - mesh.positions[i].y())).norm() < 1e-6f);
+  }
+}
+
+TEST_CASE("the up axis: option, HM3D names, COLLADA header") {
+  const Folder folder;
+  CHECK(same_box(load_mesh(folder.write("a.glb", sample_glb()), {.up = Up::kZ})->bounds(), {0, 0, -1}, {1, 0, 0}));
+  const auto hm3d = load_mesh(folder.write("x.basis.glb", sample_glb()));
+  CHECK(hm3d->attributes.at("up") == "Z (HM3D file layout)");
+  CHECK(same_box(hm3d->bounds(), {0, 0, -1}, {1, 0, 0}));
+  CHECK(same_box(load_mesh(folder.write("x.basis.glb", sample_glb()), {.up = Up::kY})->bounds(), {0, 0, 0}, {1, 1, 0}));
+
+  const auto z_up = load_mesh(folder.write("z.dae", sample_dae()));
+  CHECK(z_up->attributes.at("up") == "Z (by file header)");
+  CHECK(same_box(z_up->bounds(), {0, 0, -1}, {1, 0, 0}));  // and 100 units of 0.01 m are 1 m
+  const auto y_up = load_mesh(folder.write("y.dae", sample_dae("<up_axis>Y_UP</up_axis>")));
+  CHECK(same_box(y_up->bounds(), {0, 0, 0}, {100, 100, 0}));
+  const auto x_up = load_mesh(folder.write("x.dae", sample_dae("<up_axis>X_UP</up_axis>")));
+  CHECK(same_box(x_up->bounds(), {-100, 0, 0}, {0, 100, 0}));  // x becomes y, y becomes -x
+  CHECK(load_mesh(folder.write("d.dae", sample_dae("")))->attributes.at("up") == "Y (COLLADA default)");
+  CHECK(load_mesh(folder.write("o.obj", sample_obj()))->attributes.at("up") == "Y (default, the file does not say)");
+}
+
+TEST_CASE("node transforms: rigid part in the pose, the rest in the vertices, meshes shared") {
+  const Folder folder;
+  GlbParts parts;
+  parts.nodes =
+      R"([{"children":[1,2,3],"translation":[10,0,0]},{"mesh":0,"name":"a","translation":[0,2,0]},)"
+      R"({"mesh":0,"name":"b","rotation":[0,0.70710678,0,0.70710678]},{"mesh":0,"name":"c","scale":[2,-3,1]}])";
+  const auto file = folder.write("nodes.glb", sample_glb(parts));
+  const auto scene = load_mesh(file);
+  REQUIRE(scene->instances.size() == 3);
+  CHECK(scene->meshes.size() == 2);  // a and b share theirs
+  CHECK(same_box(instance_bounds(*scene, scene->instances[0]), {10, 2, 0}, {11, 3, 0}));
+  CHECK(same_box(instance_bounds(*scene, scene->instances[1]), {10, 0, -1}, {10, 1, 0}));  // x turns to -z
+  CHECK(same_box(instance_bounds(*scene, scene->instances[2]), {10, -3, 0}, {12, 0, 0}));
+  for (const wiw::Instance& instance : scene->instances) {
+    const Eigen::Matrix3f rotation = instance.T_world_instance.linear();
+    CHECK((rotation * rotation.transpose()).isIdentity(1e-5f));
+    CHECK(rotation.determinant() > 0.f);
+    // A mirrored mesh keeps facing the way the mirror image of the square faces.
+    const wiw::Mesh& mesh = scene->meshes[instance.meshes[0]];
+    const auto& t = mesh.triangles[0];
+    const Eigen::Vector3f normal =
+        (mesh.positions[t[1]] - mesh.positions[t[0]]).cross(mesh.positions[t[2]] - mesh.positions[t[0]]);
+    const Eigen::Vector3f expected = instance.name == "b" ? Eigen::Vector3f::UnitX() : Eigen::Vector3f::UnitZ();
+    CHECK((rotation * normal).normalized().isApprox(expected, 1e-4f));
+  }
+
+  // The same in Z-up axes: poses stay rigid, and the world is the turned one.
+  const auto turned = load_mesh(file, {.up = Up::kZ});
+  CHECK(same_box(instance_bounds(*turned, turned->instances[0]), {10, 0, -3}, {11, 0, -2}));
+  CHECK(same_box(instance_bounds(*turned, turned->instances[2]), {10, 0, 0}, {12, 0, 3}));
+}
+
+TEST_CASE("colours: glTF factors are linear, OBJ and PLY are display-encoded") {
+  const Folder folder;
+  GlbParts parts;
+  parts.material = R"({"pbrMetallicRoughness":{"baseColorFactor":[0.5,0,1,1]}})";
+  const auto plain = load_mesh(folder.write("plain.glb", sample_glb(parts)));
+  CHECK(material_of(*plain).texture == wiw::kNone);
+  CHECK(material_of(*plain).base_color.isApprox(Eigen::Vector4f(std::pow(0.5f, 1 / 2.2f), 0, 1, 1), 1e-5f));
+
+  folder.write("sample.mtl", "newmtl wood\nKd 0.5 0.25 1\n");
+  const auto obj = load_mesh(folder.write("plain.obj", sample_obj()));
+  CHECK(material_of(*obj).base_color.isApprox(Eigen::Vector4f(0.5f, 0.25f, 1, 1), 1e-5f));
+  CHECK(obj->categories == std::vector<std::string>{"table"});
+
+  const auto ply = load_mesh(folder.write("colors.ply", sample_ply()));
+  CHECK(ply->triangle_count() == 2);  // one quad
+  REQUIRE(ply->meshes[0].colors.size() == 4);
+  for (std::size_t i = 0; i < 4; ++i) {
+    const auto& p = ply->meshes[0].positions[i];
+    const int vertex = p.y() == 0.f ? (p.x() == 0.f ? 0 : 1) : (p.x() == 0.f ? 3 : 2);
+    CHECK(ply->meshes[0].colors[i] ==
+          Eigen::Matrix<std::uint8_t, 4, 1>(static_cast<std::uint8_t>(10 * vertex), 20, 255, 255));
+  }
+}
+
+TEST_CASE("alpha counts only where the material says so") {
+  const Folder folder;
+  CHECK(material_of(*load_mesh(folder.write("opaque.glb", sample_glb()))).alpha_cutoff < 0.f);
+  GlbParts parts;
+  parts.material = R"({"alphaMode":"MASK","alphaCutoff":0.25,"pbrMetallicRoughness":{"baseColorTexture":{"index":0}}})";
+  CHECK(material_of(*load_mesh(folder.write("mask.glb", sample_glb(parts)))).alpha_cutoff == doctest::Approx(0.25));
+  parts.material = R"({"alphaMode":"BLEND","pbrMetallicRoughness":{"baseColorTexture":{"index":0}}})";
+  CHECK(material_of(*load_mesh(folder.write("blend.glb", sample_glb(parts)))).alpha_cutoff == doctest::Approx(0.5));
+}
+
+TEST_CASE("external textures: beside the file, by base name, missing, undecodable") {
+  const Folder folder;
+  const auto file = folder.write("meshes/sample.obj", sample_obj());
+  folder.write("meshes/sample.mtl", "newmtl wood\nKd 0.5 0.25 1\nmap_Kd C:\\art\\my%20photo.bmp\n");
+  wiw::ImportTrace trace;
+  const auto missing = load_mesh(file, {.trace = &trace});
+  REQUIRE(missing->warnings.size() == 1);
+  CHECK(missing->warnings[0].find("my%20photo.bmp' of sample.obj was not found") != std::string::npos);
+  CHECK(material_of(*missing).base_color.isApprox(Eigen::Vector4f(0.7f, 0.7f, 0.7f, 1.f)));
+  const auto image = folder.path() / "meshes/../materials/textures/my photo.bmp";
+  CHECK(std::ranges::find(trace.absent, image) != trace.absent.end());
+
+  folder.write("materials/textures/my photo.bmp", sample_bmp());
+  const auto found = load_mesh(file);
+  CHECK(found->warnings.empty());
+  CHECK(found->textures.size() == 1);
+  CHECK(material_of(*found).base_color == Eigen::Vector4f::Ones());
+
+  folder.write("materials/textures/my photo.bmp", "not an image");
+  const auto damaged = load_mesh(file);
+  REQUIRE(damaged->warnings.size() == 1);
+  CHECK(damaged->warnings[0].find("cannot be decoded") != std::string::npos);
+}
+
+TEST_CASE("textures in Basis Universal are counted, never dropped in silence") {
+  const Folder folder;
+  GlbParts parts;
+  parts.texture =
+      R"({"extensions":{"KHR_texture_basisu" : {"source":0}}},{"extensions":{"GOOGLE_texture_basis":{"source":0}}})";
+  const auto scene = load_mesh(folder.write("x.basis.glb", sample_glb(parts)));
+  REQUIRE_FALSE(scene->warnings.empty());
+  CHECK(scene->warnings[0].find("2 textures of x.basis.glb are stored in Basis Universal") == 0);
+}
+
+TEST_CASE("only the supported formats are read") {
+  const Folder folder;
+  const std::string stl =
+      "solid s\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid "
+      "s\n";
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("a.stl", stl)), doctest::Contains(".glb, .gltf, .obj, .ply, .dae"),
+                       FileError);
+  CHECK_THROWS_AS(load_mesh(folder.write("a.obj", stl)), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("a.glb", sample_ply())),
+                       doctest::Contains("does not begin like a binary glTF"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("b.obj", sample_glb())),
+                       doctest::Contains("does not begin like a Wavefront OBJ"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(folder.path() / "none.glb"), doctest::Contains("no such file"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("empty.ply", "")), doctest::Contains("is empty"), FileError);
+}
+
+TEST_CASE("damage is named") {
+  const Folder folder;
+  GlbParts nan;
+  nan.positions[4] = std::numeric_limits<float>::quiet_NaN();
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("nan.glb", sample_glb(nan))), doctest::Contains("is not finite"),
+                       FileError);
+  GlbParts index;
+  index.triangles[2] = 77;
+  CHECK(load_mesh(folder.write("index.glb", sample_glb(index)))->triangle_count() == 1);  // the face is left out
+  const std::string whole = sample_glb();
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("cut.glb", whole.substr(0, whole.size() / 2))),
+                       doctest::Contains("truncated"), FileError);
+  GlbParts cycle;
+  cycle.nodes = R"([{"mesh":0,"children":[1]},{"children":[0]}])";
+  CHECK_THROWS_AS(load_mesh(folder.write("cycle.glb", sample_glb(cycle))), FileError);
+}
+
+TEST_CASE("triangles without area are dropped") {
+  const Folder folder;
+  GlbParts parts;
+  parts.triangles = {0, 1, 2, 0, 0, 3, 0, 2, 3};
+  CHECK(load_mesh(folder.write("a.glb", sample_glb(parts)))->triangle_count() == 2);
+}
+
+TEST_CASE("limits are enforced by figure and name") {
+  const Folder folder;
+  const auto file = folder.write("a.glb", sample_glb());
+  const auto refused = [&](const wiw::ImportLimits& limits, const char* text) {
+    CHECK_THROWS_WITH_AS(load_mesh(file, {.limits = limits}), doctest::Contains(text), FileError);
+  };
+  refused({.file_bytes = 100}, "more than the limit of 100 (raise limits.file_bytes");
+  refused({.triangles = 1}, "has 2 triangles, more than the limit of 1 (raise limits.triangles");
+  refused({.nodes = 0}, "limits.nodes");
+  refused({.texture_bytes = 15}, "has 16 bytes of decoded textures");
+  const auto scene = load_mesh(file, {.limits = {.texture_pixels = 3}});
+  REQUIRE(scene->warnings.size() == 1);
+  CHECK(scene->warnings[0].find("2 x 2 pixels, more than the limit of 3") != std::string::npos);
+}
+
+TEST_CASE("a ceiling closes a scene and faces down") {
+  const Folder folder;
+  const auto scene = load_mesh(folder.write("a.obj", "o floor\nv 0 1 0\nv 4 1 0\nv 4 1 3\nv 0 1 3\nf 4 3 2 1\n"),
+                               {.ceiling_height = 2.5f});
+  REQUIRE(scene->instances.size() == 2);
+  const wiw::Instance& ceiling = scene->instances[1];
+  CHECK(ceiling.name == "ceiling");
+  CHECK(scene->categories[static_cast<std::size_t>(ceiling.category)] == "ceiling");
+  CHECK(same_box(instance_bounds(*scene, ceiling), {0, 3.5f, 0}, {4, 3.5f, 3}));
+  const wiw::Mesh& mesh = scene->meshes[ceiling.meshes[0]];
+  for (const auto& t : mesh.triangles) {
+    CHECK((mesh.positions[t[1]] - mesh.positions[t[0]]).cross(mesh.positions[t[2]] - mesh.positions[t[0]]).y() < 0.f);
+  }
+  CHECK_THROWS_AS(load_mesh(folder.path() / "a.obj", {.ceiling_height = -1.f}), wiw::ArgumentError);
+}

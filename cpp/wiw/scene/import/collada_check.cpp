@@ -1,0 +1,114 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/scene/import/collada_check.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cstdint>
+#include <map>
+#include <pugixml.hpp>
+#include <string>
+#include <string_view>
+
+#include "wiw/core/error.hpp"
+
+namespace wiw {
+namespace {
+
+struct Requirement {
+  std::string_view element;
+  const char* attribute;
+};
+
+constexpr std::array<Requirement, 22> kRequired{{{"source", "id"},
+                                                 {"float_array", "id"},
+                                                 {"float_array", "count"},
+                                                 {"accessor", "source"},
+                                                 {"accessor", "count"},
+                                                 {"param", "type"},
+                                                 {"vertices", "id"},
+                                                 {"input", "semantic"},
+                                                 {"input", "source"},
+                                                 {"triangles", "count"},
+                                                 {"polylist", "count"},
+                                                 {"polygons", "count"},
+                                                 {"lines", "count"},
+                                                 {"geometry", "id"},
+                                                 {"instance_geometry", "url"},
+                                                 {"instance_controller", "url"},
+                                                 {"instance_effect", "url"},
+                                                 {"instance_material", "symbol"},
+                                                 {"instance_material", "target"},
+                                                 {"effect", "id"},
+                                                 {"visual_scene", "id"},
+                                                 {"instance_visual_scene", "url"}}};
+
+class Walker : public pugi::xml_tree_walker {
+ public:
+  explicit Walker(std::string path) : path_(std::move(path)) {}
+
+  bool for_each(pugi::xml_node& node) override {
+    for (const Requirement& requirement : kRequired) {
+      if (requirement.element != node.name() || is_other_use(node)) continue;
+      if (!node.attribute(requirement.attribute)) {
+        throw FileError(path_, "a <" + std::string(node.name()) + "> element has no attribute '" +
+                                   requirement.attribute + "' (damaged file)");
+      }
+    }
+    const std::string_view name = node.name();
+    const bool is_list = name == "p" || name == "h" || name == "vcount" || name == "v";
+    if (is_list &&
+        std::string_view(node.child_value()).find_first_not_of("0123456789- \t\r\n") != std::string_view::npos) {
+      throw FileError(path_, "a <" + std::string(name) + "> list holds more than whole numbers (damaged file)");
+    }
+    return true;
+  }
+
+ private:
+  /// The schema reuses a few names: <source> and <param> inside samplers and surfaces hold plain text.
+  static bool is_other_use(const pugi::xml_node& node) {
+    const std::string_view name = node.name();
+    const std::string_view parent = node.parent().name();
+    return (name == "source" && parent.starts_with("sampler")) || (name == "param" && parent != "accessor");
+  }
+
+  std::string path_;
+};
+
+/// Every accessor must find its values inside the array it names.
+void check_accessors(const pugi::xml_document& document, const std::string& path) {
+  std::map<std::string, std::uint64_t> counts;
+  for (const pugi::xpath_node& array : document.select_nodes("//float_array | //Name_array | //IDREF_array")) {
+    counts[array.node().attribute("id").value()] = array.node().attribute("count").as_ullong();
+  }
+  for (const pugi::xpath_node& found : document.select_nodes("//accessor")) {
+    const pugi::xml_node accessor = found.node();
+    const std::string name = accessor.attribute("source").value();
+    const auto array = counts.find(name.substr(name.starts_with("#") ? 1 : 0));
+    const std::uint64_t count = accessor.attribute("count").as_ullong();
+    const std::uint64_t stride = accessor.attribute("stride").as_ullong(1);
+    const std::uint64_t offset = accessor.attribute("offset").as_ullong(0);
+    const std::uint64_t available = array == counts.end() ? 0 : array->second;
+    if (count == 0) continue;
+    if (count > available || stride > available || offset > available || count * stride + offset > available) {
+      throw FileError(path, "an <accessor> reads " + std::to_string(count) + " x " + std::to_string(stride) +
+                                " values of '" + name + "', which has " + std::to_string(available) +
+                                " (damaged file)");
+    }
+  }
+}
+
+}  // namespace
+
+void check_collada(const std::filesystem::path& path) {
+  pugi::xml_document document;
+  const pugi::xml_parse_result result = document.load_file(path.c_str());
+  if (!result) {
+    throw FileError(path.string(), "is not well-formed XML: " + std::string(result.description()) + " at byte " +
+                                       std::to_string(result.offset));
+  }
+  Walker walker(path.string());
+  document.traverse(walker);
+  check_accessors(document, path.string());
+}
+
+}  // namespace wiw

@@ -1,0 +1,181 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/scene/import/ply_header.hpp"
+
+#include <algorithm>
+#include <array>
+#include <bit>
+#include <cstdint>
+#include <cstring>
+#include <sstream>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "wiw/core/error.hpp"
+#include "wiw/scene/import/file.hpp"
+
+namespace wiw {
+namespace {
+
+struct Property {
+  std::size_t bytes = 0;        // of a value, or of a list's entries
+  std::size_t count_bytes = 0;  // of a list's length; 0: no list
+};
+
+struct Element {
+  std::string name;
+  std::size_t count = 0;
+  std::vector<Property> properties;
+};
+
+struct Header {
+  std::string format;
+  std::vector<Element> elements;
+  std::size_t bytes = 0;
+};
+
+constexpr std::size_t kMostEntries = 1 << 16;  // of one face; more is damage
+
+std::size_t bytes_of(const std::string& type) {
+  struct Row {
+    std::string_view name;
+    std::size_t bytes;
+  };
+  constexpr std::array<Row, 16> kTypes{{{"char", 1},
+                                        {"uchar", 1},
+                                        {"int8", 1},
+                                        {"uint8", 1},
+                                        {"short", 2},
+                                        {"ushort", 2},
+                                        {"int16", 2},
+                                        {"uint16", 2},
+                                        {"int", 4},
+                                        {"uint", 4},
+                                        {"int32", 4},
+                                        {"uint32", 4},
+                                        {"float", 4},
+                                        {"float32", 4},
+                                        {"double", 8},
+                                        {"float64", 8}}};
+  const auto* row = std::ranges::find(kTypes, type, &Row::name);
+  return row == kTypes.end() ? 0 : row->bytes;
+}
+
+/// Text of the header's lines and the offset behind `end_header`.
+Header read_header(std::string_view file, const std::string& path) {
+  Header header;
+  std::size_t at = 0;
+  while (at < file.size()) {
+    const std::size_t end = std::min(file.find('\n', at), file.size());
+    std::istringstream line{std::string(file.substr(at, end - at))};
+    at = end + 1;
+    std::string word;
+    line >> word;
+    constexpr std::array<std::string_view, 7> kWords{"ply",     "format",   "comment",   "obj_info",
+                                                     "element", "property", "end_header"};
+    if (!word.empty() && std::ranges::find(kWords, word) == kWords.end()) {
+      throw FileError(path, "has a header line that begins with '" + word + "' (damaged file)");
+    }
+    if (word == "end_header") {
+      header.bytes = at;
+      return header;
+    }
+    if (word == "format") line >> header.format;
+    if (word == "element") {
+      Element element;
+      if (!(line >> element.name >> element.count))
+        throw FileError(path, "has an <element> line without name and count (damaged file)");
+      header.elements.push_back(std::move(element));
+    }
+    if (word == "property") {
+      std::string type;
+      std::string count_type;
+      line >> type;
+      Property property;
+      if (type == "list") {
+        line >> count_type >> type;
+        property.count_bytes = bytes_of(count_type);
+      }
+      property.bytes = bytes_of(type);
+      if (property.bytes == 0 || (!count_type.empty() && property.count_bytes == 0) || header.elements.empty()) {
+        throw FileError(path, "has a property of unknown type '" + type + "' (damaged file)");
+      }
+      header.elements.back().properties.push_back(property);
+    }
+  }
+  throw FileError(path, "ends within its header (truncated file)");
+}
+
+std::size_t list_length(std::string_view file, std::size_t at, std::size_t bytes, bool big_endian) {
+  std::uint64_t length = 0;
+  for (std::size_t i = 0; i < bytes; ++i) {
+    const std::size_t from = big_endian ? bytes - 1 - i : i;
+    length |= std::uint64_t{static_cast<unsigned char>(file[at + from])} << (8 * i);
+  }
+  return length;
+}
+
+/// Offset behind one row of `element`; npos if the file ends before.
+std::size_t row_end(const Element& element, std::string_view file, std::size_t at, bool big_endian) {
+  for (const Property& property : element.properties) {
+    std::size_t entries = 1;
+    if (property.count_bytes > 0) {
+      if (at + property.count_bytes > file.size()) return std::string_view::npos;
+      entries = list_length(file, at, property.count_bytes, big_endian);
+      if (entries > kMostEntries) return std::string_view::npos;
+      at += property.count_bytes;
+    }
+    at += entries * property.bytes;
+    if (at > file.size()) return std::string_view::npos;
+  }
+  return at;
+}
+
+void check_binary(const Header& header, std::string_view file, const std::string& path) {
+  std::size_t at = header.bytes;
+  for (const Element& element : header.elements) {
+    if (element.properties.empty()) continue;
+    for (std::size_t row = 0; row < element.count; ++row) {
+      at = row_end(element, file, at, header.format == "binary_big_endian");
+      if (at == std::string_view::npos) {
+        throw FileError(path, "ends at " + element.name + " " + std::to_string(row) + " of " +
+                                  std::to_string(element.count) + " (truncated or damaged file)");
+      }
+    }
+  }
+}
+
+void check_ascii(const Header& header, std::string_view file, const std::string& path) {
+  std::size_t rows = 0;
+  for (const Element& element : header.elements) rows += element.count;
+  const auto body = file.substr(header.bytes);
+  const auto lines =
+      static_cast<std::size_t>(std::ranges::count(body, '\n')) + (body.empty() || body.back() == '\n' ? 0 : 1);
+  if (rows > lines) {
+    throw FileError(
+        path, "should have " + std::to_string(rows) + " rows but has " + std::to_string(lines) + " (truncated file)");
+  }
+}
+
+}  // namespace
+
+void check_ply(const std::filesystem::path& path) {
+  const auto bytes = read_file(path);
+  const std::string_view file(reinterpret_cast<const char*>(bytes.data()), bytes.size());
+  const Header header = read_header(file, path.string());
+  for (const char* needed : {"vertex", "face"}) {
+    if (std::ranges::find(header.elements, needed, &Element::name) == header.elements.end()) {
+      throw FileError(path.string(), std::string("declares no element '") + needed + "'");
+    }
+  }
+  if (header.format == "ascii") {
+    check_ascii(header, file, path.string());
+  } else if (header.format == "binary_little_endian" || header.format == "binary_big_endian") {
+    check_binary(header, file, path.string());
+  } else {
+    throw FileError(path.string(),
+                    "has format '" + header.format + "'; expected ascii, binary_little_endian or binary_big_endian");
+  }
+}
+
+}  // namespace wiw
