@@ -13,7 +13,7 @@ namespace {
 /// Rounds per format; WIW_FUZZ_ROUNDS asks for more.
 int rounds() {
   const char* text = std::getenv("WIW_FUZZ_ROUNDS");
-  return text ? std::atoi(text) : 150;
+  return text ? std::atoi(text) : 60;
 }
 
 /// Loads, or is refused with a typed error that names the file. Anything else fails the test, a crash included.
