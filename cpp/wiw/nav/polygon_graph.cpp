@@ -72,20 +72,49 @@ void PolygonGraph::join() {
   }
 }
 
-Point2 PolygonGraph::inside(int index, Point2 point, double margin) const {
-  const double max_move = 50 * margin;  // in a needle-sharp corner every point is near both walls
-  const Polygon& polygon = polygons_[index];
-  Point2 moved = point;
-  for (int round = 0; round < 4; ++round) {
+namespace {
+
+/// Distance of a point to the left of side k.
+double depth(const Polygon& polygon, int k, Point2 point) {
+  const Point2 side = polygon.at[polygon.after(k)] - polygon.at[k];
+  const double size = length(side);
+  return size > 0 ? cross(side, point - polygon.at[k]) / size : 0;
+}
+
+/// Pushes the point off each side it is too near to. Moves it no farther than needed, but may fail in a sharp corner.
+Point2 push_off_sides(const Polygon& polygon, Point2 point, double margin) {
+  for (int round = 0; round < 3; ++round) {
     for (int k = 0; k < polygon.sides; ++k) {
       const Point2 side = polygon.at[polygon.after(k)] - polygon.at[k];
-      const double size = length(side);
-      const double distance = size > 0 ? cross(side, moved - polygon.at[k]) / size : margin;
-      if (distance < margin) moved = moved + (margin - distance) / size * Point2{-side.y, side.x};
+      const double missing = margin - depth(polygon, k, point);
+      if (missing > 0 && length(side) > 0) point = point + missing / length(side) * Point2{-side.y, side.x};
     }
   }
-  const double moved_by = length(moved - point);
-  return moved_by <= max_move ? moved : point + max_move / moved_by * (moved - point);
+  return point;
+}
+
+/// Moves the point towards the centre until every side is `margin` away, or half as far as from the centre.
+Point2 pull_to_centre(const Polygon& polygon, Point2 point, double margin) {
+  Point2 centre;
+  for (int k = 0; k < polygon.sides; ++k) centre = centre + 1.0 / polygon.sides * polygon.at[k];
+  double share = 0;
+  for (int k = 0; k < polygon.sides; ++k) {
+    const double from = depth(polygon, k, point), at_centre = depth(polygon, k, centre);
+    const double wanted = std::min(margin, at_centre / 2);
+    if (from < wanted) share = std::max(share, (wanted - from) / (at_centre - from));
+  }
+  return point + share * (centre - point);
+}
+
+}  // namespace
+
+Point2 PolygonGraph::inside(int index, Point2 point, double margin) const {
+  const Polygon& polygon = polygons_[index];
+  const Point2 pushed = push_off_sides(polygon, point, margin);
+  for (int k = 0; k < polygon.sides; ++k) {
+    if (depth(polygon, k, pushed) < margin / 2) return pull_to_centre(polygon, point, margin / 2);
+  }
+  return pushed;
 }
 
 }  // namespace wiw::nav
