@@ -8,7 +8,13 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-COLORS = {"floor": (0.6, 0.5, 0.4), "wall": (0.8, 0.8, 0.75), "red": (0.8, 0.2, 0.2), "green": (0.2, 0.7, 0.3), "blue": (0.2, 0.3, 0.8)}
+COLORS = {
+    "floor": (0.6, 0.5, 0.4),
+    "wall": (0.8, 0.8, 0.75),
+    "red": (0.8, 0.2, 0.2),
+    "green": (0.2, 0.7, 0.3),
+    "blue": (0.2, 0.3, 0.8),
+}
 BOXES = {  # name: material, least corner, greatest corner; metres, Y up
     "floor": ("floor", (-4, -0.1, -2), (4, 0, 2)),
     "wall_w": ("wall", (-4.1, 0, -2), (-4, 2.5, 2)),
@@ -42,7 +48,12 @@ def two_rooms(tmp_path_factory: pytest.TempPathFactory) -> str:
     lines, base = ["mtllib two_rooms.mtl"], 1
     for name, (material, low, high) in BOXES.items():
         lines += [f"o {name}", f"usemtl {material}"]
-        lines += [f"v {(low, high)[x][0]} {(low, high)[y][1]} {(low, high)[z][2]}" for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+        lines += [
+            f"v {(low, high)[x][0]} {(low, high)[y][1]} {(low, high)[z][2]}"
+            for x in (0, 1)
+            for y in (0, 1)
+            for z in (0, 1)
+        ]
         quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
         lines += ["f " + " ".join(str(base + i) for i in quad) for quad in quads]
         base += 8

@@ -15,7 +15,33 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
-_PUBLIC = {
+__all__ = [
+    "Accepts",
+    "Agent",
+    "Policy",
+    "WorldModel",
+    "accepts",
+    "action",
+    "annotate",
+    "envs",
+    "errors",
+    "evaluate",
+    "load_run",
+    "make",
+    "metrics",
+    "nav",
+    "panorama",
+    "policy",
+    "registry",
+    "render",
+    "reproject",
+    "scenes",
+    "show",
+    "types",
+    "world_model",
+]
+
+_HOME = {
     "Accepts": "wiw.world_models.base",
     "Agent": "wiw.loop.agent",
     "Policy": "wiw.policies.base",
@@ -28,15 +54,13 @@ _PUBLIC = {
     "show": "wiw.viz.show",
     "world_model": "wiw.registry",
 }
-_MODULES = ("action", "annotate", "errors", "metrics", "nav", "panorama", "registry", "render", "scenes", "types")
-
-__all__ = [*_PUBLIC, *_MODULES]
+"""Where a public name lives; the others in `__all__` are modules."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in _PUBLIC:
-        return getattr(importlib.import_module(_PUBLIC[name]), name)
-    if name in _MODULES:
+    if name in _HOME:
+        return getattr(importlib.import_module(_HOME[name]), name)
+    if name in __all__:
         return importlib.import_module(f"wiw.{name}")
     raise AttributeError(f"module 'wiw' has no attribute '{name}'")
 
@@ -46,7 +70,7 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
-    from wiw import action, annotate, errors, metrics, nav, panorama, registry, render, scenes, types
+    from wiw import action, annotate, envs, errors, metrics, nav, panorama, registry, render, reproject, scenes, types
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.runlog import load_run
     from wiw.loop.agent import Agent

@@ -136,7 +136,7 @@ def _cube_plan(pano_size: Size, face_size: int, to_cube: bool) -> Any:
     return _core.CubePlan(pano_size, face_size, to_cube)
 
 
-def to_perspective(  # noqa: PLR0917
+def to_perspective(
     pano: Image,
     hfov_deg: float,
     size: Size,

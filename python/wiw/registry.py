@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """One small registry: a kind of thing is found by name in its own folder of `wiw`, by entry point, or by path.
 
-    wiw.world_model("warp")                  python/wiw/world_models/warp/   (its class is named in `BUILT_IN`)
-    wiw.world_model("mine")                  entry point group "wiw.world_models"
-    wiw.world_model("model.py:MyModel")      a class in a file
-    wiw.world_model("mypkg.models:MyModel")  a class in an importable module
-    wiw.world_model(MyModel)                 the class itself, or an instance
+wiw.world_model("warp")                  python/wiw/world_models/warp/   (its class is named in `BUILT_IN`)
+wiw.world_model("mine")                  entry point group "wiw.world_models"
+wiw.world_model("model.py:MyModel")      a class in a file
+wiw.world_model("mypkg.models:MyModel")  a class in an importable module
+wiw.world_model(MyModel)                 the class itself, or an instance
 """
 
 from __future__ import annotations
@@ -53,8 +53,10 @@ class Registry:
             return self._load(name, name)
         near = difflib.get_close_matches(name, self.names(), n=3)
         hint = f" Did you mean {' or '.join(near)}?" if near else ""
-        raise RegistryError(f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
-                            f"or give path.py:Class, package.module:Class, or an entry point in '{self.group}'.")
+        raise RegistryError(
+            f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
+            f"or give path.py:Class, package.module:Class, or an entry point in '{self.group}'."
+        )
 
     def make(self, what: Any, **options: Any) -> Any:
         """An instance from a name, path, class, factory, or instance (returned as it is).
@@ -79,7 +81,9 @@ class Registry:
     def _load(self, name: str, path: str) -> Any:
         module_name, _, attribute = path.rpartition(":")
         try:
-            module = _import_file(Path(module_name)) if module_name.endswith(".py") else importlib.import_module(module_name)
+            module = (
+                _import_file(Path(module_name)) if module_name.endswith(".py") else importlib.import_module(module_name)
+            )
             return getattr(module, attribute)
         except (FileNotFoundError, ModuleNotFoundError, AttributeError) as error:
             raise RegistryError(f"{self.kind} '{name}' cannot be loaded: {error}") from error
@@ -101,24 +105,36 @@ def _import_file(path: Path) -> Any:
     return module
 
 
-WORLD_MODELS = Registry("world model", "wiw.world_models", {
-    "none": "wiw.world_models.none:none",
-    "copy": "wiw.world_models.copy:Copy",
-    "warp": "wiw.world_models.warp:Warp",
-    "oracle": "wiw.world_models.oracle:Oracle",
-})
-POLICIES = Registry("policy", "wiw.policies", {
-    "heuristic": "wiw.policies.heuristic:Heuristic",
-    "matcher": "wiw.policies.matcher:Matcher",
-    "climber": "wiw.policies.matcher.climber:Climber",
-    "geometric": "wiw.policies.geometric:Geometric",
-})
+WORLD_MODELS = Registry(
+    "world model",
+    "wiw.world_models",
+    {
+        "none": "wiw.world_models.none:none",
+        "copy": "wiw.world_models.copy:Copy",
+        "warp": "wiw.world_models.warp:Warp",
+        "oracle": "wiw.world_models.oracle:Oracle",
+    },
+)
+POLICIES = Registry(
+    "policy",
+    "wiw.policies",
+    {
+        "heuristic": "wiw.policies.heuristic:Heuristic",
+        "matcher": "wiw.policies.matcher:Matcher",
+        "climber": "wiw.policies.matcher.climber:Climber",
+        "geometric": "wiw.policies.geometric:Geometric",
+    },
+)
 TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"})
-METRICS = Registry("metric", "wiw.metrics", {
-    "success": "wiw.metrics.navigation:success_rate",
-    "spl": "wiw.metrics.navigation:spl",
-    "mean_trajectory": "wiw.metrics.navigation:mean_trajectory",
-})
+METRICS = Registry(
+    "metric",
+    "wiw.metrics",
+    {
+        "success": "wiw.metrics.navigation:success_rate",
+        "spl": "wiw.metrics.navigation:spl",
+        "mean_trajectory": "wiw.metrics.navigation:mean_trajectory",
+    },
+)
 
 
 def list_world_models() -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import RegistryError
+from wiw.loop.agent import Query
 from wiw.loop.clock import Clock
 from wiw.loop.imagine import imagine
 from wiw.policies.base import FrameSpec
@@ -28,7 +29,7 @@ def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS):
     for index in range(episodes):
         env = task.environment(depth=True)
         observation = env.begin(task.episode(index))
-        queries.append(wiw.loop.agent.Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
+        queries.append(Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
     model = wiw.world_model(name_or_model)
     proposals = [[Proposal(plan) for plan in plans] for _ in queries]
     return imagine(model, queries, proposals, FrameSpec("panorama", (144, 256)), Clock()).rollouts

@@ -11,6 +11,7 @@ from gymnasium.utils.env_checker import check_env
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
+from wiw.envs.navigation import PRIMITIVES
 from wiw.errors import ArgumentError
 from wiw.types import Episode
 
@@ -105,7 +106,7 @@ def test_the_budget_truncates(env) -> None:
 
 def test_stop_ends_the_episode(env) -> None:
     env.reset(options={"episode": 0})
-    _, reward, terminated, _, info = env.step(wiw.envs.navigation.PRIMITIVES.index(STOP))
+    _, reward, terminated, _, info = env.step(PRIMITIVES.index(STOP))
     assert terminated and reward == 0 and info["result"]["success"] == 0
 
 
@@ -158,7 +159,9 @@ def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
         def propose(self, situations, candidates, horizon):
             for s in situations:
                 seen.append((s.observation.odometry.copy(), s.key, s.goal.task, s.goal.text))
-                names = {f.name for f in dataclasses.fields(s.observation)} | {f.name for f in dataclasses.fields(s.goal)}
+                names = {f.name for f in dataclasses.fields(s.observation)} | {
+                    f.name for f in dataclasses.fields(s.goal)
+                }
                 assert names == {"panorama", "front", "odometry", "depth", "task", "image", "text"}
             return [[wiw.types.Proposal([TURN_LEFT, FORWARD])] for _ in situations]
 

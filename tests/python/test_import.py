@@ -19,7 +19,9 @@ print(json.dumps({"seconds": seconds, "modules": sorted(m for m in sys.modules i
 
 
 def test_import_takes_no_heavy_module() -> None:
-    answer = json.loads(subprocess.run([sys.executable, "-c", PROBE], capture_output=True, check=True, text=True).stdout)
+    answer = json.loads(
+        subprocess.run([sys.executable, "-c", PROBE], capture_output=True, check=True, text=True).stdout
+    )
     assert not {"torch", "torchvision", "cv2", "matplotlib", "scipy", "gymnasium"} & set(answer["modules"])
     assert answer["seconds"] < 0.3
 

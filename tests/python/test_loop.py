@@ -8,6 +8,7 @@ import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError
 from wiw.loop.scheduler import run_episodes
+from wiw.policies.base import FrameSpec
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Proposal
 
@@ -59,15 +60,19 @@ def task(two_rooms: str) -> ImageNav:
     return ImageNav(scenes=two_rooms, decisions=4)
 
 
-@pytest.mark.parametrize("make", [
-    lambda: wiw.Agent("matcher"),
-    lambda: wiw.Agent("matcher", "copy"),
-    lambda: wiw.Agent("matcher", "oracle"),
-    lambda: wiw.Agent("climber"),
-    lambda: wiw.Agent("geometric"),
-    lambda: wiw.Agent("heuristic", "oracle", candidates=4),
-    lambda: wiw.Agent(Greedy(), Stamp(), candidates=4),
-], ids=["matcher", "matcher+copy", "matcher+oracle", "climber", "geometric", "heuristic+oracle", "greedy+stamp"])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: wiw.Agent("matcher"),
+        lambda: wiw.Agent("matcher", "copy"),
+        lambda: wiw.Agent("matcher", "oracle"),
+        lambda: wiw.Agent("climber"),
+        lambda: wiw.Agent("geometric"),
+        lambda: wiw.Agent("heuristic", "oracle", candidates=4),
+        lambda: wiw.Agent(Greedy(), Stamp(), candidates=4),
+    ],
+    ids=["matcher", "matcher+copy", "matcher+oracle", "climber", "geometric", "heuristic+oracle", "greedy+stamp"],
+)
 def test_results_do_not_depend_on_how_many_episodes_are_live(task: ImageNav, make) -> None:
     alone, together = run(task, make(), live=1), run(task, make(), live=3)
     assert alone.decisions.keys() == together.decisions.keys()
@@ -83,7 +88,7 @@ def test_the_oracle_imagines_what_then_happens(task: ImageNav) -> None:
     """The chosen plan's imagined panoramas equal what the environment shows when the plan is carried out."""
 
     class Whole(Greedy):
-        frames = wiw.policies.base.FrameSpec("panorama", (576, 1024))
+        frames = FrameSpec("panorama", (576, 1024))
 
     env = task.environment()
     observation = env.begin(task.episode(0))
@@ -142,7 +147,9 @@ def test_a_broken_contract_is_raised_with_what_was_expected(task: ImageNav) -> N
 
 def test_a_model_of_fixed_length_is_padded_and_chunked(task: ImageNav) -> None:
     class Short(wiw.WorldModel):
-        accepts = wiw.accepts(control="action", view="perspective", size=(64, 64), frames=3, vocabulary={0: 9, 1: 7, 2: 5, 3: 6, 4: 0})
+        accepts = wiw.accepts(
+            control="action", view="perspective", size=(64, 64), frames=3, vocabulary={0: 9, 1: 7, 2: 5, 3: 6, 4: 0}
+        )
         lengths = set()
 
         def rollout(self, observations, controls, seeds):
@@ -164,7 +171,9 @@ def test_a_perspective_model_works_with_the_matcher(task: ImageNav) -> None:
         accepts = wiw.accepts(control="text", view="perspective", frames=9)
 
         def rollout(self, observations, controls, seeds):
-            assert all("forward" in c.text.lower() or "left" in c.text.lower() or "right" in c.text.lower() for c in controls)
+            assert all(
+                "forward" in c.text.lower() or "left" in c.text.lower() or "right" in c.text.lower() for c in controls
+            )
             return np.repeat(observations.image[:, None], 9, 1)
 
     recorder = run(task, wiw.Agent("matcher", Still()), count=1)

@@ -17,7 +17,13 @@ VERSION = 1
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
     """Writes an episode file; `about` (generator, seed, ...) goes into its header."""
-    body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": [asdict(e) for e in episodes]}
+    body = {
+        "format": "wiw-episodes",
+        "version": VERSION,
+        "task": task,
+        **about,
+        "episodes": [asdict(e) for e in episodes],
+    }
     Path(path).write_text(json.dumps(body, indent=1), encoding="utf-8")
 
 

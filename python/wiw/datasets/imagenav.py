@@ -67,7 +67,9 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
             geodesic=geodesic,
             info={"ideal_primitives": ideal},
         )
-    raise ArgumentError(f"{world.name}: no start and goal satisfy {rules} in {rules.attempts} attempts; loosen the rules")
+    raise ArgumentError(
+        f"{world.name}: no start and goal satisfy {rules} in {rules.attempts} attempts; loosen the rules"
+    )
 
 
 def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, turn: float = np.pi / 8) -> int:

@@ -105,7 +105,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
 
     # -- gymnasium -----------------------------------------------------------------------------------------------------
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Starts an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random."""
         super().reset(seed=seed)
         index = (options or {}).get("episode")

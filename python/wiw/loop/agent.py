@@ -57,8 +57,10 @@ class Agent:
         self.horizon = 5 if horizon is None else horizon
         self.execute = max(1, self.horizon - 2) if execute is None else execute
         if self.candidates < 1 or self.horizon < 1 or not 1 <= self.execute <= self.horizon:
-            raise ArgumentError(f"Agent: expected candidates >= 1 and 1 <= execute <= horizon, got candidates="
-                                f"{self.candidates}, horizon={self.horizon}, execute={self.execute}")
+            raise ArgumentError(
+                f"Agent: expected candidates >= 1 and 1 <= execute <= horizon, got candidates="
+                f"{self.candidates}, horizon={self.horizon}, execute={self.execute}"
+            )
         self._memories: dict[tuple[int, int], tuple[Any, Any]] = {}
 
     @property
@@ -93,7 +95,9 @@ class Agent:
         seconds = clock.share(len(queries))
         return [
             self._decision(query, situation, plans, rollout, score, seconds, calls)
-            for query, situation, plans, rollout, score in zip(queries, revising, proposals, rollouts, scores, strict=True)
+            for query, situation, plans, rollout, score in zip(
+                queries, revising, proposals, rollouts, scores, strict=True
+            )
         ]
 
     def forget(self, key: Key) -> None:
@@ -118,7 +122,9 @@ class Agent:
         if self.policy.can_revise or self.model is None:
             return self.policy
         if self.policy.default_revision is None:
-            raise ArgumentError(f"Agent: policy {type(self.policy).__name__} only proposes; give `revision=` a policy that scores")
+            raise ArgumentError(
+                f"Agent: policy {type(self.policy).__name__} only proposes; give `revision=` a policy that scores"
+            )
         return POLICIES.make(self.policy.default_revision)
 
     def _situations(self, queries: Sequence[Query]) -> tuple[list[Situation], list[Situation]]:
@@ -135,7 +141,9 @@ class Agent:
             revising.append(Situation(query.observation, query.goal, query.key, other))
         return proposing, revising
 
-    def _decision(self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any) -> Decision:
+    def _decision(
+        self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any
+    ) -> Decision:
         actions, chosen = self.revision.revise(situation, proposals, scores)
         return Decision(
             actions=actions,

@@ -74,7 +74,9 @@ def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any], panorama
             raise ArgumentError("the world model needs depth: make the environment with depth=True")
         depth = batch.depths(np.stack(depths), maker)
     if "simulator" in accepts.needs:
-        simulators = [_turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)]
+        simulators = [
+            _turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
+        ]
     return Conditioning(batch.observations(panoramas, maker), depth=depth, simulators=simulators)
 
 
@@ -95,8 +97,10 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
         return Conditioning(whole.image[part.rows], depth=depth, simulators=simulators)
     if accepts.needs:
-        raise ArgumentError(f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
-                            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon")
+        raise ArgumentError(
+            f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
+            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon"
+        )
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 
@@ -133,7 +137,9 @@ def _seeds(batch: Any, queries: Sequence[Any], proposals: Sequence[Sequence[Prop
     return np.array(keys, np.uint64)[batch.row_owner]
 
 
-def _unpack(batch: Any, shown: NDArray[np.uint8], view: str, proposals: Sequence[Sequence[Proposal]]) -> list[list[Rollout]]:
+def _unpack(
+    batch: Any, shown: NDArray[np.uint8], view: str, proposals: Sequence[Sequence[Proposal]]
+) -> list[list[Rollout]]:
     real, lengths = batch.real, batch.lengths
     flat = iter(range(len(lengths)))
     return [

@@ -47,7 +47,9 @@ class Trial:
         """Executes the decision's first segment and observes."""
         before = self.env.truth()
         outcome = self.env.run(decision.actions[: decision.execute])
-        record = DecisionRecord(self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path)
+        record = DecisionRecord(
+            self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path
+        )
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
         self.decisions += 1
         return record
@@ -122,4 +124,3 @@ def _finished(trial: Trial) -> EpisodeResult:
 def _failed(index: int, episode: Episode, begin: float, error: Exception) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, time.perf_counter() - begin, text)
-

@@ -62,12 +62,17 @@ class Policy(ABC):
         raise NotImplementedError
 
     def score(
-        self, situations: Sequence[Situation], proposals: Sequence[Sequence[Proposal]], rollouts: Sequence[Sequence[Rollout]]
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
         """One score a candidate for each episode, higher is better. One call for all live episodes."""
         raise NotImplementedError(f"{type(self).__name__} only proposes; give the agent a revision policy")
 
-    def revise(self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]) -> tuple[NDArray[np.int8], int | None]:
+    def revise(
+        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int8], int | None]:
         """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
         best = int(np.argmax(scores))
         return proposals[best].actions, best

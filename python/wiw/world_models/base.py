@@ -77,7 +77,9 @@ def accepts(
         raise ArgumentError(f"accepts: frames counts the observation too: expected 0 (any) or at least 2, got {frames}")
     if best_batch < 1:
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
-    return Accepts(control, space, view, size, frames, tuple(needs), causal, best_batch, vocabulary, null_first, template)
+    return Accepts(
+        control, space, view, size, frames, tuple(needs), causal, best_batch, vocabulary, null_first, template
+    )
 
 
 def _check(name: str, value: str, allowed: Sequence[str]) -> None:
@@ -124,6 +126,8 @@ def checked_rollout(
     expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         came = f"{frames.dtype} {frames.shape}" if isinstance(frames, np.ndarray) else type(frames).__name__
-        raise ContractError(f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
-                            f"width, 3), got {came}")
+        raise ContractError(
+            f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
+            f"width, 3), got {came}"
+        )
     return frames

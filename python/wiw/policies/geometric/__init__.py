@@ -62,7 +62,9 @@ class Geometric(Matcher):
             if solved is not None and solved[1] >= memory.support:
                 memory.place, memory.support = solved
 
-    def _judge_headings(self, memory: Memory, odometry: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _judge_headings(
+        self, memory: Memory, odometry: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         prior, runs = super()._judge_headings(memory, odometry)
         assert isinstance(memory, GeometricMemory)
         if memory.place is None:
@@ -107,14 +109,22 @@ def goal_place(observation: Observation, memory: GeometricMemory) -> tuple[NDArr
     return _solve(np.array(points), np.array(pixels), observation.odometry) if len(points) >= INLIERS else None
 
 
-def _solve(points: NDArray[np.float64], pixels: NDArray[np.float32], odometry: NDArray[np.float64]) -> tuple[NDArray[np.float64], int] | None:
+def _solve(
+    points: NDArray[np.float64], pixels: NDArray[np.float32], odometry: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], int] | None:
     """PnP with RANSAC in OpenCV's camera frame (x right, y down, z ahead); the agent's camera is the origin."""
     focal = VIEW / 2
     intrinsics = np.array([[focal, 0, VIEW / 2 - 0.5], [0, focal, VIEW / 2 - 0.5], [0, 0, 1]])
     cv2.setRNGSeed(0)
     try:
         found, rotation, translation, inliers = cv2.solvePnPRansac(
-            points, pixels.astype(np.float64), intrinsics, None, iterationsCount=300, reprojectionError=4.0, flags=cv2.SOLVEPNP_EPNP
+            points,
+            pixels.astype(np.float64),
+            intrinsics,
+            None,
+            iterationsCount=300,
+            reprojectionError=4.0,
+            flags=cv2.SOLVEPNP_EPNP,
         )
     except cv2.error:  # the solver's word for points that determine no pose, e.g. all on one spot
         return None

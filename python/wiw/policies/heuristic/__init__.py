@@ -32,7 +32,9 @@ class Heuristic(Policy):
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Independent draws, keyed by (seed, episode, decision, candidate); the first is what the base policy does."""
-        return [[self._plan(situation, candidate, horizon) for candidate in range(candidates)] for situation in situations]
+        return [
+            [self._plan(situation, candidate, horizon) for candidate in range(candidates)] for situation in situations
+        ]
 
     def _plan(self, situation: Situation, candidate: int, horizon: int) -> Proposal:
         key = situation.key

@@ -110,7 +110,10 @@ class Matcher(Policy):
         return [self._propose(situation, candidates, horizon) for situation in situations]
 
     def score(
-        self, situations: Sequence[Situation], proposals: Sequence[Sequence[Proposal]], rollouts: Sequence[Sequence[Rollout]]
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
         """Prior plus the gain in similarity that the imagined places promise."""
         options = self.options
@@ -134,7 +137,9 @@ class Matcher(Policy):
         chosen += [k for k in order if k not in chosen][: candidates - len(chosen)]
         return [Proposal(straight_run(k, horizon, int(runs[k] / STEP)), prior=float(priors[k])) for k in chosen]
 
-    def _judge_headings(self, memory: Memory, odometry: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _judge_headings(
+        self, memory: Memory, odometry: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Prior of each heading and the metres that are free ahead; heading k is k left turns away."""
         options = self.options
         distance = memory.map.frontier_distance()

@@ -83,7 +83,9 @@ def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
 
 def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
     """float32 [N, 128]: Bhattacharyya coefficient of the goal's and each window's Lab histogram."""
-    wrapped = np.concatenate([places.histograms[:, -WINDOW // 2 :], places.histograms, places.histograms[:, : WINDOW // 2]], 1)
+    wrapped = np.concatenate(
+        [places.histograms[:, -WINDOW // 2 :], places.histograms, places.histograms[:, : WINDOW // 2]], 1
+    )
     sums = np.cumsum(np.pad(wrapped, ((0, 0), (1, 0), (0, 0))), axis=1)
     windows = sums[:, WINDOW:] - sums[:, :-WINDOW]
     windows = windows[:, :COLUMNS] / np.maximum(windows[:, :COLUMNS].sum(2, keepdims=True), 1e-9)
@@ -165,7 +167,9 @@ def _normalised(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
     return (centred / max(float(np.linalg.norm(centred)), 1e-6)).astype(np.float32)
 
 
-def _correlation(places: NDArray[np.float32], goal: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+def _correlation(
+    places: NDArray[np.float32], goal: NDArray[np.float32], mask: NDArray[np.float32]
+) -> NDArray[np.float32]:
     """[N, 128]: normalised correlation of the goal with the window centred at each column, by FFT over columns.
 
     With w the goal's mask of n pixels and f a channel: sum (f - mean) g = sum f g because g has zero mean, and the

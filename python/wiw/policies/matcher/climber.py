@@ -20,7 +20,9 @@ class Climber(Matcher):
     Its score without a world model is the fair figure to beat for one who asks whether imagination was needed at all.
     """
 
-    def _judge_headings(self, memory: Memory, odometry: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _judge_headings(
+        self, memory: Memory, odometry: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         prior, runs = super()._judge_headings(memory, odometry)
         azimuth = odometry[2] + np.arange(HEADINGS) * 2 * np.pi / HEADINGS
         directions = np.stack([np.cos(azimuth), np.sin(azimuth)], 1)

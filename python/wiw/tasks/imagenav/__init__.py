@@ -11,8 +11,8 @@ import numpy as np
 
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.imagenav import camera_pose, generate
-from wiw.envs.navigation import NavigationEnv, Trip
 from wiw.datasets.worlds import World, world
+from wiw.envs.navigation import NavigationEnv, Trip
 from wiw.errors import ArgumentError
 from wiw.scenes import resolve
 from wiw.types import Episode, Goal
@@ -76,7 +76,9 @@ class ImageNav:
             raise ArgumentError(f"imagenav: no preset '{preset}'; there are {', '.join(PRESETS)}")
         unknown = set(rules) - set(asdict(PRESETS[preset]))
         if unknown:
-            raise ArgumentError(f"imagenav: unknown rules {sorted(unknown)}; there are {sorted(asdict(PRESETS[preset]))}")
+            raise ArgumentError(
+                f"imagenav: unknown rules {sorted(unknown)}; there are {sorted(asdict(PRESETS[preset]))}"
+            )
         self.rules = replace(PRESETS[preset], **rules)
         self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
         self.episode_file = None if episode_file is None else str(episode_file)
@@ -99,7 +101,11 @@ class ImageNav:
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity: what must be equal for two runs to be comparable."""
-        source = {"episode_file": self.episode_file} if self.episode_file else {"scenes": self.scenes, "per_scene": self.per_scene}
+        source = (
+            {"episode_file": self.episode_file}
+            if self.episode_file
+            else {"scenes": self.scenes, "per_scene": self.per_scene}
+        )
         return {"task": self.name, "seed": self.seed, **source, **asdict(self.rules)}
 
     def environment(self, depth: bool = False) -> NavigationEnv:
@@ -122,8 +128,10 @@ class ImageNav:
                 break
             self._episodes += self._of_scene(scenes[0] if whole_scene else scenes[done], done if whole_scene else 0)
         if len(self._episodes) < count:
-            raise ArgumentError(f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; "
-                                "name more scenes (apartments:val:N) or raise per_scene")
+            raise ArgumentError(
+                f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; "
+                "name more scenes (apartments:val:N) or raise per_scene"
+            )
         return self._episodes[:count]
 
     def episode(self, index: int) -> Episode:

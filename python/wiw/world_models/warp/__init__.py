@@ -33,7 +33,8 @@ class Warp(WorldModel):
             wanted = slice(control.shared, control.length)
             if wanted.start < wanted.stop:
                 frames[row, 1 + control.shared : 1 + control.length] = warp(
-                    observations.image[row], observations.depth[row], control.viewpoints[wanted]
-                )
+                    observations.image[row : row + 1],
+                    observations.depth[row : row + 1],
+                    control.viewpoints[None, wanted],
+                )[0]
         return frames
-
