@@ -103,7 +103,8 @@ void bind_spaces(py::module_& module) {
       .def_readonly("forward_m", &ActionSpace::forward_m)
       .def_property_readonly("turn_deg", [](const ActionSpace& space) { return degrees(space.turn_rad); })
       .def_readonly("turn_rad", &ActionSpace::turn_rad)
-      .def("__eq__", [](const ActionSpace& a, const ActionSpace& b) { return a == b; }, py::is_operator())
+      .def(
+          "__eq__", [](const ActionSpace& a, const ActionSpace& b) { return a == b; }, py::is_operator())
       .def("__hash__",
            [](const ActionSpace& space) { return py::hash(py::make_tuple(space.forward_m, space.turn_rad)); })
       .def(py::pickle([](const ActionSpace& space) { return py::make_tuple(space.forward_m, space.turn_rad); },

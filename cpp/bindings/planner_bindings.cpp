@@ -101,6 +101,7 @@ py::object part_object(const py::object& type, const Batch& batch, const Part& p
     trajectories.insert(trajectories.end(), trajectory.begin(), trajectory.end());
   }
   std::vector<Pose> viewpoints;
+  viewpoints.reserve(trajectories.size());
   for (const PlanarPose& pose : trajectories) viewpoints.push_back(to_viewpoint(pose));
   return type(part.first, part.steps, integers(part.rows), to_ids(actions).reshape({rows, steps}),
               planar_array(trajectories).reshape({rows, steps, py::ssize_t{3}}),
@@ -326,9 +327,9 @@ void bind_batch(py::module_& module) {
                              [](const BoundBatch& self) { return integers(self.batch.episodes()); })
       .def_property_readonly("lengths",
                              [](const BoundBatch& self) {
-                               std::vector<int> lengths;
-                               for (std::size_t i = 0; i < self.batch.candidates(); ++i) {
-                                 lengths.push_back(static_cast<int>(self.batch.sources(i).size()));
+                               std::vector<int> lengths(self.batch.candidates());
+                               for (std::size_t i = 0; i < lengths.size(); ++i) {
+                                 lengths[i] = static_cast<int>(self.batch.sources(i).size());
                                }
                                return integers(lengths);
                              })

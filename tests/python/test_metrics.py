@@ -38,9 +38,7 @@ def slow_ssim(a, b, span, panorama=False):
     maps = []
     for channel in range(a.shape[-1]):
         x, y = a[..., channel].astype(float), b[..., channel].astype(float)
-        mx, my, xx, yy, xy = (
-            gaussian_filter(image, 1.5, mode=mode, radius=5) for image in (x, y, x * x, y * y, x * y)
-        )
+        mx, my, xx, yy, xy = (gaussian_filter(image, 1.5, mode=mode, radius=5) for image in (x, y, x * x, y * y, x * y))
         c1, c2 = (0.01 * span) ** 2, (0.03 * span) ** 2
         luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
         maps.append(luminance * (2 * (xy - mx * my) + c2) / (xx - mx * mx + yy - my * my + c2))

@@ -10,10 +10,10 @@ namespace wiw {
 
 namespace {
 
-/// Squared error of one row; whole numbers for bytes (a row of 2^15 values fits 32 bits, so it is summed in pieces).
+/// Squared error of one row; whole numbers for bytes (32768 squares fit 32 bits, so a row is summed in pieces).
 template <class T>
 double row_error(const T* a, const T* b, std::size_t count) {
-  constexpr std::size_t kPiece = 1 << 15;
+  constexpr std::size_t kPiece = 32768;
   using Sum = std::conditional_t<std::is_integral_v<T>, std::uint32_t, double>;
   using Difference = std::conditional_t<std::is_integral_v<T>, std::int32_t, double>;
   double total = 0;

@@ -35,8 +35,9 @@ struct Shifted {
 
   template <class T>
   Shifted(const ImageView<const T>& image, double range, bool wrap) {
-    const auto count = static_cast<std::size_t>(image.size.width * image.channels);
-    const auto margin = static_cast<std::size_t>(wrap ? kRadius * image.channels : 0);
+    const auto channels = static_cast<std::size_t>(image.channels);
+    const std::size_t count = static_cast<std::size_t>(image.size.width) * channels;
+    const std::size_t margin = wrap ? kRadius * channels : 0;
     stride = count + 2 * margin;
     values.resize(stride * static_cast<std::size_t>(image.size.height));
     const auto middle = static_cast<float>(range / 2);

@@ -75,6 +75,7 @@ void Batch::merge(const std::vector<SplitPlan>& splits, int episode) {
                    [](const Row& a, const Row& b) { return a.candidate < b.candidate; });
   for (const SplitPlan& split : splits) {
     std::vector<Source> steps;
+    steps.reserve(split.rolled.size() + split.rest.size());
     for (const int turns : split.rolled) steps.push_back({-1, turns});
     const int row = split.rest.empty() ? -1 : static_cast<int>(find_row(split) - rows_.begin());
     for (std::size_t k = 0; k < split.rest.size(); ++k) steps.push_back({row, static_cast<int>(k) + 1});
@@ -95,10 +96,12 @@ int Batch::common_frames(const Row& earlier, const Row& later) const {
 }
 
 void Batch::share() {
+  std::size_t first = 0;  // row of the episode
   for (std::size_t later = 0; later < rows_.size(); ++later) {
-    for (std::size_t earlier = later; earlier-- > 0 && rows_[earlier].episode == rows_[later].episode;) {
+    if (rows_[first].episode != rows_[later].episode) first = later;
+    for (std::size_t earlier = first; earlier < later; ++earlier) {
       const int common = common_frames(rows_[earlier], rows_[later]);
-      if (common > 0 && common >= rows_[later].shared) {
+      if (common > rows_[later].shared) {
         rows_[later].parent = static_cast<int>(earlier);
         rows_[later].shared = common;
       }

@@ -104,7 +104,7 @@ void resize_with(const std::uint8_t* source, Size from, Size to, int shift, cons
 void Resizer::operator()(const std::uint8_t* source, int shift, std::uint8_t* out) const {
   // Sums below 2^24 are whole numbers in single precision too.
   const std::uint64_t largest = std::uint64_t{255} * rows_.total * columns_.total;
-  if (rows_.total <= 257 && largest < (1u << 24)) {
+  if (rows_.total <= 257 && largest < 16777216) {
     resize_with<std::uint16_t, std::uint32_t>(source, from_, to_, shift, rows_, columns_, out);
   } else {
     resize_with<std::uint32_t, std::uint64_t>(source, from_, to_, shift, rows_, columns_, out);

@@ -19,9 +19,7 @@ def aeqa_score(scores: ArrayLike) -> float:
     return 100.0 * float(_core.mean(_core.answer_credit(np.asarray(scores, np.float64))))
 
 
-def aeqa_spl(
-    scores: ArrayLike, shortest: ArrayLike, travelled: ArrayLike, answered: ArrayLike | None = None
-) -> float:
+def aeqa_spl(scores: ArrayLike, shortest: ArrayLike, travelled: ArrayLike, answered: ArrayLike | None = None) -> float:
     """Answer score weighted by path length in percent: mean of (s - 1) / 4 * L* / max(L, L*).
 
     Args:
