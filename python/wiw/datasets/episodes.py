@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
+from wiw.datasets import habitat
 from wiw.errors import FileError
 from wiw.types import Episode
 
@@ -27,15 +29,22 @@ def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any)
     Path(path).write_text(json.dumps(body, indent=1), encoding="utf-8")
 
 
-def load(path: str | Path) -> list[Episode]:
-    """Reads an episode file written by `save`.
+def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
+    """Reads an episode file: one written by `save`, habitat-lab's navigation episodes, or World-in-World's ImageNav file.
+
+    `scenes` is the folder that scene paths of the foreign formats are relative to. Lengths that a file does not give
+    are NaN until the task has measured them.
 
     Raises:
         FileError: missing, not JSON, of another format or version, or an episode lacks a field; names the file.
     """
     body = read_json(path)
+    if habitat.is_habitat(body) and body.get("format") != "wiw-episodes":
+        return habitat.read_habitat(body, str(path), scenes)
+    if habitat.is_world_in_world(body):
+        return habitat.read_world_in_world(body, str(path), scenes)
     if not isinstance(body, Mapping) or body.get("format") != "wiw-episodes":
-        raise FileError(f"{path}: expected an episode file of wiw ('format': 'wiw-episodes')")
+        raise FileError(f"{path}: expected an episode file of wiw ('format': 'wiw-episodes'), habitat-lab or World-in-World")
     if body.get("version") != VERSION:
         raise FileError(f"{path}: version {body.get('version')}, this release reads version {VERSION}")
     return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(body.get("episodes", []))]
@@ -47,8 +56,6 @@ def read_json(path: str | Path) -> Any:
     Raises:
         FileError: it cannot be read or parsed; names file and cause.
     """
-    import gzip
-
     try:
         raw = Path(path).read_bytes()
         return json.loads(gzip.decompress(raw) if str(path).endswith(".gz") else raw)

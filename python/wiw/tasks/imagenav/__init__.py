@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.imagenav import camera_pose, generate
+from wiw.datasets.imagenav import camera_pose, generate, ideal_primitives
 from wiw.datasets.worlds import World, world
 from wiw.envs.navigation import NavigationEnv, Trip
 from wiw.errors import ArgumentError
@@ -54,7 +54,8 @@ class ImageNav:
         scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world.
         seed: seed of the generated episodes and of the run.
         preset: "paper" or "official"; `rules` overrides it field by field.
-        episode_file: a JSON episode file to use instead of generating.
+        episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
+        scene_folder: folder that scene paths in a foreign episode file are relative to.
         per_scene: generated episodes a scene.
         backend: renderer, "auto", "cpu" or "gpu".
     """
@@ -68,6 +69,7 @@ class ImageNav:
         seed: int = 0,
         preset: str = "paper",
         episode_file: str | Path | None = None,
+        scene_folder: str | Path = "",
         per_scene: int = 5,
         backend: str = "auto",
         **rules: Any,
@@ -82,6 +84,7 @@ class ImageNav:
         self.rules = replace(PRESETS[preset], **rules)
         self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
         self.episode_file = None if episode_file is None else str(episode_file)
+        self.scene_folder = str(scene_folder)
         self._episodes: list[Episode] = []
 
     @property
@@ -119,7 +122,7 @@ class ImageNav:
             ArgumentError: the episode file or the scenes hold fewer.
         """
         if not self._episodes and self.episode_file:
-            self._episodes = episode_file.load(self.episode_file)
+            self._episodes = episode_file.load(self.episode_file, self.scene_folder)
         scenes = [] if self.episode_file else resolve(self.scenes)
         whole_scene = len(scenes) == 1
         while len(self._episodes) < count and not self.episode_file:
@@ -157,13 +160,14 @@ class ImageNav:
     def result(self, trip: Trip) -> dict[str, float]:
         """Metrics of one finished episode; `spl` is its contribution, 0 to 1."""
         by_actions = self.rules.spl == "actions"
-        shortest = float(trip.episode.info.get("ideal_primitives", 0)) if by_actions else trip.episode.geodesic
+        geodesic, ideal = _shortest(trip)
+        shortest = float(ideal) if by_actions else geodesic
         walked = float(trip.actions) if by_actions else trip.travelled
         return {
             "success": float(trip.success),
             "actions": float(trip.actions),
             "travelled": trip.travelled,
-            "shortest": trip.episode.geodesic,
+            "shortest": geodesic,
             "spl": float(trip.success) * shortest / max(walked, shortest, 1e-9),
             "distance_to_goal": trip.distance_to_goal(),
         }
@@ -172,3 +176,12 @@ class ImageNav:
         """One block of episodes in one scene, numbered on from those before it."""
         made = generate(world(scene, self.backend), self.per_scene * (block + 1), self.seed)[self.per_scene * block :]
         return [replace(e, episode_id=f"{len(self._episodes) + i:04d}") for i, e in enumerate(made)]
+
+
+def _shortest(trip: Trip) -> tuple[float, int]:
+    """Metres and primitives of an ideal run; measured where the episode file does not give them."""
+    episode = trip.episode
+    if np.isfinite(episode.geodesic) and "ideal_primitives" in episode.info:
+        return episode.geodesic, int(episode.info["ideal_primitives"])
+    path = np.asarray(trip.world.navmesh.shortest_path(episode.start_position, episode.goal_position), float)
+    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), ideal_primitives(path, episode.start_yaw)

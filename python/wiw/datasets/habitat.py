@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Episode files of other systems: Habitat's PointNav-v1 (its ImageNav has no file of its own) and World-in-World's ImageNav.
+
+Positions are metres, Y up, in all of them; the order of a quaternion is part of each format and never guessed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from wiw._core import core
+from wiw.errors import FileError
+from wiw.types import Episode
+
+Order = Literal["xyzw", "wxyz"]
+
+
+def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
+    """Heading in radians, left positive, of a rotation about the vertical.
+
+    Raises:
+        FileError: not four numbers, not of unit length, or tilted by more than 5 degrees; names `where`.
+    """
+    values = np.asarray(quaternion, float)
+    if values.shape != (4,) or abs(np.linalg.norm(values) - 1) > 1e-2:
+        raise FileError(f"{where}: expected a unit quaternion in order {order}, got {quaternion!r}")
+    x, y, z, w = values if order == "xyzw" else np.roll(values, -1)
+    if np.hypot(x, z) > np.sin(np.radians(2.5)):
+        raise FileError(f"{where}: rotation {quaternion!r} ({order}) is not about the vertical; is the order right?")
+    return float(2 * np.arctan2(y, w))
+
+
+def is_habitat(body: Any) -> bool:
+    """Whether a parsed file has the layout of habitat-lab's navigation episodes."""
+    return isinstance(body, Mapping) and bool(body.get("episodes")) and "start_rotation" in body["episodes"][0]
+
+
+def read_habitat(body: Mapping[str, Any], path: str, scenes: str | Path = "") -> list[Episode]:
+    """Episodes of habitat-lab (`start_rotation` in order xyzw), scenes looked up below the folder `scenes`.
+
+    Habitat derives an ImageNav goal's heading from a hash that differs between processes. Here it is the heading of
+    `goals[0].rotation` where the file has one, else a function of the episode's id.
+    """
+    return [_habitat(item, f"{path}: episode {i}", Path(scenes)) for i, item in enumerate(body["episodes"])]
+
+
+def _habitat(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
+    try:
+        goal = item["goals"][0]
+        name = str(item["episode_id"])
+        rotation = goal.get("rotation")
+        yaw = yaw_of(rotation, "xyzw", where) if rotation is not None else heading_of(name)
+        return Episode(
+            episode_id=name,
+            scene=str(scenes / str(item["scene_id"]).removeprefix("data/scene_datasets/")),
+            start_position=_point(item["start_position"]),
+            start_yaw=yaw_of(item["start_rotation"], "xyzw", where),
+            goal_position=_point(goal["position"]),
+            goal_yaw=yaw,
+            geodesic=float(item.get("info", {}).get("geodesic_distance", float("nan"))),
+            info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id"},
+        )
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise FileError(f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})") from error
+
+
+def is_world_in_world(body: Any) -> bool:
+    """Whether a parsed file has the layout of World-in-World's published ImageNav episodes."""
+    return isinstance(body, Mapping) and bool(body.get("data")) and "goal_image_relpath" in body["data"][0]
+
+
+def read_world_in_world(body: Mapping[str, Any], path: str, scenes: str | Path = "") -> list[Episode]:
+    """Episodes of the published ImageNav file (quaternions in order wxyz), scenes below the folder `scenes`."""
+    return [_world_in_world(item, f"{path}: item {i}", Path(scenes)) for i, item in enumerate(body["data"])]
+
+
+def _world_in_world(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
+    try:
+        return Episode(
+            episode_id=str(item["episode_id"]),
+            scene=str(scenes / str(item["scene_relpath"])),
+            start_position=_point(item["start_position"]),
+            start_yaw=yaw_of(item["start_rotation"], "wxyz", where),
+            goal_position=_point(item["goal_position"]),
+            goal_yaw=yaw_of(item["goal_rotation"], "wxyz", where),
+            geodesic=float("nan"),
+            info={"source": "world-in-world", "goal_radius": float(item["goal_radius"]), "steps": item.get("step_to_goal")},
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(f"{where}: not a World-in-World ImageNav item ({type(error).__name__}: {error})") from error
+
+
+def heading_of(name: str) -> float:
+    """A heading in [0, 2 pi) that is a function of an episode's id, the same on every machine and in every process."""
+    return float(2 * np.pi * core.uniform(core.fold_key(list(name.encode())), 1)[0])
+
+
+def _point(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
