@@ -210,7 +210,7 @@ class GpuRenderer final : public Renderer {
   }
 
   void resolve_panorama(std::size_t front_view, Size size, int side, ProgramKey outputs) {
-    const GLuint program = context_->programs().panorama(outputs);
+    const GLuint program = context_->programs().panorama(outputs | (samples_ > 1 ? kSampled : 0u));
     gl_->UseProgram(program);
     set_integer(program, "face_size", side);
     set_integer(program, "width", size.width);
@@ -218,7 +218,6 @@ class GpuRenderer final : public Renderer {
     set_integer(program, "sample_count", samples_);
     const auto offsets = sample_offsets(samples_);
     gl_->Uniform2fv(context_->programs().uniform(program, "samples"), samples_, offsets.front().data());
-    gl_->Uniform3fv(context_->programs().uniform(program, "face_axes"), 3 * kFaces, face_axes().front().data());
     set_sky(program);
     const Framebuffer& faces = context_->workspace().faces;
     bind_map(kColorUnit, faces.texture(kColorTarget));

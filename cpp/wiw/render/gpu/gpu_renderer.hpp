@@ -16,14 +16,14 @@ std::shared_ptr<Renderer> make_gpu_renderer(ScenePtr scene, const RenderOptions&
 /// devices that may be hardware.
 bool has_gpu_hardware();
 
-/// One row of `wiw doctor`.
+/// One EGL device as `wiw doctor` lists it. Where it gives no OpenGL context, `error` says why and the texts are empty.
 struct EglDeviceReport {
-  int index = -1;        // what WIW_EGL_DEVICE selects; -1: the surfaceless platform
-  std::string vendor;    // empty when it gives no context, and then
-  std::string renderer;  //
-  std::string version;   //
-  std::string error;     // says why
+  int index = -1;  // what WIW_EGL_DEVICE selects; -1: the surfaceless platform
+  std::string vendor;
+  std::string renderer;
+  std::string version;
   bool software = false;
+  std::string error;
 };
 
 /// Every EGL device, each tried. Throws BackendError when there is no EGL library.

@@ -28,9 +28,9 @@ GLuint ProgramCache::average() {
   return find_or_make(kAveragePass, [&] { return link("average", screen_vertex_source(), average_fragment_source()); });
 }
 
-GLuint ProgramCache::panorama(ProgramKey outputs) {
-  return find_or_make(kPanoramaPass | outputs,
-                      [&] { return link("panorama", screen_vertex_source(), panorama_fragment_source(outputs)); });
+GLuint ProgramCache::panorama(ProgramKey key) {
+  return find_or_make(kPanoramaPass | key,
+                      [&] { return link("panorama", screen_vertex_source(), panorama_fragment_source(key)); });
 }
 
 GLuint ProgramCache::compile(const char* name, GLenum stage, const std::string& source) {

@@ -21,7 +21,7 @@ class ProgramCache {
   GLuint scene(ProgramKey key);
   GLuint sky(ProgramKey outputs);
   GLuint average();
-  GLuint panorama(ProgramKey outputs);
+  GLuint panorama(ProgramKey key);
 
   /// -1, which GL ignores, where the program does not use the uniform.
   [[nodiscard]] GLint uniform(GLuint program, const char* name) const { return gl_.GetUniformLocation(program, name); }

@@ -236,13 +236,12 @@ void main() {
 }
 )";
 
-// Layer f holds face f, whose axes are given in camera coordinates.
+// Layer f holds face f in the order of face_axes(): front, right, back, left, top, bottom.
 constexpr const char* kPanoramaMain = R"(
 uniform sampler2DArray color_map;
 uniform sampler2DArray depth_map;
 uniform usampler2DArray id_map;
 uniform sampler2DArray slope_map;
-uniform vec3 face_axes[18];   // right, up, back of each face
 uniform vec2 samples[16];
 uniform int sample_count;
 uniform int face_size;
@@ -254,26 +253,24 @@ vec3 direction(vec2 pixel) {
   float latitude = (0.5 - pixel.y / float(height)) * 3.141592653589793;
   return vec3(sin(longitude) * cos(latitude), sin(latitude), -cos(longitude) * cos(latitude));
 }
-int face_of(vec3 d) {
+// Column and row of a ray on the face it hits, and that face.
+vec3 face_hit(vec3 d) {
   vec3 a = abs(d);
-  if (a.z >= a.x && a.z >= a.y) return d.z < 0.0 ? 0 : 2;
-  if (a.x >= a.y) return d.x > 0.0 ? 1 : 3;
-  return d.y > 0.0 ? 4 : 5;
-}
-vec2 face_position(vec3 d, int face) {
-  float depth = -dot(d, face_axes[3 * face + 2]);
-  vec2 image = vec2(dot(d, face_axes[3 * face]), -dot(d, face_axes[3 * face + 1])) / depth;
-  return clamp((0.5 * image + 0.5) * float(face_size), vec2(0.001), vec2(float(face_size) - 0.001));
+  vec4 hit = d.z < 0.0 ? vec4(d.x, d.y, a.z, 0.0) : vec4(-d.x, d.y, a.z, 2.0);
+  if (a.x > a.z) hit = d.x > 0.0 ? vec4(d.z, d.y, a.x, 1.0) : vec4(-d.z, d.y, a.x, 3.0);
+  if (a.y > max(a.x, a.z)) hit = d.y > 0.0 ? vec4(d.x, d.z, a.y, 4.0) : vec4(d.x, -d.z, a.y, 5.0);
+  vec2 image = vec2(hit.x, -hit.y) / hit.z;
+  return vec3(clamp((0.5 * image + 0.5) * float(face_size), 0.001, float(face_size) - 0.001), hit.w);
 }
 // Bilinear among the texels that show the same instance, so that outlines stay sharp.
-vec4 surface_color(vec2 position, int face, uint id) {
-  vec2 corner = floor(position - 0.5);
-  vec2 part = position - 0.5 - corner;
+vec4 surface_color(vec3 hit, uint id) {
+  vec2 corner = floor(hit.xy - 0.5);
+  vec2 part = hit.xy - 0.5 - corner;
   vec4 sum = vec4(0.0);
   float weights = 0.0;
   for (int i = 0; i < 4; ++i) {
     vec2 step = vec2(i & 1, i >> 1);
-    ivec3 texel = ivec3(clamp(ivec2(corner + step), 0, face_size - 1), face);
+    ivec3 texel = ivec3(clamp(ivec2(corner + step), 0, face_size - 1), hit.z);
     vec2 share = mix(1.0 - part, part, step);
     float weight = texelFetch(id_map, texel, 0).x == id ? share.x * share.y : 0.0;
     sum += weight * texelFetch(color_map, texel, 0);
@@ -281,37 +278,39 @@ vec4 surface_color(vec2 position, int face, uint id) {
   }
   return sum / weights;
 }
+vec4 ray_color(vec3 d, vec3 hit) {
+  uint id = texelFetch(id_map, ivec3(hit), 0).x;
+  return id == 0u ? sky(right.xyz * d.x + up.xyz * d.y + back.xyz * d.z) : surface_color(hit, id);
+}
 void main() {
   vec3 d = direction(gl_FragCoord.xy);
-  int face = face_of(d);
-  vec2 position = face_position(d, face);
-  ivec3 texel = ivec3(position, face);
+  vec3 hit = face_hit(d);
 #ifdef COLOR_OUT
+#ifdef SAMPLED
   vec4 sum = vec4(0.0);
   for (int i = 0; i < sample_count; ++i) {
     vec3 ray = direction(gl_FragCoord.xy + samples[i]);
-    int ray_face = face_of(ray);
-    vec2 hit = face_position(ray, ray_face);
-    uint id = texelFetch(id_map, ivec3(hit, ray_face), 0).x;
-    sum += id == 0u ? sky(right.xyz * ray.x + up.xyz * ray.y + back.xyz * ray.z) : surface_color(hit, ray_face, id);
+    sum += ray_color(ray, face_hit(ray));
   }
   out_color = sum / float(sample_count);
+#else
+  out_color = ray_color(d, hit);
+#endif
 #endif
 #ifdef DEPTH_OUT
-  float inverse = texelFetch(depth_map, texel, 0).x;
-  vec2 from_centre = position - floor(position) - 0.5;
-  float at_ray = inverse + dot(texelFetch(slope_map, texel, 0).xy, from_centre);
+  float inverse = texelFetch(depth_map, ivec3(hit), 0).x;
+  float at_ray = inverse + dot(texelFetch(slope_map, ivec3(hit), 0).xy, fract(hit.xy) - 0.5);
   at_ray = clamp(at_ray, 0.5 * inverse, 2.0 * inverse);
   out_depth = inverse == 0.0 ? 0.0 : 1.0 / (at_ray * max(abs(d.x), max(abs(d.y), abs(d.z))));
 #endif
 #ifdef ID_OUT
-  out_id = texelFetch(id_map, texel, 0).x;
+  out_id = texelFetch(id_map, ivec3(hit), 0).x;
 #endif
 }
 )";
 
 std::string header(ProgramKey key) {
-  static constexpr std::array<std::pair<ProgramKey, const char*>, 10> kNames{{{kTextured, "TEXTURED"},
+  static constexpr std::array<std::pair<ProgramKey, const char*>, 11> kNames{{{kTextured, "TEXTURED"},
                                                                               {kLightmapped, "LIGHTMAPPED"},
                                                                               {kEmissive, "EMISSIVE"},
                                                                               {kVertexColors, "VERTEX_COLORS"},
@@ -320,7 +319,8 @@ std::string header(ProgramKey key) {
                                                                               {kColorOut, "COLOR_OUT"},
                                                                               {kDepthOut, "DEPTH_OUT"},
                                                                               {kIdOut, "ID_OUT"},
-                                                                              {kCubeFace, "CUBE_FACE"}}};
+                                                                              {kCubeFace, "CUBE_FACE"},
+                                                                              {kSampled, "SAMPLED"}}};
   std::string text = "#version 330 core\n";
   for (const auto& [bit, name] : kNames) {
     if ((key & bit) != 0) text += std::string("#define ") + name + "\n";
@@ -352,8 +352,8 @@ std::string sky_fragment_source(ProgramKey outputs) { return header(outputs) + k
 
 std::string average_fragment_source() { return header(0) + kAverageMain; }
 
-std::string panorama_fragment_source(ProgramKey outputs) {
-  return header(outputs) + kViewBlock + kOutputs + kSky + kPanoramaMain;
+std::string panorama_fragment_source(ProgramKey key) {
+  return header(key) + kViewBlock + kOutputs + kSky + kPanoramaMain;
 }
 
 }  // namespace wiw::gpu

@@ -18,6 +18,7 @@ enum : std::uint32_t {
   kDepthOut = 1u << 7,  // metric depth,
   kIdOut = 1u << 8,     // instance ids
   kCubeFace = 1u << 9,  // the pass draws one face of a panorama
+  kSampled = 1u << 10,  // the pass averages several rays a pixel
 };
 using ProgramKey = std::uint32_t;
 
@@ -30,6 +31,6 @@ std::string scene_fragment_source(ProgramKey key);
 std::string screen_vertex_source();
 std::string sky_fragment_source(ProgramKey outputs);
 std::string average_fragment_source();
-std::string panorama_fragment_source(ProgramKey outputs);
+std::string panorama_fragment_source(ProgramKey key);
 
 }  // namespace wiw::gpu
