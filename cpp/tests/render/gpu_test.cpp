@@ -201,6 +201,7 @@ TEST_CASE("gpu: one renderer used from several threads") {
   const Picture expected = draw(*renderer, kPoses[1], kView);
   std::vector<Picture> pictures(4);
   std::vector<std::thread> threads;
+  threads.reserve(pictures.size());
   for (Picture& picture : pictures) {
     threads.emplace_back([&] { picture = draw(*renderer, kPoses[1], kView); });
   }

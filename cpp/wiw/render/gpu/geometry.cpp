@@ -58,6 +58,9 @@ class Splitter {
                             3.f);
     }
     std::iota(order_.begin(), order_.end(), 0u);
+  }
+
+  void run() {
     if (!order_.empty()) split(order_);
   }
 
@@ -111,7 +114,7 @@ Geometry build_geometry(const Scene& scene) {
     range.first_chunk = geometry.chunks.size();
     const auto first_vertex = static_cast<std::uint32_t>(geometry.vertices.size());
     for (std::size_t i = 0; i < mesh.positions.size(); ++i) geometry.vertices.push_back(make_vertex(mesh, i));
-    Splitter(mesh, first_vertex, geometry);
+    Splitter(mesh, first_vertex, geometry).run();
     range.chunk_count = geometry.chunks.size() - range.first_chunk;
     for (std::size_t i = 0; i < range.chunk_count; ++i) range.box.extend(geometry.chunks[range.first_chunk + i].box);
     set_appearance(scene, mesh, range);

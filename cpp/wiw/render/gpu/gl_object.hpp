@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <bit>
+#include <cstddef>
 #include <utility>
 
 #include "wiw/render/gpu/gl_api.hpp"
@@ -29,6 +31,9 @@ class GlObject {
   const Gl* gl_ = nullptr;
   GLuint id_ = 0;
 };
+
+/// GL passes a position inside the bound buffer as a pointer.
+inline const void* buffer_offset(std::size_t bytes) { return std::bit_cast<const void*>(bytes); }
 
 using GlBuffer = GlObject<&Gl::GenBuffers, &Gl::DeleteBuffers>;
 using GlTexture = GlObject<&Gl::GenTextures, &Gl::DeleteTextures>;

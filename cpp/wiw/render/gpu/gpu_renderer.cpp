@@ -2,6 +2,7 @@
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
 #include <algorithm>
+#include <tuple>
 #include <utility>
 
 #include "wiw/core/error.hpp"
@@ -38,6 +39,18 @@ ProgramKey outputs_of(const RenderTargets& targets) {
          (targets.instance != nullptr ? kIdOut : 0u);
 }
 
+/// What one renderer keeps on the device. Make, use and destroy while the context is current.
+struct GraphicsMemory {
+  GraphicsMemory(GlContext& context, const Scene& content, const Geometry& geometry)
+      : scene(context, content, geometry),
+        views(context.gl(), context.info().uniform_alignment),
+        no_vertices(context.gl()) {}
+
+  SceneBuffers scene;
+  UniformSlots<View> views;
+  GlVertexArray no_vertices;
+};
+
 }  // namespace
 
 class GpuRenderer final : public Renderer {
@@ -49,9 +62,7 @@ class GpuRenderer final : public Renderer {
     for (const Instance& instance : scene_->instances) poses_.push_back(instance.T_world_instance);
     const GlContext::Current current(*context_);
     gl_ = &context_->gl();
-    buffers_ = std::make_unique<SceneBuffers>(*context_, *scene_, geometry);
-    views_ = std::make_unique<UniformSlots<View>>(*gl_, context_->info().uniform_alignment);
-    empty_ = std::make_unique<GlVertexArray>(*gl_);
+    memory_ = std::make_unique<GraphicsMemory>(*context_, *scene_, geometry);
     chunks_ = std::move(geometry.chunks);
     meshes_ = std::move(geometry.meshes);
   }
@@ -59,14 +70,10 @@ class GpuRenderer final : public Renderer {
   ~GpuRenderer() override {
     try {
       const GlContext::Current current(*context_);
-      buffers_.reset();
-      views_.reset();
-      empty_.reset();
+      memory_.reset();
     } catch (const Error&) {
       // The context is lost or belongs to the parent process: its objects are gone or not ours to delete.
-      (void)buffers_.release();
-      (void)views_.release();
-      (void)empty_.release();
+      std::ignore = memory_.release();
     }
   }
 
@@ -98,7 +105,7 @@ class GpuRenderer final : public Renderer {
     const GlContext::Current current(*context_);
     for (std::size_t i = 0; i < ids.size(); ++i) {
       poses_[ids[i] - 1] = poses[i];
-      buffers_->set_pose(ids[i], poses[i]);
+      memory_->scene.set_pose(ids[i], poses[i]);
     }
     context_->check("moving instances");
   }
@@ -156,7 +163,7 @@ class GpuRenderer final : public Renderer {
         for (const auto& offset : offsets) views.push_back(perspective_view(pose, camera, offset, samples_));
       }
     }
-    views_->upload(views, GL_STREAM_DRAW);
+    memory_->views.upload(views, GL_STREAM_DRAW);
     const ProgramKey direct = sampled ? outputs & ~kColorOut : outputs;
     Framebuffer& batch = context_->workspace().batch;
     batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, true);
@@ -193,7 +200,7 @@ class GpuRenderer final : public Renderer {
     for (const Pose& pose : poses) {
       for (int face = 0; face < kFaces; ++face) views.push_back(face_view(pose, face, camera.size, samples_));
     }
-    views_->upload(views, GL_STREAM_DRAW);
+    memory_->views.upload(views, GL_STREAM_DRAW);
     const int side = face_size(camera.size, samples_);
     const ProgramKey face_outputs = outputs | kIdOut | kCubeFace;
     auto& [batch, faces, samples] = context_->workspace();
@@ -230,8 +237,8 @@ class GpuRenderer final : public Renderer {
   /// The scene as `view` sees it, and the sky behind it.
   void draw_view(const std::vector<View>& views, std::size_t view, ProgramKey outputs) {
     gl_->DepthFunc(GL_GREATER);
-    views_->bind(kViewBinding, view);
-    buffers_->bind_geometry();
+    memory_->views.bind(kViewBinding, view);
+    memory_->scene.bind_geometry();
     draws_.gather(views[view], *scene_, meshes_, chunks_, poses_);
     draw_chunks(outputs);
     // A panorama adds the sky where no face has a surface.
@@ -253,23 +260,23 @@ class GpuRenderer final : public Renderer {
       const MeshRange& mesh = meshes_[draw.mesh];
       const ProgramKey wanted = reduce(mesh.appearance | outputs);
       if (std::exchange(key, wanted) != wanted) gl_->UseProgram(context_->programs().scene(wanted));
-      if (std::exchange(instance, draw.instance) != draw.instance) buffers_->bind_instance(draw.instance);
-      if (std::exchange(material, mesh.material) != mesh.material) buffers_->bind_material(mesh.material);
+      if (std::exchange(instance, draw.instance) != draw.instance) memory_->scene.bind_instance(draw.instance);
+      if (std::exchange(material, mesh.material) != mesh.material) memory_->scene.bind_material(mesh.material);
       if ((wanted & kTextured) != 0 && std::exchange(texture, mesh.texture) != mesh.texture) {
-        buffers_->bind_texture(mesh.texture);
+        memory_->scene.bind_texture(mesh.texture);
       }
       if ((wanted & kLightmapped) != 0 && std::exchange(lightmap, mesh.lightmap) != mesh.lightmap) {
-        buffers_->bind_lightmap(mesh.lightmap);
+        memory_->scene.bind_lightmap(mesh.lightmap);
       }
       const Chunk& chunk = chunks_[draw.chunk];
       gl_->DrawElements(GL_TRIANGLES, static_cast<GLsizei>(chunk.index_count), GL_UNSIGNED_INT,
-                        reinterpret_cast<const void*>(chunk.first_index * sizeof(std::uint32_t)));
+                        buffer_offset(chunk.first_index * sizeof(std::uint32_t)));
     }
   }
 
   void draw_screen(std::size_t view) {
-    views_->bind(kViewBinding, view);
-    gl_->BindVertexArray(empty_->id());
+    memory_->views.bind(kViewBinding, view);
+    gl_->BindVertexArray(memory_->no_vertices.id());
     gl_->DepthMask(GL_FALSE);
     gl_->DrawArrays(GL_TRIANGLES, 0, 3);
     gl_->DepthMask(GL_TRUE);
@@ -312,9 +319,7 @@ class GpuRenderer final : public Renderer {
   std::vector<Eigen::Affine3f> poses_;
   std::vector<Chunk> chunks_;
   std::vector<MeshRange> meshes_;
-  std::unique_ptr<SceneBuffers> buffers_;
-  std::unique_ptr<UniformSlots<View>> views_;
-  std::unique_ptr<GlVertexArray> empty_;
+  std::unique_ptr<GraphicsMemory> memory_;
   DrawList draws_;
 };
 

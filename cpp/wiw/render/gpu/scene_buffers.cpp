@@ -53,11 +53,14 @@ SceneBuffers::SceneBuffers(GlContext& context, const Scene& scene, const Geometr
       lightmap_sampler_(make_sampler(gl_, GL_LINEAR, GL_CLAMP_TO_EDGE)) {
   upload_geometry(geometry);
   std::vector<InstanceBlock> instances;
+  instances.reserve(scene.instances.size());
   for (const Instance& instance : scene.instances) {
     instances.push_back(make_instance(instance.id, instance.T_world_instance));
   }
   instances_.upload(instances, GL_DYNAMIC_DRAW);
-  std::vector<MaterialBlock> materials{{Eigen::Vector4f::Ones(), Eigen::Vector4f::Zero()}};
+  std::vector<MaterialBlock> materials;
+  materials.reserve(scene.materials.size() + 1);
+  materials.push_back({Eigen::Vector4f::Ones(), Eigen::Vector4f::Zero()});
   for (const Material& material : scene.materials) {
     materials.push_back({material.base_color, Eigen::Vector4f::Constant(material.alpha_cutoff)});
   }
@@ -77,7 +80,7 @@ void SceneBuffers::upload_geometry(const Geometry& geometry) {
   const auto attribute = [&](GLuint location, GLint count, GLenum type, std::size_t offset) {
     const GLboolean normalised = type == GL_FLOAT ? GL_FALSE : GL_TRUE;
     gl_.EnableVertexAttribArray(location);
-    gl_.VertexAttribPointer(location, count, type, normalised, sizeof(Vertex), reinterpret_cast<const void*>(offset));
+    gl_.VertexAttribPointer(location, count, type, normalised, sizeof(Vertex), buffer_offset(offset));
   };
   attribute(0, 3, GL_FLOAT, offsetof(Vertex, position));
   attribute(1, 3, GL_SHORT, offsetof(Vertex, normal));
@@ -115,7 +118,7 @@ void SceneBuffers::set_pose(std::uint32_t id, const Eigen::Affine3f& T_world_ins
 }
 
 void SceneBuffers::bind_material(std::int32_t index) const {
-  materials_.bind(kMaterialBinding, static_cast<std::size_t>(index + 1));
+  materials_.bind(kMaterialBinding, static_cast<std::size_t>(std::int64_t{index} + 1));
 }
 
 void SceneBuffers::bind_texture(std::int32_t index) const {

@@ -18,7 +18,10 @@ class UniformSlots {
 
   void upload(std::span<const Block> blocks, GLenum usage) {
     std::vector<std::byte> bytes(stride_ * blocks.size());
-    for (std::size_t i = 0; i < blocks.size(); ++i) std::memcpy(bytes.data() + i * stride_, &blocks[i], sizeof(Block));
+    for (std::size_t i = 0; i < blocks.size(); ++i) {
+      // NOLINTNEXTLINE(bugprone-undefined-memory-manipulation): Eigen's fixed-size vectors are plain floats
+      std::memcpy(bytes.data() + i * stride_, &blocks[i], sizeof(Block));
+    }
     gl_.BindBuffer(GL_UNIFORM_BUFFER, buffer_.id());
     gl_.BufferData(GL_UNIFORM_BUFFER, static_cast<GLsizeiptr>(bytes.size()), bytes.data(), usage);
   }
