@@ -4,10 +4,8 @@
 #include <doctest/doctest.h>
 
 #include "wiw/core/error.hpp"
-#include "wiw/planner/assemble.hpp"
 
 using namespace wiw;
-using enum Action;
 
 namespace {
 constexpr Size kPanorama{.height = 32, .width = 64};
@@ -71,12 +69,4 @@ TEST_CASE("depth becomes planar in a perspective view") {
   maker.depth(sphere.data(), kPanorama, 0, depth.data());
   CHECK(depth[40] == doctest::Approx(2));
   CHECK(depth[36] == doctest::Approx(2 / std::sqrt(1 + 64.0 / 81)));  // left edge, ray (-8/9, 0, -1)
-}
-
-TEST_CASE("a rollout of the wrong length is refused") {
-  const Batch batch({{{kForward, kForward}}}, {});
-  const Panoramas real{.count = 1, .size = kPanorama};
-  CHECK_THROWS_AS(check_inputs(batch, real, {.rollouts = {{.rows = 1, .frames = 2}}}), ArgumentError);
-  CHECK_THROWS_AS(check_inputs(batch, real, {}), ArgumentError);
-  CHECK_THROWS_AS(check_inputs(batch, {}, {.rollouts = {{.rows = 1, .frames = 3}}}), ArgumentError);
 }
