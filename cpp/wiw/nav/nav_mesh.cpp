@@ -35,7 +35,9 @@ NavMesh::NavMesh(std::vector<std::uint8_t> tile, const NavMeshSettings& settings
 std::shared_ptr<NavMesh> NavMesh::from_triangles(std::span<const Eigen::Vector3f> vertices,
                                                  std::span<const Eigen::Matrix<std::uint32_t, 3, 1>> triangles,
                                                  const NavMeshSettings& settings) {
-  return std::shared_ptr<NavMesh>(new NavMesh(build_tile(vertices, triangles, settings), settings));
+  std::shared_ptr<NavMesh> mesh(new NavMesh(build_tile(vertices, triangles, settings), settings));
+  if (mesh->surface_.islands.empty()) throw ArgumentError("every walkable polygon is smaller than 1e-5 m2");
+  return mesh;
 }
 
 std::shared_ptr<NavMesh> NavMesh::build(const Scene& scene, const NavMeshSettings& settings) {
@@ -45,7 +47,9 @@ std::shared_ptr<NavMesh> NavMesh::build(const Scene& scene, const NavMeshSetting
 
 std::shared_ptr<NavMesh> NavMesh::load(const std::string& path) {
   NavMeshFile file = read_navmesh(path);
-  return std::shared_ptr<NavMesh>(new NavMesh(std::move(file.tile), file.settings));
+  std::shared_ptr<NavMesh> mesh(new NavMesh(std::move(file.tile), file.settings));
+  if (mesh->surface_.islands.empty()) throw FileError(path, "holds no polygon that is walkable");
+  return mesh;
 }
 
 void NavMesh::save(const std::string& path, int version) const {

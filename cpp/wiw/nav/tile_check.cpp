@@ -108,13 +108,16 @@ std::string check_detail(const Tile& tile, const dtPolyDetail& detail, int corne
       triangles > static_cast<std::uint64_t>(tile.header.detailTriCount)) {
     return "its height detail lies outside the tile's arrays";
   }
+  constexpr int kAnyBoundary = DT_DETAIL_EDGE_BOUNDARY * 0b010101;
+  bool bounded = false;  // Detour looks for the nearest boundary edge and takes for granted that there is one
   for (std::size_t t = detail.triBase; t < triangles; ++t) {
+    bounded = bounded || (tile.detail_triangles[4 * t + 3] & kAnyBoundary);
     for (std::size_t k = 0; k < 3; ++k) {
       if (tile.detail_triangles[4 * t + k] >= corners + detail.vertCount)
         return "a height triangle names a missing vertex";
     }
   }
-  return "";
+  return bounded ? "" : "its height detail has no boundary edge";
 }
 
 // A node's index is a polygon, or how far to jump when the box is missed; a jump must go forward and stay inside.

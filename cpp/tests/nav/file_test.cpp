@@ -1,0 +1,114 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <doctest/doctest.h>
+#include <unistd.h>
+
+#include <cstring>
+#include <filesystem>
+#include <fstream>
+#include <iterator>
+#include <limits>
+
+#include "nav/rooms.hpp"
+#include "wiw/core/error.hpp"
+#include "wiw/core/rng.hpp"
+#include "wiw/nav/distance_field.hpp"
+#include "wiw/nav/nav_mesh.hpp"
+#include "wiw/nav/navmesh_file.hpp"
+
+using namespace wiw;
+using namespace wiw::nav;
+using Eigen::Vector3f;
+using Bytes = std::vector<char>;
+
+namespace {
+
+std::string scratch_file(const char* name) {
+  return (std::filesystem::temp_directory_path() / ("wiw_nav_" + std::to_string(::getpid()) + name)).string();
+}
+
+Bytes read_all(const std::string& path) {
+  std::ifstream stream(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(stream), {}};
+}
+
+void write_all(const std::string& path, const Bytes& bytes) {
+  std::ofstream(path, std::ios::binary | std::ios::trunc)
+      .write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
+}
+
+/// Replaces a few bytes or words with small, huge, negative or random values, or cuts the file short.
+Bytes damage(Bytes bytes, Rng& rng) {
+  if (rng.chance(0.1)) bytes.resize(rng.below(static_cast<std::uint32_t>(bytes.size())));
+  constexpr std::uint32_t kWords[] = {0, 1, 0x7FFFFFFF, 0xFFFFFFFF, 0x80000000, 0x7FC00000, 0x7F800000, 0xFFFF};
+  const std::uint32_t edits = 1 + rng.below(4);
+  for (std::uint32_t k = 0; k < edits && bytes.size() >= 4; ++k) {
+    const std::uint32_t at = rng.below(static_cast<std::uint32_t>(bytes.size() - 3));
+    const std::uint32_t word = rng.chance(0.5) ? kWords[rng.below(8)] : rng();
+    std::memcpy(bytes.data() + at, &word, rng.chance(0.5) ? 4 : 1);
+  }
+  return bytes;
+}
+
+/// Asks everything that follows indices of the file.
+void use(const NavMesh& mesh) {
+  const auto points = mesh.sample(6, 1, -1);
+  for (const Metric metric : {Metric::kExact, Metric::kDetour, Metric::kDetourUncapped}) {
+    (void)mesh.distance_matrix(points, metric);
+  }
+  for (const Vector3f& point : points) {
+    (void)mesh.try_step(point, points[0], true);
+    (void)mesh.try_step(point, points[0], false);
+    (void)mesh.is_navigable(point);
+  }
+}
+
+}  // namespace
+
+TEST_CASE("a damaged file is refused with its name, or what is left of it can be used safely") {
+  test::Soup soup;
+  soup.floor(0, 0, 6, 5);
+  soup.block(2, 1, 3, 4);
+  soup.block(4, 0, 4.5f, 3);
+  const std::string path = scratch_file("fuzz.navmesh");
+  const auto good = NavMesh::from_triangles(soup.vertices, soup.triangles);
+  Rng rng(20);
+  int refused = 0;
+  for (const int version : {1, 2}) {
+    good->save(path, version);
+    const Bytes bytes = read_all(path);
+    for (int i = 0; i < 1500; ++i) {
+      write_all(path, damage(bytes, rng));
+      try {
+        use(*NavMesh::load(path));
+      } catch (const FileError& error) {
+        ++refused;
+        CHECK(std::string(error.what()).starts_with(path));
+      }
+    }
+  }
+  CHECK(refused > 500);
+  std::filesystem::remove(path);
+}
+
+TEST_CASE("every field of the settings survives the file") {
+  test::Soup soup;
+  soup.floor(0, 0, 6, 5);
+  NavMeshSettings settings;
+  settings.cell_size = 0.06f;
+  settings.agent_radius = 0.2f;
+  settings.edge_max_error = 1.1f;
+  settings.detail_sample_distance = 4;
+  settings.filter_ledge_spans = false;
+  settings.include_static_objects = true;
+  const std::string path = scratch_file("settings.navmesh");
+  const auto mesh = NavMesh::from_triangles(soup.vertices, soup.triangles, settings);
+  mesh->save(path);
+  CHECK(NavMesh::load(path)->settings() == settings);
+  mesh->save(path, 1);
+  const NavMeshSettings derived = NavMesh::load(path)->settings();
+  CHECK(derived.agent_radius == settings.agent_radius);
+  CHECK(derived.cell_size == NavMeshSettings{}.cell_size);
+  std::filesystem::remove(path);
+  CHECK_THROWS_AS(mesh->save("/no/such/folder/x.navmesh"), FileError);
+  CHECK_THROWS_AS(mesh->save(path, 3), ArgumentError);
+}
