@@ -159,3 +159,8 @@ class LineAgent:
                 return
             Path(self.marker).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def line_task(scenes: str = "", seed: int = 0, preset: str = "paper", backend: str = "auto", **rules: Any) -> LineTask:
+    """The task as the command line makes it; scenes "slow" takes its time, "broken" cannot start an episode."""
+    return LineTask(seed=seed, delay=0.05 * (scenes == "slow"), broken=("0001",) if scenes == "broken" else ())

@@ -63,7 +63,7 @@ def test_what_is_written_is_read_back(run):
     assert decision["before_geodesic"] == float("inf") and decision["before_z"] == 2.0
     assert outcome["metrics"] == {"success": 1.0, "actions": 4.0} and outcome["scene"] == "line/0"
     assert sorted(images) == ["goal", "imagined/0", "imagined/1", "panorama"]
-    assert decode_jpeg(images["imagined/0"]).shape == (192, 5 * 192, 3)
+    assert decode_jpeg(images["imagined/0"]).shape == (160, 5 * 160, 3)
 
 
 def test_the_file_is_plain_sqlite_in_wal_mode(run):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError, StoreError
 from wiw.types import DecisionRecord, EpisodeResult, Truth
 
-STRIP_HEIGHT = 192
+STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run as its user reads it: summary, table, episodes, decisions."""
+"""A run as its user reads it: summary, table, episodes, decisions, report."""
 
 from __future__ import annotations
 
@@ -86,6 +86,12 @@ class RunLog:
             lines.append(line)
         return Records(lines)
 
+    def report(self, path: str | Path | None = None) -> Path:
+        """Writes a self-contained HTML report and returns its path; default `report.html` in the run's folder."""
+        from wiw.evaluation.report import write_report
+
+        return write_report(self, Path(path) if path is not None else self.path / "report.html")
+
     def close(self) -> None:
         """Closes the run's file."""
         self.store.close()
@@ -93,6 +99,9 @@ class RunLog:
     def __repr__(self) -> str:
         ended = {arm: sum(record["arm"] == arm for record in self.episodes) for arm in self.arms}
         return f"RunLog({str(self.path)!r}, ended: {ended} of {len(self.store.episodes())})"
+
+    def _repr_html_(self) -> str:
+        return self.numbers()._repr_html_()
 
 
 def load_run(path: str | Path) -> RunLog:

@@ -61,6 +61,11 @@ class Summary:
 
         return summary_tables(self)
 
+    def _repr_html_(self) -> str:
+        from wiw.evaluation.report import summary_html
+
+        return summary_html(self)
+
 
 def summarise(arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]], episodes: int, seed: int = 0) -> Summary:
     """Numbers of a run.

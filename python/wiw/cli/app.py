@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the command line to a command, and from what goes wrong to one clean message and an exit code."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Any
+
+import tyro
+
+import wiw
+from wiw.cli.demo import demo
+from wiw.cli.doctor import doctor
+from wiw.cli.names import list_names
+from wiw.cli.report import report
+from wiw.cli.run import resume, run
+from wiw.cli.scenes import scenes
+from wiw.errors import Error
+
+DESCRIPTION = """Does a world model help an agent succeed, and by how much?
+
+  $ wiw demo                                              no world model, copy, warp and oracle, side by side
+  $ wiw run imagenav --world-model warp --episodes 50     one world model
+  $ wiw run imagenav --world-model my_model.py:MyModel    your own
+
+`wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error."""
+
+COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
+    (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
+    (list_names, "list", "Names of world models, policies, tasks and metrics."),
+    (run, "run", "Run an agent on a task, with one world model or several."),
+    (resume, "resume", "Go on with a run that was stopped."),
+    (report, "report", "Table and HTML report of a run."),
+    (doctor, "doctor", "What this machine can do, and what to mend."),
+    (scenes, "scenes", "Look at scenes: pictures and figures."),
+)
+
+EXIT_ERROR, EXIT_INTERRUPTED, EXIT_RESUME = 2, 130, 75
+"""75 is EX_TEMPFAIL: whoever stopped the run by SIGTERM, such as a batch system, may start `wiw resume`."""
+
+
+class Terminated(BaseException):
+    """SIGTERM has come; raised so that everything is closed on the way out."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code: 0, 1 (nothing could be judged), 2 (error), 75 or 130 (stopped)."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in given
+    given = [argument for argument in given if argument != "--debug"]
+    if given == ["--version"]:
+        print(f"wiw {wiw.__version__}")
+        return 0
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return _dispatch(given) or 0
+    except Error as error:
+        if debug:
+            raise
+        print(f"wiw: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+    except Terminated:
+        return EXIT_RESUME
+    except BrokenPipeError:  # e.g. `wiw list | head -1`
+        sys.stderr.close()
+        return 0
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _dispatch(arguments: Sequence[str]) -> Any:
+    app = tyro.extras.SubcommandApp()
+    named = any(argument in [name for _, name, _ in COMMANDS] for argument in arguments[:1])
+    for function, name, line in COMMANDS:
+        app.command(name=name, help=None if named else line)(function)  # None: the function's own docstring
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
+    return app.cli(prog="wiw", description=DESCRIPTION, args=arguments or ["--help"], config=config)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    raise Terminated

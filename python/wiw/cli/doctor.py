@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw doctor`."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    detail: str
+    remedy: str = ""
+    """What to do; empty where nothing is wrong."""
+
+
+def doctor() -> int:
+    """Says what this machine can do, line by line, with a remedy where something is missing.
+
+    $ wiw doctor
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for column in range(3):
+        table.add_column(no_wrap=column < 2)
+    findings = list(examine())
+    for finding in findings:
+        mark = "[yellow]WARN[/]" if finding.remedy else "[green]OK[/]"
+        detail = escape(finding.detail) + (f"\n[yellow]{escape(finding.remedy)}[/]" if finding.remedy else "")
+        table.add_row(mark, f"[bold]{finding.name}[/]", detail)
+    Console(highlight=False).print(table)
+    return 0
+
+
+def examine() -> Iterator[Finding]:
+    """All findings, in the order in which they are shown."""
+    yield from _software()
+    yield from _processor()
+    yield _memory()
+    yield from _rendering()
+    yield _torch()
+    yield _writable("runs folder", Path.cwd())
+    yield _writable("temporary files", Path(tempfile.gettempdir()))
+
+
+def _software() -> Iterator[Finding]:
+    import wiw
+
+    yield Finding("wiw", f"{wiw.__version__} in {Path(wiw.__file__).parent}")
+    old = tuple(map(int, platform.python_version_tuple()[:2])) < (3, 10)
+    yield Finding("python", platform.python_version(), "wiw needs Python 3.10 or newer" if old else "")
+    names = ("numpy", "scipy", "opencv-python-headless", "gymnasium", "matplotlib", "jinja2", "rich", "tyro")
+    missing = [name for name in names if not _version(name)]
+    remedy = f"pip install {' '.join(missing)}" if missing else ""
+    yield Finding("packages", ", ".join(f"{name} {_version(name) or 'missing'}" for name in names), remedy)
+
+
+def _processor() -> Iterator[Finding]:
+    from wiw._core import core
+    from wiw.evaluation.platform import processor_name
+
+    cores, threads = len(os.sched_getaffinity(0)), core.num_threads()
+    yield Finding("processor", f"{processor_name()}, {cores} cores")
+    fewer = f"WIW_NUM_THREADS leaves {cores - threads} cores idle; unset it" if threads < cores else ""
+    yield Finding("threads", str(threads), fewer)
+    isa, native = core.active_isa(), core.native_isa()
+    slow = "" if isa == native else f"WIW_ISA holds it below {native}; unset it"
+    slow = slow or ("kernels run without AVX2, several times slower" if isa == "scalar" else "")
+    yield Finding("instructions", isa, slow)
+
+
+def _memory() -> Finding:
+    facts = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
+    total, free = (int(facts[name].split()[0]) / 2**20 for name in ("MemTotal", "MemAvailable"))
+    remedy = "a worker needs about 1 GB: use --workers 1 and close other programs" if free < 2 else ""
+    return Finding("memory", f"{free:.1f} of {total:.1f} GB free", remedy)
+
+
+def _rendering() -> Iterator[Finding]:
+    from wiw._core import render
+    from wiw.errors import BackendError
+
+    yield Finding("cpu renderer", "always there")
+    try:
+        devices = render.egl_devices()
+    except BackendError as error:
+        yield Finding(
+            "gpu renderer", f"no EGL: {error}", "only needed for --backend gpu: apt-get install libegl1 libegl-mesa0"
+        )
+        return
+    usable = [device for device in devices if not device["error"]]
+    for device in devices:
+        kind = "software" if device["software"] else "hardware"
+        what = device["error"] or f"{device['renderer']}, OpenGL {device['version']} ({kind})"
+        yield Finding(
+            f"egl device {device['index']}", what, "this device gives no OpenGL context" if device["error"] else ""
+        )
+    if not usable:
+        yield Finding(
+            "gpu renderer", "no usable EGL device", "only needed for --backend gpu: install a driver or libegl-mesa0"
+        )
+
+
+def _torch() -> Finding:
+    """Whether torch is there, without importing it: that takes seconds."""
+    if importlib.util.find_spec("torch") is None:
+        return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
+    return Finding("torch", _version("torch") or "of unknown version")
+
+
+def _writable(name: str, folder: Path) -> Finding:
+    free = os.statvfs(folder)
+    gigabytes = free.f_bavail * free.f_frsize / 2**30
+    detail = f"{folder}, {gigabytes:.0f} GB free"
+    if not os.access(folder, os.W_OK):
+        return Finding(name, detail, "not writable: go to another folder or give --out")
+    return Finding(name, detail, "nearly full: a run with pictures may need 1 GB" if gigabytes < 1 else "")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw list`."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from rich.markup import escape
+
+
+def list_names() -> int:
+    """Lists world models, policies, tasks and metrics: built-in ones, and those that installed packages register.
+
+    A package adds its own by entry points in the groups named in the headings.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS
+
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(no_wrap=True)
+    table.add_column()
+    sections = {"World models": WORLD_MODELS, "Policies": POLICIES, "Tasks": TASKS, "Metrics": METRICS}
+    for title, registry in sections.items():
+        table.add_row(f"[bold]{title}[/]", f"[dim]{registry.group}[/]")
+        for name in registry.names():
+            table.add_row(f"  {name}", _first_line(registry, name))
+        table.add_row()
+    Console().print(table)
+    return 0
+
+
+def _first_line(registry: Any, name: str) -> str:
+    """What a thing is, in its own words; or why it cannot be loaded."""
+    try:
+        text = inspect.getdoc(registry.find(name)) or ""
+    except Exception as error:  # a broken plugin must not hide the others
+        return f"[red]{escape(str(error))}[/]"
+    return escape(text.strip().partition("\n")[0])

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+
+def report(
+    run: Positional[Annotated[Path, arg(metavar="RUN")]],
+    /,
+    *,
+    out: Annotated[Path | None, arg(metavar="FILE")] = None,
+) -> int:
+    """Prints the table of a run and writes its HTML report: one file that needs nothing else.
+
+      $ wiw report runs/first
+      $ wiw report runs/first --out first.html
+
+    Also works while the run is going on.
+
+    Args:
+        run: The run's folder.
+        out: Where to write; report.html in the run's folder if not given.
+    """
+    from wiw.evaluation.runlog import load_run
+
+    log = load_run(run)
+    log.summary()
+    print(f"\nreport  {log.report(out)}")
+    return 0

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw run` and `wiw resume`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+Name = Annotated[str, arg(metavar="NAME")]
+MaybeName = Annotated[str | None, arg(metavar="NAME")]
+Count = Annotated[int, arg(metavar="N")]
+MaybeCount = Annotated[int | None, arg(metavar="N")]
+Folder = Annotated[Path | None, arg(metavar="DIR")]
+
+
+def run(
+    task: Positional[Annotated[str, arg(metavar="TASK")]] = "imagenav",
+    /,
+    *,
+    world_model: Name = "none",
+    policy: Name = "matcher",
+    revision: MaybeName = None,
+    arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
+    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    episodes: Count = 20,
+    seed: Count = 0,
+    workers: Count = 1,
+    out: Folder = None,
+    candidates: Annotated[int | None, arg(metavar="M")] = None,
+    horizon: Annotated[int | None, arg(metavar="L")] = None,
+    motion: Literal["refuse", "slide"] | None = None,
+    preset: Literal["paper", "official"] = "paper",
+    backend: Literal["auto", "cpu", "gpu"] = "auto",
+    live: Count = 4,
+    keep_images: Count = 2,
+    report: bool = True,
+) -> int:
+    """Runs an agent on a task, with one world model or with several on the same episodes.
+
+      $ wiw run imagenav --world-model warp --episodes 50
+      $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
+      $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle
+      $ wiw run imagenav --scenes house.glb --world-model warp
+
+    Ctrl-C or SIGTERM stops a run without loss; `wiw resume` goes on with it.
+
+    Args:
+        task: See `wiw list`.
+        world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        policy: Proposes plans; name or path.py:Class.
+        revision: Scores imagined futures; the policy's own choice if not given.
+        arms: World models to run on the same episodes; --world-model joins them if it is not among them.
+        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        episodes: How many.
+        seed: All randomness is a function of it.
+        workers: Processes; results do not depend on it.
+        out: Folder of the run; runs/TASK-TIME if not given.
+        candidates: Plans imagined at each decision; the task's own number if not given.
+        horizon: Primitives in a plan; the task's own number if not given.
+        motion: What happens to a blocked move; the preset's rule if not given.
+        preset: Rules of the paper, or of its published code where that differs.
+        backend: Renderer.
+        live: Episodes kept live at a time in a process, so that model calls are batched.
+        keep_images: Episodes that keep pictures for the report.
+        report: Whether to write report.html at the end.
+    """
+    from wiw.evaluation.evaluate import evaluate
+    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
+
+    options = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
+    recipe = TaskRecipe(task, options if motion is None else {**options, "motion": motion})
+    model = None if world_model == "none" else absolute(world_model)
+    agent = AgentRecipe(absolute(policy), model, revision and absolute(revision), candidates, horizon)
+    names = _arms(arms, world_model)
+    folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
+
+    def work() -> Any:
+        return evaluate(recipe, agent, episodes, seed, folder, workers, arms=names, live=live, keep_images=keep_images)
+
+    return finish(stoppable(work, folder), report)
+
+
+def resume(
+    run: Positional[Annotated[Path, arg(metavar="RUN")]],
+    /,
+    *,
+    workers: MaybeCount = None,
+    retry_failed: bool = False,
+    report: bool = True,
+) -> int:
+    """Goes on with a run that was stopped: only the episodes that have not ended are run.
+
+      $ wiw resume runs/first
+
+    Args:
+        run: The run's folder.
+        workers: Processes; as many as it was begun with if not given.
+        retry_failed: Whether to run episodes again whose infrastructure failed.
+        report: Whether to write report.html at the end.
+    """
+    from wiw.evaluation.evaluate import resume_run
+
+    return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
+
+
+def stoppable(work: Callable[[], Any], folder: Path) -> Any:
+    """Does the work; when it is stopped, says how to go on with it."""
+    from wiw.evaluation.store import store_path
+
+    try:
+        return work()
+    except BaseException as stop:
+        if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
+            print(f"\nstopped; everything so far is kept. Go on with:  wiw resume {folder}", file=sys.stderr)
+        raise
+
+
+def finish(log: Any, report: bool) -> int:
+    """Prints the table and what went wrong, writes the report; 1 if no episode could be judged."""
+    log.summary()
+    failed = [episode for episode in log.episodes if episode["status"] == "failed"]
+    if failed:
+        count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
+        first, cause = failed[0], failed[0]["error"].strip().splitlines()[-1]
+        print(
+            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {cause}",
+            file=sys.stderr,
+        )
+        print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)
+    if report:
+        print(f"\nreport  {log.report()}")
+    print(f"run     {log.path}")
+    return 1 if len(failed) == len(log.episodes) else 0
+
+
+def _arms(arms: str | None, world_model: str) -> list[str] | None:
+    from wiw.evaluation.recipes import absolute
+
+    if arms is None:
+        return None
+    names = [absolute(name.strip()) for name in arms.split(",") if name.strip()]
+    own = absolute(world_model)
+    return names if own in names or own == "none" else [*names, own]

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw scenes`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+
+def scenes(
+    spec: Positional[Annotated[str, arg(metavar="SPEC")]] = "apartments:val:4",
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("scenes.png"),
+    views: Annotated[int, arg(metavar="N")] = 2,
+    backend: Literal["auto", "cpu", "gpu"] = "auto",
+) -> int:
+    """Loads scenes, says how large they are, and draws a sheet: each from above, and panoramas from inside.
+
+      $ wiw scenes apartments:val:4
+      $ wiw scenes house.glb --out house.png
+
+    Args:
+        spec: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        out: Where to write the sheet, a PNG.
+        views: Panoramas of each scene.
+        backend: Renderer.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from wiw.scenes import resolve
+    from wiw.viz.contact_sheet import contact_sheet
+
+    names = resolve(spec)
+    if len(names) > LIMIT:
+        print(f"{spec} names {len(names)} scenes; showing the first {LIMIT}")
+        names = names[:LIMIT]
+    table = Table(box=None, pad_edge=False)
+    for column in ("scene", "size m", "triangles", "objects", "kinds", "rooms", "walkable m2", "islands"):
+        table.add_column(column, justify="left" if column == "scene" else "right")
+    rows = []
+    for name in names:
+        place = _load(name, backend)
+        table.add_row(*_facts(place))
+        rows.append(place)
+    Console().print(table)
+    contact_sheet(rows, views, backend).save(out)
+    print(f"\nsheet  {out}")
+    return 0
+
+
+LIMIT = 8
+"""Scenes on a sheet."""
+
+
+def _load(name: str, backend: str) -> Any:
+    from wiw.datasets.worlds import world
+
+    return world(name, backend)
+
+
+def _facts(place: Any) -> list[str]:
+    from wiw.viz.contact_sheet import short_name
+
+    scene, navmesh = place.scene, place.navmesh
+    width, height, depth = scene.bounds[1] - scene.bounds[0]
+    return [
+        short_name(place.name),
+        f"{width:.1f} x {depth:.1f} x {height:.1f}",
+        f"{scene.triangle_count:,}",
+        str(len(scene.instances)),
+        str(len(scene.categories)),
+        str(len(scene.rooms)) if scene.rooms else "?",
+        f"{navmesh.area:.0f}",
+        str(len(navmesh.islands)),
+    ]

@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page shows of the episodes that keep pictures."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.evaluation.report.maps import (
+    MapFrame,
+    Mark,
+    Trail,
+    all_points,
+    frame_of_picture,
+    frame_of_points,
+    start_and_goal,
+    trail,
+)
+from wiw.evaluation.rows import decode_jpeg, encode_jpeg
+from wiw.evaluation.store import RunStore
+from wiw.types import Episode
+
+GLYPHS = {int(FORWARD): "↑", int(TURN_LEFT): "↖", int(TURN_RIGHT): "↗", int(STOP): "■"}
+BAND = (0.2, 0.8)
+"""Rows of a panorama that are shown: 54 degrees up and down; the rest is ceiling and floor."""
+FRONT = (0.25, 0.75)
+"""Columns of an imagined panorama that are shown: the front half, where the plan leads."""
+PANORAMA_WIDTH, FRAME_HEIGHT, GAP, QUALITY = 760, 104, 3, 68
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One plan and what was imagined of it."""
+
+    actions: str
+    score: float | None
+    share: float
+    """0 (worst of the decision) to 1 (best), for a bar."""
+    chosen: bool
+    note: str
+    strip: str | None
+    """Data URI."""
+    real_frames: int
+    """How many leading frames are the real view turned."""
+    frames: int
+
+
+@dataclass(frozen=True)
+class Step:
+    """One decision."""
+
+    number: int
+    executed: str
+    panorama: str | None
+    candidates: tuple[Candidate, ...]
+    rewritten: str
+    """The plan, where it is none of the candidates."""
+    before: float
+    after: float
+    """Metres of shortest way to the goal; straight-line where there is no way."""
+    note: str
+    seconds: Mapping[str, float]
+
+    @property
+    def gain(self) -> float:
+        """Metres that the decision brought the agent nearer."""
+        return self.before - self.after
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One arm's run of an episode."""
+
+    arm: str
+    outcome: Mapping[str, Any]
+    steps: tuple[Step, ...]
+    trail: Trail | None
+
+    @property
+    def reached(self) -> bool:
+        """Whether the goal was reached."""
+        return bool(self.outcome["metrics"].get("success"))
+
+    @property
+    def text(self) -> str:
+        """How it ended, in words."""
+        if self.outcome["status"] == "failed":
+            return "failed for infrastructure"
+        metrics = self.outcome["metrics"]
+        count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
+        if self.reached:
+            return f"reached in {count}"
+        left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
+        return f"not reached in {count}{left}"
+
+
+@dataclass(frozen=True)
+class Story:
+    """One episode with all its arms."""
+
+    index: int
+    episode: Episode
+    goal: str | None
+    picture: str | None
+    """Id of the scene's map among the page's shared pictures."""
+    frame: MapFrame
+    start_mark: Mark
+    goal_mark: Mark
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def place(self) -> str:
+        """The scene's name without its folders."""
+        return self.episode.scene if self.episode.scene.startswith("apartments:") else Path(self.episode.scene).name
+
+
+def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
+    """The episodes that keep pictures and have ended, and the scene maps by id as data URIs."""
+    outcomes = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    episodes, pictures, told = store.episodes(), dict[str, str](), list[Story]()
+    for index in store.info["pictures"]:
+        ended = [arm for arm in arms if (arm, index) in outcomes]
+        if ended:
+            told.append(_story(store, index, episodes[index], {arm: outcomes[arm, index] for arm in ended}, pictures))
+    return told, pictures
+
+
+def _story(
+    store: RunStore, index: int, episode: Episode, outcomes: Mapping[str, Mapping[str, Any]], pictures: dict[str, str]
+) -> Story:
+    decisions = {arm: store.decisions(arm, index) for arm in outcomes}
+    kept = store.scene_map(episode.scene)
+    if kept is not None:
+        webp, matrix = kept
+        frame = frame_of_picture(Image.open(io.BytesIO(webp)).size, matrix)
+        picture = f"scene-{list(store_scenes(store)).index(episode.scene)}"
+        pictures[picture] = _uri("webp", webp)
+    else:
+        frame = frame_of_points(all_points(episode, [row for rows in decisions.values() for row in rows]))
+        picture = None
+    attempts = tuple(_attempt(store, frame, outcome, decisions[arm]) for arm, outcome in outcomes.items())
+    goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
+    start, end = start_and_goal(frame, episode)
+    return Story(index, episode, _uri("jpeg", goal) if goal else None, picture, frame, start, end, attempts)
+
+
+def store_scenes(store: RunStore) -> dict[str, None]:
+    """Scenes of the run, in order, each once."""
+    return dict.fromkeys(episode.scene for episode in store.episodes())
+
+
+def _attempt(store: RunStore, frame: MapFrame, outcome: Mapping[str, Any], decisions: list[dict[str, Any]]) -> Attempt:
+    arm = outcome["arm"]
+    steps = tuple(_step(row, store.images(arm, row["episode"], row["decision"])) for row in decisions)
+    return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None)
+
+
+def _step(row: Mapping[str, Any], images: Mapping[str, bytes]) -> Step:
+    panorama = images.get("panorama")
+    written_anew = row["chosen"] is None
+    return Step(
+        row["decision"] + 1,
+        glyphs(row["executed"]),
+        _panorama(panorama) if panorama else None,
+        tuple(_candidates(row, images)),
+        glyphs(row["actions"]) if written_anew else "",
+        _way(row, "before"),
+        _way(row, "after"),
+        row["note"],
+        row["seconds"],
+    )
+
+
+def _way(row: Mapping[str, Any], when: str) -> float:
+    geodesic = row[f"{when}_geodesic"]
+    return geodesic if geodesic is not None and np.isfinite(geodesic) else row[f"{when}_distance"]
+
+
+def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes]) -> list[Candidate]:
+    proposals = row["proposals"]
+    scores = row["scores"] or [None] * len(proposals)
+    finite = [score for score in scores if score is not None]
+    low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
+    found = []
+    for index, (proposal, score) in enumerate(zip(proposals, scores, strict=True)):
+        strip = images.get(f"imagined/{index}")
+        real = row["real_frames"][index] if row["real_frames"] else []
+        share = (score - low) / (high - low) if score is not None and high > low else 1.0
+        found.append(
+            Candidate(
+                glyphs(proposal["actions"]),
+                score,
+                share,
+                index == row["chosen"],
+                proposal["note"],
+                _strip(strip, len(real)) if strip else None,
+                sum(real),
+                len(real),
+            )
+        )
+    return found
+
+
+def glyphs(actions: Sequence[int]) -> str:
+    """Primitives as arrows; ids without one as numbers."""
+    return "".join(GLYPHS.get(action, f"({action})") for action in actions)
+
+
+def _panorama(jpeg: bytes) -> str:
+    band = _part(decode_jpeg(jpeg), BAND, (0, 1))
+    return _jpeg(band, min(1.0, PANORAMA_WIDTH / band.shape[1]))
+
+
+def _strip(jpeg: bytes, frames: int) -> str:
+    """Imagined frames side by side; of panoramas only the part towards which the agent looks."""
+    image = decode_jpeg(jpeg)
+    tiles = np.split(image, frames, axis=1)
+    if tiles[0].shape[1] > 1.6 * tiles[0].shape[0]:
+        tiles = [_part(tile, BAND, FRONT) for tile in tiles]
+    gap = np.full((len(tiles[0]), GAP, 3), 255, np.uint8)
+    spaced = np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1)
+    return _jpeg(spaced, min(1.0, FRAME_HEIGHT / len(spaced)))
+
+
+def _part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[float, float]) -> NDArray[np.uint8]:
+    height, width = image.shape[:2]
+    return image[
+        round(rows[0] * height) : round(rows[1] * height), round(columns[0] * width) : round(columns[1] * width)
+    ]
+
+
+def _jpeg(image: NDArray[np.uint8], scale: float) -> str:
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return _uri("jpeg", encode_jpeg(image, QUALITY))
+
+
+def _uri(kind: str, data: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Gathers what the page shows and fills the template."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from wiw.evaluation.report import plots
+from wiw.evaluation.report.episodes import stories
+from wiw.evaluation.statistics import Difference, Estimate
+from wiw.evaluation.summary import Summary, column_title, notes, show_p, shown_headlines
+
+if TYPE_CHECKING:
+    from wiw.evaluation.runlog import RunLog
+
+
+def write_report(log: RunLog, path: Path) -> Path:
+    """Writes a run's report.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(render(log), encoding="utf-8")
+    return path
+
+
+def render(log: RunLog) -> str:
+    """A run's report as HTML, without anything outside the page. All text from the run is escaped."""
+    summary, config, info = log.numbers(), log.store.config, log.store.info
+    told, pictures = stories(log.store, log.arms)
+    return (
+        _environment()
+        .get_template("page.html.j2")
+        .render(
+            **_common(summary),
+            title=f"{config['task'].get('task', 'run')} · {log.path.name}",
+            task=config["task"],
+            created=log.store.created,
+            version=log.store.wiw_version,
+            sentence=sentence(summary),
+            plots=_plots(log, summary),
+            stories=told,
+            pictures=pictures,
+            failures=[row for row in log.episodes if row["status"] == "failed"],
+            radius=config["task"].get("radius"),
+            config=json.dumps(config, indent=2, ensure_ascii=False),
+            platform=json.dumps(info["platform"], indent=2, ensure_ascii=False),
+            command=" ".join(info["command"]),
+        )
+    )
+
+
+def summary_html(summary: Summary) -> str:
+    """The tables alone, for Jupyter."""
+    return _environment().get_template("summary.html.j2").render(**_common(summary))
+
+
+def sentence(summary: Summary) -> str:
+    """What the run shows, in a few sentences that claim no more than the intervals bear."""
+    judged = [line for line in summary.arms if "success" in line.estimates and line.name != "none"]
+    shown = [line for line in judged if line.role == "world model"] or judged[-1:]
+    parts = []
+    for line in shown[:3]:
+        rate = (
+            f"With {line.name}, the agent succeeded in {line.estimates['success'].value:.1f} % of {line.done} episodes"
+        )
+        parts.append(rate + _verdict(_found(summary, line.name, "none")))
+    return " ".join(parts)
+
+
+def _verdict(difference: Difference | None) -> str:
+    if difference is None:
+        return "."
+    found = difference.estimate
+    against = f"{abs(found.value):.1f} points {'more' if found.value >= 0 else 'fewer'} than without a world model"
+    interval = f"95 % interval {signed(found.low)} to {signed(found.high)}"
+    if found.excludes_zero:
+        return f", {against} ({interval})."
+    return f", {against}; with so few episodes that may be chance ({interval})."
+
+
+def signed(value: float) -> str:
+    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
+    return f"{value:+.1f}".replace("-", "\u2212")
+
+
+def _found(summary: Summary, arm: str, base: str) -> Difference | None:
+    wanted = (arm, base, "success")
+    return next((d for d in summary.differences if (d.arm, d.base, d.metric) == wanted), None)
+
+
+def _common(summary: Summary) -> dict[str, Any]:
+    bases = dict.fromkeys(difference.base for difference in summary.differences)
+    return {
+        "summary": summary,
+        "headlines": shown_headlines(summary),
+        "notes": notes(summary),
+        "bases": {base: dict.fromkeys(d.arm for d in summary.differences if d.base == base) for base in bases},
+        "colors": plots.arm_colors([line.name for line in summary.arms]),
+        "reach": _reach(summary.differences),
+    }
+
+
+def _reach(differences: Sequence[Difference]) -> dict[str, float]:
+    """For each metric the largest end of an interval, so that all bars share a scale."""
+    reach: dict[str, float] = {}
+    for difference in differences:
+        ends = [abs(end) for end in (difference.estimate.low, difference.estimate.high) if not math.isnan(end)]
+        reach[difference.metric] = max([reach.get(difference.metric, 1e-9), *ends])
+    return reach
+
+
+def _plots(log: RunLog, summary: Summary) -> list[tuple[str, str, Markup]]:
+    """Title, explanation and drawing of each plot."""
+    done: dict[str, list[Mapping[str, Any]]] = {
+        arm: [row for row in log.episodes if row["arm"] == arm and row["status"] == "done"] for arm in log.arms
+    }
+    if not any(rows and "success" in rows[0]["metrics"] for rows in done.values()):
+        return []
+    budget = int(max(row["metrics"].get("decisions", 0) for rows in done.values() for row in rows))
+    found = [
+        (
+            "Success by arm",
+            "Bars are 95 % intervals; dashed lines mark floor (copy) and ceiling (oracle).",
+            plots.success_by_arm(summary),
+        ),
+        ("Success by distance", "Do longer ways need the world model more?", plots.success_by_distance(done)),
+    ]
+    if budget:
+        found.append(
+            ("Decisions to success", "How soon the goal is reached.", plots.decisions_to_success(done, budget))
+        )
+    return found
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("wiw.evaluation.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"column": column_title, "p": show_p, "asset": _asset, "signed": signed}
+    environment.tests["binding"] = _binding
+    return environment
+
+
+def _binding(estimate: Estimate) -> bool:
+    return estimate.excludes_zero
+
+
+def _asset(name: str) -> Markup:
+    """A style sheet or script of this package, as it is."""
+    return Markup((Path(__file__).parent / "templates" / name).read_text(encoding="utf-8"))

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plots as inline SVG that takes its text colour from the page, so that it reads on light and dark alike."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from wiw.evaluation.intervals import wilson
+from wiw.evaluation.summary import Summary
+
+INK = "#010203"
+"""Stands for the page's text colour."""
+PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
+ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b"}
+FEW = 24
+"""Below this many episodes single outcomes are shown instead of binned rates."""
+
+Outcomes = Mapping[str, Sequence[Mapping[str, Any]]]
+
+
+def arm_colors(arms: Sequence[str]) -> dict[str, str]:
+    """One colour an arm; the references always have the same."""
+    others = [arm for arm in arms if arm not in ROLE_COLORS]
+    return {**ROLE_COLORS, **{arm: PALETTE[i % len(PALETTE)] for i, arm in enumerate(others)}}
+
+
+def success_by_arm(summary: Summary) -> Markup:
+    """Success rates with their intervals; floor and ceiling as lines through the others."""
+    lines = [line for line in summary.arms if "success" in line.estimates]
+    colors = arm_colors([line.name for line in summary.arms])
+    figure, axes = _figure()
+    for y, line in enumerate(reversed(lines)):
+        found = line.estimates["success"]
+        if line.name in ("copy", "oracle"):
+            axes.axvline(found.value, color=colors[line.name], lw=1, ls=(0, (4, 3)), alpha=0.7, zorder=0)
+        axes.plot([found.low, found.high], [y, y], color=colors[line.name], lw=5, alpha=0.35, solid_capstyle="round")
+        axes.plot(found.value, y, "o", color=colors[line.name], ms=9)
+    axes.set_yticks(range(len(lines)), [line.name for line in reversed(lines)])
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    axes.set_xlim(-2, 102)
+    axes.set_xlabel("success rate, %")
+    axes.grid(axis="x", color=INK, alpha=0.08)
+    return _svg(figure, "success-by-arm")
+
+
+def success_by_distance(outcomes: Outcomes) -> Markup:
+    """How success depends on the way to go: single episodes where there are few, else rates in bins of equal counts."""
+    colors = arm_colors(list(outcomes))
+    figure, axes = _figure()
+    if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
+        _outcome_dots(axes, outcomes, colors)
+    else:
+        _binned_rates(axes, outcomes, colors)
+    axes.set_xlabel("shortest way from start to goal, m")
+    return _svg(figure, "success-by-distance")
+
+
+def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+    for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
+        for row in rows:
+            filled = colors[arm] if row["metrics"].get("success") else "none"
+            axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9)
+    axes.set_yticks(range(len(outcomes)), list(reversed(list(outcomes))))
+    axes.set_ylim(-0.6, len(outcomes) - 0.4)
+    axes.set_title("filled: reached, hollow: not", loc="right", fontsize=9, color=INK)
+
+
+def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+    lengths = np.array([row["geodesic"] for rows in outcomes.values() for row in rows])
+    edges = np.unique(np.quantile(lengths, np.linspace(0, 1, 5)))
+    for shift, (arm, rows) in enumerate(outcomes.items()):
+        ways = np.array([row["geodesic"] for row in rows])
+        reached = np.array([row["metrics"].get("success", 0.0) for row in rows])
+        which = np.clip(np.searchsorted(edges, ways, side="right") - 1, 0, len(edges) - 2)
+        points = [(i, reached[which == i]) for i in range(len(edges) - 1) if (which == i).any()]
+        offset = 0.03 * (edges[-1] - edges[0]) * (shift - (len(outcomes) - 1) / 2)
+        x = [(edges[i] + edges[i + 1]) / 2 + offset for i, _ in points]
+        y = [100 * values.mean() for _, values in points]
+        spans = [wilson(float(values.mean()), len(values)) for _, values in points]
+        bars = [
+            [value - 100 * low for value, (low, _) in zip(y, spans, strict=True)],
+            [100 * high - value for value, (_, high) in zip(y, spans, strict=True)],
+        ]
+        axes.errorbar(
+            x, y, yerr=np.clip(bars, 0, None), color=colors[arm], marker="o", ms=6, lw=1.6, elinewidth=1, label=arm
+        )
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel("success rate, %")
+    _legend(axes)
+
+
+def decisions_to_success(outcomes: Outcomes, budget: int) -> Markup:
+    """Share of episodes that have reached the goal after so many decisions."""
+    colors = arm_colors(list(outcomes))
+    figure, axes = _figure()
+    for arm, rows in outcomes.items():
+        taken = np.sort([row["metrics"]["decisions"] for row in rows if row["metrics"].get("success")])
+        share = 100 * np.arange(1, len(taken) + 1) / max(1, len(rows))
+        x, y = np.concatenate([[0], taken, [budget]]), np.concatenate([[0], share, [share[-1] if len(share) else 0]])
+        axes.step(x, y, where="post", color=colors[arm], lw=2.2, label=arm)
+    axes.set_xlim(0, budget + 0.3)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel("decisions")
+    axes.set_ylabel("reached the goal, %")
+    _legend(axes)
+    return _svg(figure, "decisions-to-success")
+
+
+def _figure() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(4.7, 3.1), layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(INK)
+    axes.spines["bottom"].set_alpha(0.3)
+    axes.tick_params(colors=INK, length=0, labelsize=10)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)
+    axes.grid(axis="y", color=INK, alpha=0.08)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _legend(axes: Axes) -> None:
+    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
+
+
+def _svg(figure: Figure, name: str) -> Markup:
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    drawing = buffer.getvalue().replace(INK, "currentColor")
+    return Markup(drawing[drawing.index("<svg") :])  # matplotlib escapes the text it draws

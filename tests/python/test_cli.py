@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from wiw.cli import main
+from wiw.cli.doctor import examine
+from wiw.evaluation.runlog import load_run
+
+FAKES = Path(__file__).with_name("fakes.py")
+TASK = f"{FAKES}:line_task"
+
+
+def run(*arguments):
+    return main(["run", TASK, "--policy", "heuristic", *map(str, arguments)])
+
+
+def test_help_teaches_by_examples(capsys):
+    for command, example in (
+        ([], "wiw demo"),
+        (["run"], "--arms none,copy,warp,oracle"),
+        (["resume"], "wiw resume runs/first"),
+        (["report"], "--out first.html"),
+        (["scenes"], "apartments:val:4"),
+        (["demo"], "oracle, the ceiling"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main([*command, "--help"])
+        assert stop.value.code == 0
+        assert example in " ".join(capsys.readouterr().out.split())
+
+
+def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):
+    with pytest.raises(SystemExit):
+        main([])
+    assert "wiw demo" in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stop:
+        main(["fly"])
+    assert stop.value.code == 2
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0 and capsys.readouterr().out.startswith("wiw ")
+
+
+def test_list_names_everything_with_a_line(capsys):
+    assert main(["list"]) == 0
+    shown = capsys.readouterr().out
+    for name in (
+        "copy",
+        "oracle",
+        "matcher",
+        "imagenav",
+        "spl",
+        "wiw.world_models",
+        "Predicts that every future frame",
+    ):
+        assert name in shown
+
+
+def test_run_prints_a_table_and_writes_a_report(tmp_path, capsys):
+    assert run("--episodes", 4, "--out", tmp_path / "run", "--seed", 3) == 0
+    shown = capsys.readouterr().out
+    assert "SR %" in shown and "none" in shown and str(tmp_path / "run" / "report.html") in shown
+    log = load_run(tmp_path / "run")
+    assert log.complete and log.store.config["seed"] == 3
+    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
+
+
+def test_report_and_resume_of_a_finished_run(tmp_path, capsys):
+    run("--episodes", 2, "--out", tmp_path / "run", "--no-report")
+    assert not (tmp_path / "run" / "report.html").exists()
+    assert main(["report", str(tmp_path / "run"), "--out", str(tmp_path / "x.html")]) == 0
+    assert (tmp_path / "x.html").exists()
+    before = list(load_run(tmp_path / "run").episodes)
+    assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
+    assert list(load_run(tmp_path / "run").episodes) == before
+
+
+def test_failed_episodes_are_said_aloud_and_can_be_retried(tmp_path, capsys):
+    assert run("--scenes", "broken", "--episodes", 3, "--out", tmp_path / "run", "--no-report") == 0
+    assert "1 episode failed for infrastructure" in capsys.readouterr().err
+    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 0
+    assert "no such scene" in capsys.readouterr().err
+
+
+def test_errors_are_one_clean_line(tmp_path, capsys):
+    assert run("--world-model", "wrap", "--out", tmp_path / "a") == 2
+    message = capsys.readouterr().err
+    assert message.startswith("wiw: ") and "Did you mean warp" in message and "Traceback" not in message
+    assert main(["report", str(tmp_path / "nowhere")]) == 2
+    assert "no run at" in capsys.readouterr().err
+    run("--episodes", 1, "--out", tmp_path / "b", "--no-report")
+    assert run("--episodes", 1, "--out", tmp_path / "b") == 2
+    assert "wiw resume" in capsys.readouterr().err
+
+
+def test_debug_shows_the_traceback(tmp_path):
+    with pytest.raises(Exception, match="no run at"):
+        main(["report", str(tmp_path), "--debug"])
+
+
+def start(*arguments):
+    paths = os.pathsep.join(sys.path)
+    command = [sys.executable, "-m", "wiw.cli", "run", TASK, "--policy", "heuristic", *map(str, arguments)]
+    return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
+def test_a_stopped_run_says_how_to_go_on(tmp_path, sent, code):
+    out = tmp_path / "run"
+    process = start("--scenes", "slow", "--episodes", 30, "--live", 1, "--out", out, "--workers", 2)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (out.exists() and ended(out)):
+        time.sleep(0.05)
+    process.send_signal(sent)
+    _, shown = process.communicate(timeout=20)
+    assert process.returncode == code, shown
+    assert f"wiw resume {out}" in shown and "Traceback" not in shown
+    assert 0 < len(load_run(out).episodes) < 30
+    assert main(["resume", str(out), "--no-report", "--workers", "2"]) == 0
+    assert load_run(out).complete
+
+
+def ended(out):
+    try:
+        return len(load_run(out).episodes) > 2
+    except Exception:
+        return False
+
+
+def test_doctor_names_what_matters(capsys):
+    assert main(["doctor"]) == 0
+    shown = capsys.readouterr().out
+    for name in ("python", "processor", "threads", "instructions", "memory", "torch", "runs folder"):
+        assert name in shown
+    assert "torch" not in sys.modules
+
+
+def test_doctor_warns_with_a_remedy(monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    findings = {finding.name: finding for finding in examine()}
+    assert "not writable" in findings["runs folder"].remedy and findings["wiw"].remedy == ""
+
+
+def test_scenes_draws_a_sheet(tmp_path, capsys):
+    pytest.importorskip("PIL")
+    from PIL import Image
+
+    mesh = tmp_path / "room.obj"
+    mesh.write_text(ROOM)
+    assert main(["scenes", str(mesh), "--out", str(tmp_path / "sheet.png"), "--views", "1"]) == 0
+    assert "room.obj" in capsys.readouterr().out
+    assert Image.open(tmp_path / "sheet.png").width > 500
+
+
+ROOM = """v -2 0 -2
+v 2 0 -2
+v 2 0 2
+v -2 0 2
+v -2 2 -2
+v 2 2 -2
+f 1 4 3 2
+f 1 2 6 5
+"""
