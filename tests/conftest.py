@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,14 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
     "chest": ("red", (1.4, 0, -1.9), (2.2, 0.6, -1.5)),
     "picture": ("blue", (-3.99, 1.0, 0.2), (-3.97, 1.6, 1.0)),
 }
+
+
+@pytest.fixture(scope="session", autouse=True)
+def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Imported scenes are kept in a folder of the test run, not in the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("WIW_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@
 
 #include "arrays.hpp"
 #include "scene_builder.hpp"
+#include "wiw/scene/cache.hpp"
 #include "wiw/scene/describe.hpp"
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/measure.hpp"
@@ -183,4 +184,14 @@ void bind_scene(py::module_& module) {
              py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
              py::arg("model_folders") = Paths{},
              "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
+  module.attr("IMPORTER_VERSION") = wiw::importer_version();
+  module.def("write_cache", &wiw::write_scene_cache, py::arg("scene"), py::arg("path"),
+             py::call_guard<py::gil_scoped_release>(),
+             "Writes a scene to a cache file, which appears whole or not at all.");
+  module.def(
+      "map_cache",
+      [](const std::filesystem::path& path) { return std::const_pointer_cast<Scene>(wiw::map_scene_cache(path)); },
+      py::arg("path"), py::call_guard<py::gil_scoped_release>(),
+      "Maps a cache file: a scene whose arrays lie in the file. Raises FileError if it is damaged or of another "
+      "version.");
 }

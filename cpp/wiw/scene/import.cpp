@@ -4,10 +4,12 @@
 #include <assimp/config.h>
 #include <assimp/postprocess.h>
 #include <assimp/scene.h>
+#include <assimp/version.h>
 
 #include <assimp/Importer.hpp>
 
 #include "wiw/core/error.hpp"
+#include "wiw/scene/cache.hpp"
 #include "wiw/scene/import/assimp_scene.hpp"
 #include "wiw/scene/import/ceiling.hpp"
 #include "wiw/scene/import/collada_check.hpp"
@@ -18,6 +20,8 @@
 
 namespace wiw {
 namespace {
+
+constexpr int kImporterVersion = 1;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {
@@ -68,6 +72,12 @@ void check_content(const FileContext& context, Scene& scene) {
 }
 
 }  // namespace
+
+std::string importer_version() {
+  return std::to_string(kImporterVersion) + ", cache " + std::to_string(kSceneCacheVersion) + ", assimp " +
+         std::to_string(aiGetVersionMajor()) + "." + std::to_string(aiGetVersionMinor()) + "." +
+         std::to_string(aiGetVersionPatch());
+}
 
 ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& options) {
   const MeshFormat format = mesh_format_of(path);

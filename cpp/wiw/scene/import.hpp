@@ -11,6 +11,10 @@
 
 namespace wiw {
 
+/// Names the importer's behaviour: this code's version, the cache layout's and assimp's. Scenes imported under another
+/// name are imported again.
+std::string importer_version();
+
 /// Which axis of the file points up. `kAuto` decides by the file, see `up_axis_of`.
 enum class Up { kAuto, kY, kZ };
 

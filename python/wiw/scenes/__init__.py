@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes: meshes and Gazebo worlds from files.
+
+World frame: metres, Y up, right-handed. See `Scene` for what a scene tells about itself.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from wiw import _core
+from wiw.errors import ArgumentError, FileError
+from wiw.scenes import isolated, store
+
+Scene = _core.scene.Scene
+
+__all__ = ["Scene", "apartment", "load", "open_scene", "resolve"]
+
+_log = logging.getLogger("wiw.scenes")
+
+
+def load(
+    path: str | PathLike[str],
+    up: str | None = None,
+    ceiling: float | None = None,
+    cache: bool = True,
+    *,
+    isolate: bool = True,
+    limits: dict[str, int] | None = None,
+    texture_folders: Sequence[str | PathLike[str]] = (),
+    model_folders: Sequence[str | PathLike[str]] = (),
+) -> Scene:
+    """Reads a GLB, glTF, OBJ, PLY or DAE mesh, or a Gazebo `.world` or `.sdf` file.
+
+    Args:
+        path: the file; `~` is understood.
+        up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for names in HM3D's layout). The
+            rule that was used is `scene.attributes["up"]`.
+        ceiling: closes a scene that is open above, in metres above its floor.
+        cache: keep the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`) and map it the next time.
+        isolate: import in a process of its own, so that a file that crashes the reader raises FileError here.
+        limits: raises or lowers the import limits: file_bytes, triangles, nodes, texture_pixels, texture_bytes.
+        texture_folders: searched for textures by base name, after the places beside the file.
+        model_folders: searched for `model://` of a world, before the places beside the file.
+
+    What had to be left out, such as a texture that is missing, is logged and listed in `scene.warnings`.
+
+    Raises:
+        FileError: naming file and cause: missing, damaged, unsupported or above the limits.
+        ArgumentError: an option is out of its range.
+    """
+    file = Path(path).expanduser()
+    if not file.is_file():
+        raise FileError(f"{file}: no such file; expected a mesh or a Gazebo world")
+    options = {
+        "up": up,
+        "ceiling": ceiling,
+        "limits": limits or {},
+        "texture_folders": [str(Path(folder).expanduser()) for folder in texture_folders],
+        "model_folders": [str(Path(folder).expanduser()) for folder in model_folders],
+    }
+    scene = _load(file, options, cache, isolate)
+    for warning in scene.warnings:
+        _log.warning("%s: %s", scene.name, warning)
+    return scene
+
+
+def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Scene:
+    def build(out: Path) -> store.Sources:
+        if isolate:
+            return isolated.import_to(file, options, out)
+        scene, read, absent = _core.scene.import_scene(file, **options)
+        _core.scene.write_cache(scene, out)
+        return store.Sources(tuple(read), tuple(absent))
+
+    if cache:
+        return store.imported(file, options, build)
+    if not isolate:
+        return _core.scene.import_scene(file, **options)[0]
+    with TemporaryDirectory(prefix="wiw-scene-") as folder:
+        build(Path(folder) / "scene")
+        return _core.scene.map_cache(Path(folder) / "scene")  # the mapping outlives the file
+
+
+def apartment(seed: int, split: str = "val") -> Scene:
+    """A furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
+
+    `split` is "train", "val" or "test". Raises ArgumentError for any other.
+    """
+    return _core.scene.apartment(seed, split)
+
+
+SPLIT_SIZE = 1000
+"""Apartments that a spec without a number stands for."""
+
+
+def resolve(spec: str) -> list[str]:
+    """The single scenes that a scene spec names, in order, none of them loaded.
+
+    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, each named
+    "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
+
+    Raises:
+        ArgumentError: the split or the count is not one.
+        FileError: there is no such file.
+    """
+    if not spec.startswith("apartments"):
+        if not Path(spec).expanduser().is_file():
+            raise FileError(
+                f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]"
+            )
+        return [spec]
+    match = re.fullmatch(r"apartments:(train|val|test)(?::([1-9][0-9]*)|/([0-9]+))?", spec)
+    if match is None:
+        raise ArgumentError(
+            f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40 or apartments:val/7"
+        )
+    split, count, index = match.groups()
+    if index is not None:
+        return [spec]
+    return [f"apartments:{split}/{i}" for i in range(int(count or SPLIT_SIZE))]
+
+
+def open_scene(name: str) -> Scene:
+    """Loads one scene of `resolve`."""
+    if name.startswith("apartments:"):
+        split, _, index = name.removeprefix("apartments:").partition("/")
+        return apartment(int(index), split)
+    return load(name)
