@@ -2,8 +2,9 @@
 """Platform time of one decision: everything but the world model, the policy's own computation and rendering.
 
 Eight candidates of fourteen imagined panoramas (576x1024), one 384x384 view each, from a mock model that hands out
-frames made beforehand. The peers do the same in Python with a look-up cached as well as they allow, one candidate after
-another: roll the real panorama for leading turns, cut a view out of every frame, pick the best.
+frames made beforehand: once by the planner's calls alone, once as `wiw.Agent.decide`, with all Python in between. The
+peers do the same in Python with a look-up cached as well as they allow, one candidate after another: roll the real
+panorama for leading turns, cut a view out of every frame, pick the best.
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from __future__ import annotations
 import numpy as np
 from harness import measure, optional, report, spread
 
+import wiw
 from wiw._core import planner
+from wiw.types import Goal, Key, Observation, Proposal
 
 PANORAMA = (576, 1024)
 VIEW = (384, 384)
@@ -59,6 +62,28 @@ class Decision:
         return views[best[0]]
 
 
+def whole_decision(decision: Decision):
+    """The same through the agent, with a policy and a model that cost nothing."""
+
+    class Fixed(wiw.Policy):
+        def propose(self, situations, candidates, horizon):
+            return [[Proposal(plan) for plan in decision.plans] for _ in situations]
+
+        def score(self, situations, proposals, rollouts):
+            return list(decision.scores)
+
+    class Mock(wiw.WorldModel):
+        accepts = wiw.accepts(control="action", causal=decision.spec.causal)
+
+        def rollout(self, observations, controls, seeds):
+            return next(frames for frames in decision.rollouts if frames.shape[1] == len(controls[0].actions) + 1)
+
+    agent = wiw.Agent(Fixed(), Mock(), candidates=CANDIDATES, horizon=STEPS)
+    front = np.zeros((480, 480, 3), np.uint8)
+    observation = Observation(decision.panoramas[0], front, np.zeros(3))
+    return lambda: agent.decide(observation, Goal("imagenav", image=front), Key(seed=0, episode=0))
+
+
 def one_by_one(decision: Decision, cut):
     """The same decision in plain Python: every candidate has its own rollout of all its steps."""
     frames = decision.rollouts[0].reshape(-1, *PANORAMA, 3)
@@ -89,16 +114,18 @@ def remap_cut(cv2):
 def compare(title: str, decision: Decision) -> None:
     cv2, py360convert = optional("cv2"), optional("py360convert")
     cases = {
-        "wiw": decision,
+        "planner alone": decision,
+        "wiw.Agent.decide": whole_decision(decision),
         "cv2.remap, cached maps": one_by_one(decision, remap_cut(cv2)) if cv2 else None,
         "py360convert.e2p": one_by_one(decision, lambda frame: py360convert.e2p(frame, 90, 0, 0, VIEW))
         if py360convert
         else None,
     }
     timings = measure(cases, repeats=15)
-    report(title, cases, timings, "wiw", f"p50 at most {TARGET_MS:g} ms")
-    verdict = "met" if np.median(timings["wiw"].wall) * 1e3 <= TARGET_MS else "MISSED"
-    print(f"  platform time per decision: {spread(1e3 * timings['wiw'].wall)} ms, target {verdict}")
+    ours = timings["wiw.Agent.decide"]
+    report(title, cases, timings, "wiw.Agent.decide", f"p50 at most {TARGET_MS:g} ms")
+    verdict = "met" if np.median(ours.wall) * 1e3 <= TARGET_MS else "MISSED"
+    print(f"  platform time per decision: {spread(1e3 * ours.wall)} ms, target {verdict}")
 
 
 def main() -> None:

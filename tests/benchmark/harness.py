@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import random
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -58,7 +59,8 @@ def spread(values: Sequence[float] | np.ndarray, digits: int = 2) -> str:
 def report(title: str, cases: Mapping[str, Any], timings: Mapping[str, Timing], ours: str, target: str = "") -> None:
     """Prints milliseconds of each case and how many times longer than `ours` it took, round by round."""
     width = max(map(len, cases)) + 2
-    print(f"\n{title}" + (f"   (target: {target})" if target else ""))
+    busy = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+    print(f"\n{title}   ({busy}{f'; target: {target}' if target else ''})")
     print(f"  {'':{width}}{'CPU ms':>26}{'wall ms':>26}{'x ours (CPU)':>24}{'x ours (wall)':>24}")
     for name in cases:
         if name not in timings:
