@@ -175,11 +175,13 @@ def policy(name: Any, **options: Any) -> Any:
     return POLICIES.make(name, **options)
 
 
-def make(task_id: str, **options: Any) -> Any:
+def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     """A gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
+
+    Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it.
 
     Raises:
         RegistryError: unknown task, or options that do not fit; the message says what is known.
     """
     name = task_id.removesuffix("-v0").lower()
-    return TASKS.make(name, **options).environment()
+    return TASKS.make(name, **options).environment(depth=depth)
