@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 ARMS = ("none", "copy", "warp", "oracle")
-SCENES, PER_SCENE = 3, 2
+SCENES, PER_SCENE = 2, 2
 
 
 def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:

@@ -55,7 +55,7 @@ def _differences(summary: Summary, base: str) -> Table:
     for headline in shown_headlines(summary):
         table.add_column(column_title(headline), justify="right", no_wrap=True)
     table.add_column("W/L", justify="right", no_wrap=True)
-    table.add_column("p", justify="right", no_wrap=True)
+    table.add_column("p", justify="right", no_wrap=True, min_width=5)
     for arm in dict.fromkeys(d.arm for d in summary.differences if d.base == base):
         found = [summary.difference(arm, base, headline.metric) for headline in shown_headlines(summary)]
         score = f"{found[0].wins}/{found[0].losses}"
