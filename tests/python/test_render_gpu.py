@@ -246,3 +246,9 @@ print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
 """
     )
     assert run_python(code) == "0"
+
+
+def test_auto_takes_the_ray_caster_unless_there_is_hardware():
+    hardware = any(not device["software"] for device in usable_devices())
+    description = run_python(ONE_TRIANGLE + "print(Renderer(scene).description)", WIW_EGL_DEVICE="")
+    assert description.startswith("gpu" if hardware else "cpu")

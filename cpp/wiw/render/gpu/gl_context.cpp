@@ -24,8 +24,7 @@ constexpr const char* kForked =
     "workers with multiprocessing's \"spawn\" method, or use backend=\"cpu\"";
 
 void require_owner() {
-  const int process = owner.load();
-  if (process != 0 && process != getpid()) throw BackendError(kForked);
+  if (GlContext::lost_to_fork()) throw BackendError(kForked);
 }
 
 EGLDisplay open_display(const EglLibrary& egl, const EglDevice& device) {
@@ -79,6 +78,11 @@ std::shared_ptr<GlContext> create_best() {
 }
 
 }  // namespace
+
+bool GlContext::lost_to_fork() {
+  const int process = owner.load();
+  return process != 0 && process != getpid();
+}
 
 std::shared_ptr<GlContext> GlContext::shared() {
   static std::mutex mutex;

@@ -31,6 +31,9 @@ class GlContext {
   /// context is replaced. Throws BackendError with the remedy, also in a child forked after the context was created.
   static std::shared_ptr<GlContext> shared();
 
+  /// Whether this process was forked after its parent had opened the shared context.
+  static bool lost_to_fork();
+
   GlContext(const EglLibrary& egl, const EglDevice& device);
   ~GlContext();
   GlContext(const GlContext&) = delete;

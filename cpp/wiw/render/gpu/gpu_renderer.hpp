@@ -12,8 +12,8 @@ namespace wiw {
 /// OpenGL back end on the process's EGL device. Throws BackendError with the remedy when there is none.
 std::shared_ptr<Renderer> make_gpu_renderer(ScenePtr scene, const RenderOptions& options);
 
-/// Whether an EGL device that is no software rasteriser gives a context here. Never throws; opens a context only on
-/// devices that may be hardware.
+/// Whether an EGL device that is no software rasteriser gives a context here; opens one only on devices that may be
+/// hardware. Throws BackendError if WIW_EGL_DEVICE names a device that does not exist.
 bool has_gpu_hardware();
 
 /// One EGL device as `wiw doctor` lists it. Where it gives no OpenGL context, `error` says why and the texts are empty.

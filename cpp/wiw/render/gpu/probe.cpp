@@ -8,14 +8,21 @@
 namespace wiw {
 
 bool has_gpu_hardware() {
+  const gpu::EglLibrary* egl = nullptr;
   try {
-    const auto devices = gpu::candidate_devices(gpu::egl_library());
-    const auto may_be_hardware = [](const gpu::EglDevice& device) { return !device.marked_software; };
-    // The surfaceless platform of a machine without hardware devices is Mesa's software rasteriser.
-    if (std::ranges::none_of(devices,
-                             [&](const auto& device) { return may_be_hardware(device) && device.index >= 0; })) {
-      return false;
-    }
+    egl = &gpu::egl_library();
+  } catch (const BackendError&) {
+    return false;
+  }
+  if (gpu::list_devices(*egl).empty()) return false;
+  const auto devices = gpu::candidate_devices(*egl);
+  // The surfaceless platform of a machine without hardware devices is Mesa's software rasteriser.
+  const auto may_be_hardware = [](const gpu::EglDevice& device) {
+    return device.index >= 0 && !device.marked_software;
+  };
+  if (std::ranges::none_of(devices, may_be_hardware)) return false;
+  if (gpu::GlContext::lost_to_fork()) return true;  // making a renderer then says what to do
+  try {
     return !gpu::GlContext::shared()->info().software;
   } catch (const BackendError&) {
     return false;
