@@ -45,6 +45,7 @@ namespace wiw::gpu {
   X(GenSamplers, PFNGLGENSAMPLERSPROC)                         \
   X(GenTextures, PFNGLGENTEXTURESPROC)                         \
   X(GenVertexArrays, PFNGLGENVERTEXARRAYSPROC)                 \
+  X(GetBufferSubData, PFNGLGETBUFFERSUBDATAPROC)               \
   X(GetError, PFNGLGETERRORPROC)                               \
   X(GetIntegerv, PFNGLGETINTEGERVPROC)                         \
   X(GetProgramInfoLog, PFNGLGETPROGRAMINFOLOGPROC)             \

@@ -33,7 +33,7 @@ class GlObject {
 };
 
 /// GL passes a position inside the bound buffer as a pointer.
-inline const void* buffer_offset(std::size_t bytes) { return std::bit_cast<const void*>(bytes); }
+inline void* buffer_offset(std::size_t bytes) { return std::bit_cast<void*>(bytes); }
 
 using GlBuffer = GlObject<&Gl::GenBuffers, &Gl::DeleteBuffers>;
 using GlTexture = GlObject<&Gl::GenTextures, &Gl::DeleteTextures>;

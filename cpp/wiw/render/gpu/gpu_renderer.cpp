@@ -203,7 +203,8 @@ class GpuRenderer final : public Renderer {
     memory_->views.upload(views, GL_STREAM_DRAW);
     const int side = face_size(camera.size, samples_);
     const ProgramKey face_outputs = outputs | kIdOut | kCubeFace;
-    auto& [batch, faces, samples] = context_->workspace();
+    Framebuffer& batch = context_->workspace().batch;
+    Framebuffer& faces = context_->workspace().faces;
     batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, false);
     faces.reserve({side, side}, kFaces, face_outputs, true);
     for (std::size_t i = 0; i < poses.size(); ++i) {
@@ -297,19 +298,47 @@ class GpuRenderer final : public Renderer {
     gl_->Uniform3fv(context_->programs().uniform(program, "horizon"), 1, scene_->sky.horizon.data());
   }
 
+  /// Packs all views of a batch into one buffer of the driver's first, so that the device is waited for once.
   void read_back(Size size, std::size_t count, std::size_t first, const RenderTargets& targets) {
-    Framebuffer& batch = context_->workspace().batch;
-    const auto read = [&](std::size_t target, GLenum format, GLenum type, void* pixels) {
-      gl_->ReadBuffer(GL_COLOR_ATTACHMENT0 + static_cast<GLenum>(target));
-      gl_->ReadPixels(0, 0, size.width, size.height, format, type, pixels);
+    struct Output {
+      std::size_t target;
+      GLenum format;
+      GLenum type;
+      std::size_t view_bytes;
+      void* to;
     };
+    const std::size_t pixels = size.pixels();
+    std::vector<Output> outputs;
+    const auto want = [&](auto* to, std::size_t channels, std::size_t target, GLenum format, GLenum type) {
+      if (to == nullptr) return;
+      outputs.push_back({target, format, type, channels * sizeof(*to) * pixels, to + channels * first * pixels});
+    };
+    want(targets.depth, 1, kDepthTarget, GL_RED, GL_FLOAT);
+    want(targets.instance, 1, kIdTarget, GL_RED_INTEGER, GL_UNSIGNED_INT);
+    want(targets.color, 3, kColorTarget, GL_RGB, GL_UNSIGNED_BYTE);
+    std::size_t total = 0;
+    for (const Output& output : outputs) total += count * output.view_bytes;
+
+    gl_->BindBuffer(GL_PIXEL_PACK_BUFFER, context_->workspace().packed.id());
+    gl_->BufferData(GL_PIXEL_PACK_BUFFER, static_cast<GLsizeiptr>(total), nullptr, GL_STREAM_READ);
     for (std::size_t i = 0; i < count; ++i) {
-      const std::size_t skipped = (first + i) * size.pixels();
-      batch.bind(static_cast<int>(i), outputs_of(targets), false);
-      if (targets.color != nullptr) read(kColorTarget, GL_RGB, GL_UNSIGNED_BYTE, targets.color + 3 * skipped);
-      if (targets.depth != nullptr) read(kDepthTarget, GL_RED, GL_FLOAT, targets.depth + skipped);
-      if (targets.instance != nullptr) read(kIdTarget, GL_RED_INTEGER, GL_UNSIGNED_INT, targets.instance + skipped);
+      context_->workspace().batch.bind(static_cast<int>(i), outputs_of(targets), false);
+      std::size_t start = 0;
+      for (const Output& output : outputs) {
+        gl_->ReadBuffer(GL_COLOR_ATTACHMENT0 + static_cast<GLenum>(output.target));
+        gl_->ReadPixels(0, 0, size.width, size.height, output.format, output.type,
+                        buffer_offset(start + i * output.view_bytes));
+        start += count * output.view_bytes;
+      }
     }
+    std::size_t start = 0;
+    for (const Output& output : outputs) {
+      const std::size_t bytes = count * output.view_bytes;
+      gl_->GetBufferSubData(GL_PIXEL_PACK_BUFFER, static_cast<GLintptr>(start), static_cast<GLsizeiptr>(bytes),
+                            output.to);
+      start += bytes;
+    }
+    gl_->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
   }
 
   ScenePtr scene_;

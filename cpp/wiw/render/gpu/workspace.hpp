@@ -7,11 +7,12 @@ namespace wiw::gpu {
 
 /// Targets of a render call: the views of a batch, the faces of one panorama, the samples of one view.
 struct Workspace {
-  explicit Workspace(const Gl& gl) : batch(gl), faces(gl), samples(gl) {}
+  explicit Workspace(const Gl& gl) : batch(gl), faces(gl), samples(gl), packed(gl) {}
 
   Framebuffer batch;
   Framebuffer faces;
   Framebuffer samples;
+  GlBuffer packed;  // what is read back
 };
 
 }  // namespace wiw::gpu
