@@ -39,10 +39,26 @@ inline Ints look_up(const std::int32_t* table, Ints index) {
   return (Ints)_mm512_permutexvar_epi32((__m512i)index, _mm512_loadu_si512(table));
 }
 
+/// The texel pairs of lanes a and b. Separate loads beat gather instructions, which are microcode on many processors.
+inline __m128i two_pairs(const std::uint32_t* texels, std::int32_t a, std::int32_t b) {
+  const __m128d low = _mm_load_sd(reinterpret_cast<const double*>(texels + a));
+  return _mm_castpd_si128(_mm_loadh_pd(low, reinterpret_cast<const double*>(texels + b)));
+}
+
+inline __m512i eight_pairs(const std::uint32_t* texels, const std::int32_t* index) {
+  __m512i pairs = _mm512_castsi128_si512(two_pairs(texels, index[0], index[1]));
+  pairs = _mm512_inserti64x2(pairs, two_pairs(texels, index[2], index[3]), 1);
+  __m256i high = _mm256_castsi128_si256(two_pairs(texels, index[4], index[5]));
+  high = _mm256_inserti128_si256(high, two_pairs(texels, index[6], index[7]), 1);
+  return _mm512_inserti64x4(pairs, high, 1);
+}
+
 /// Texels `index` and `index + 1` of every lane.
 inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints& right) {
-  const __m512i low = _mm512_i32gather_epi64(_mm512_castsi512_si256((__m512i)index), texels, 4);
-  const __m512i high = _mm512_i32gather_epi64(_mm512_extracti64x4_epi64((__m512i)index, 1), texels, 4);
+  alignas(64) std::int32_t indices[kLanes];
+  _mm512_store_si512(indices, (__m512i)index);
+  const __m512i low = eight_pairs(texels, indices);
+  const __m512i high = eight_pairs(texels, indices + 8);
   const __m512i even = _mm512_setr_epi32(0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30);
   const __m512i odd = _mm512_setr_epi32(1, 3, 5, 7, 9, 11, 13, 15, 17, 19, 21, 23, 25, 27, 29, 31);
   left = (Ints)_mm512_permutex2var_epi32(low, even, high);
