@@ -106,15 +106,15 @@ def _room_shell(mesh: _Mesh, x0: float, z0: float) -> None:
 def _furnish(mesh: _Mesh, x0: float, z0: float) -> None:
     rng = mesh.rng
     for _ in range(6):  # tables, beds, shelves: a top, legs, things on top
-        center = np.array([x0, 0, z0]) + [rng.uniform(0.6, 3.4), 0, rng.uniform(0.6, 3.4)]
+        center = np.array([x0 + rng.uniform(0.6, 3.4), 0, z0 + rng.uniform(0.6, 3.4)])
         size = np.array([rng.uniform(0.5, 1.3), rng.uniform(0.35, 1.1), rng.uniform(0.4, 0.9)])
-        mesh.box(center + [0, size[1], 0], np.array([size[0], 0.05, size[2]]))
+        mesh.box(center + size * [0, 1, 0], np.array([size[0], 0.05, size[2]]))
         for sx in (-0.45, 0.45):
             for sz in (-0.45, 0.45):
-                mesh.box(center + [sx * size[0], size[1] / 2, sz * size[2]], np.array([0.05, size[1], 0.05]))
+                mesh.box(center + size * [sx, 0.5, sz], np.array([0.05, size[1], 0.05]))
         mesh.finish_object()
         for _ in range(4):
-            base = center + [rng.uniform(-0.4, 0.4) * size[0], size[1] + 0.025, rng.uniform(-0.4, 0.4) * size[2]]
+            base = center + size * [rng.uniform(-0.4, 0.4), 1 + 0.025 / size[1], rng.uniform(-0.4, 0.4)]
             heights = np.linspace(0, rng.uniform(0.1, 0.35), 6)
             mesh.turned(base, np.stack([rng.uniform(0.02, 0.09, 6), heights], -1))
             mesh.finish_object()
@@ -158,7 +158,11 @@ def _views(rng: np.random.Generator, count: int = 8) -> NDArray[np.float64]:
     for pose in poses:
         room = rng.integers(0, [ROOMS_X - 1, ROOMS_Z - 1])
         yaw = rng.uniform(0, 2 * np.pi)
-        pose[:3, 3] = [ROOM * room[0] + 2.0 + rng.uniform(-0.3, 0.3), 1.0, ROOM * (room[1] + 1) + rng.uniform(-0.3, 0.3)]
+        pose[:3, 3] = [
+            ROOM * room[0] + 2.0 + rng.uniform(-0.3, 0.3),
+            1.0,
+            ROOM * (room[1] + 1) + rng.uniform(-0.3, 0.3),
+        ]
         pose[:3, :3] = [[np.cos(yaw), 0, np.sin(yaw)], [0, 1, 0], [-np.sin(yaw), 0, np.cos(yaw)]]
     return poses
 

@@ -40,16 +40,21 @@ inline Ints look_up(const std::int32_t* table, Ints index) {
   return (Ints)look_up(reinterpret_cast<const float*>(table), index);
 }
 
+/// The texel pairs of lanes a and b. Separate loads beat gather instructions, which are microcode on many processors.
+inline __m128i two_pairs(const std::uint32_t* texels, std::int32_t a, std::int32_t b) {
+  const __m128d low = _mm_load_sd(reinterpret_cast<const double*>(texels + a));
+  return _mm_castpd_si128(_mm_loadh_pd(low, reinterpret_cast<const double*>(texels + b)));
+}
+
 /// Texels `index` and `index + 1` of every lane.
 inline void load_pairs(const std::uint32_t* texels, Ints index, Ints& left, Ints& right) {
-  const auto* base = reinterpret_cast<const long long*>(texels);
-  const __m256i even_odd = _mm256_setr_epi32(0, 2, 4, 6, 1, 3, 5, 7);
-  const __m256i low = _mm256_i32gather_epi64(base, _mm256_castsi256_si128((__m256i)index), 4);
-  const __m256i high = _mm256_i32gather_epi64(base, _mm256_extracti128_si256((__m256i)index, 1), 4);
-  const __m256i a = _mm256_permutevar8x32_epi32(low, even_odd);  // 4 left texels, 4 right texels
-  const __m256i b = _mm256_permutevar8x32_epi32(high, even_odd);
-  left = (Ints)_mm256_permute2x128_si256(a, b, 0x20);
-  right = (Ints)_mm256_permute2x128_si256(a, b, 0x31);
+  // Lanes 0 1 4 5 and 2 3 6 7, so that the shuffles within halves put every lane in its place.
+  const __m256 a = _mm256_castsi256_ps(
+      _mm256_set_m128i(two_pairs(texels, index[4], index[5]), two_pairs(texels, index[0], index[1])));
+  const __m256 b = _mm256_castsi256_ps(
+      _mm256_set_m128i(two_pairs(texels, index[6], index[7]), two_pairs(texels, index[2], index[3])));
+  left = (Ints)_mm256_shuffle_ps(a, b, 0x88);
+  right = (Ints)_mm256_shuffle_ps(a, b, 0xDD);
 }
 
 /// Transposes eight rows of eight in place.

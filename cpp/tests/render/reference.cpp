@@ -1,0 +1,199 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "render/reference.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "wiw/render/shading.hpp"
+
+namespace wiw::testing {
+
+namespace {
+
+using Vector = Eigen::Vector3d;
+
+template <class T, int N>
+Eigen::Matrix<double, N, 1> blend(const Buffer<Eigen::Matrix<T, N, 1>>& values, const Mesh& mesh, std::size_t triangle,
+                                  double b1, double b2) {
+  const auto& corner = mesh.triangles[triangle];
+  return (1 - b1 - b2) * values[corner[0]].template cast<double>() + b1 * values[corner[1]].template cast<double>() +
+         b2 * values[corner[2]].template cast<double>();
+}
+
+bool meets(const Eigen::AlignedBox3d& box, const Vector& origin, const Vector& ray) {
+  const Eigen::Array3d to_min = (box.min() - origin).array() / ray.array();
+  const Eigen::Array3d to_max = (box.max() - origin).array() / ray.array();
+  return to_min.min(to_max).maxCoeff() <= to_min.max(to_max).minCoeff();
+}
+
+int wrap(int i, int size, bool repeat) { return repeat ? ((i % size) + size) % size : std::clamp(i, 0, size - 1); }
+
+}  // namespace
+
+Reference::Reference(const Scene& scene) : scene_(scene) {
+  for (const Texture& texture : scene.textures) mips_.push_back(build_mips(texture));
+  for (const Instance& instance : scene.instances) {
+    Eigen::AlignedBox3d box;
+    for (const std::uint32_t mesh : instance.meshes) {
+      for (const auto& position : scene.meshes[mesh].positions) {
+        box.extend((instance.T_world_instance * position).cast<double>());
+      }
+    }
+    box.extend(box.min() - Vector::Constant(0.01));
+    box.extend(box.max() + Vector::Constant(0.01));
+    bounds_.push_back(box);
+  }
+}
+
+std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vector& ray, double slack) const {
+  std::vector<Hit> hits;
+  for (const Instance& instance : scene_.instances) {
+    if (!meets(bounds_[instance.id - 1], origin, ray)) continue;
+    for (const std::uint32_t index : instance.meshes) {
+      const Mesh& mesh = scene_.meshes[index];
+      for (std::size_t i = 0; i < mesh.triangles.size(); ++i) {
+        const auto corner = [&](int k) -> Vector {
+          return (instance.T_world_instance * mesh.positions[mesh.triangles[i][k]]).cast<double>();
+        };
+        const Vector first = corner(0);
+        Eigen::Matrix3d system;  // first + b1 e1 + b2 e2 = origin + t ray
+        system << corner(1) - first, corner(2) - first, -ray;
+        if (std::abs(system.determinant()) < 1e-12) continue;
+        const Vector solution = system.inverse() * (origin - first);
+        const double least = std::min({solution[0], solution[1], 1 - solution[0] - solution[1]});
+        if (least < -slack || solution[2] < shading::kNearClip) continue;
+        hits.push_back({&mesh, &instance, i, solution[2], solution[0], solution[1], system.col(0), system.col(1)});
+      }
+    }
+  }
+  std::ranges::sort(hits, {}, &Hit::t);
+  return hits;
+}
+
+Eigen::Vector4d Reference::bilinear(std::int32_t number, int level, const Eigen::Vector2d& uv, bool repeat) const {
+  const auto index = static_cast<std::size_t>(number);
+  const Texture& texture = scene_.textures[index];
+  const Size size = level == 0 ? texture.size : mips_[index][static_cast<std::size_t>(level) - 1].size;
+  const std::uint8_t* texels =
+      level == 0 ? texture.rgba.data() : mips_[index][static_cast<std::size_t>(level) - 1].rgba.data();
+  const Eigen::Vector2d inside = repeat ? uv - uv.array().floor().matrix() : uv.cwiseMax(0.0).cwiseMin(1.0).eval();
+  const double x = inside.x() * size.width - 0.5;
+  const double y = inside.y() * size.height - 0.5;
+  const double x0 = std::floor(x);
+  const double y0 = std::floor(y);
+  Eigen::Vector4d sum = Eigen::Vector4d::Zero();
+  for (const int dy : {0, 1}) {
+    for (const int dx : {0, 1}) {
+      const int row = wrap(static_cast<int>(y0) + dy, size.height, repeat);
+      const int column = wrap(static_cast<int>(x0) + dx, size.width, repeat);
+      const double weight = (dx ? x - x0 : 1 - x + x0) * (dy ? y - y0 : 1 - y + y0);
+      for (int c = 0; c < 4; ++c) sum[c] += weight * texels[4 * (row * size.width + column) + c] / 255.0;
+    }
+  }
+  return sum;
+}
+
+bool Reference::is_hole(const Hit& hit, bool& doubtful) const {
+  if (hit.mesh->material == kNone) return false;
+  const Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
+  if (material.alpha_cutoff < 0) return false;
+  double alpha = material.base_color[3];
+  if (material.texture != kNone && !hit.mesh->uv.empty()) {
+    alpha *= bilinear(material.texture, 0, blend(hit.mesh->uv, *hit.mesh, hit.triangle, hit.b1, hit.b2), true)[3];
+  }
+  doubtful = doubtful || std::abs(alpha - material.alpha_cutoff) < 1e-3;
+  return alpha < material.alpha_cutoff;
+}
+
+double Reference::level(const Hit& hit, const Vector& ray, double spread) const {
+  const Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
+  const Size size = scene_.textures[static_cast<std::size_t>(material.texture)].size;
+  const auto& corner = hit.mesh->triangles[hit.triangle];
+  Eigen::Matrix2d texels;
+  for (int k = 1; k < 3; ++k) {
+    const Eigen::Vector2d uv = (hit.mesh->uv[corner[k]] - hit.mesh->uv[corner[0]]).cast<double>();
+    texels.col(k - 1) = uv.cwiseProduct(Eigen::Vector2d(size.width, size.height));
+  }
+  // Orthonormal frame of the triangle's plane.
+  const Vector normal = hit.edge_1.cross(hit.edge_2).normalized();
+  const Vector across = hit.edge_1.normalized();
+  const Vector along = normal.cross(across);
+  Eigen::Matrix2d metres;
+  metres << across.dot(hit.edge_1), across.dot(hit.edge_2), along.dot(hit.edge_1), along.dot(hit.edge_2);
+  const Eigen::JacobiSVD<Eigen::Matrix2d> svd(texels * metres.inverse());
+  const double stretch = std::max(1.0, 1.0 / std::abs(normal.dot(ray)));
+  return std::log2(spread * hit.t * stretch * svd.singularValues()[0]);
+}
+
+double Reference::ambient(const Hit& hit, const Vector& ray) const {
+  Vector geometric = hit.edge_1.cross(hit.edge_2).normalized();
+  if (geometric.dot(ray) > 0) geometric = -geometric;
+  Vector normal = geometric;
+  if (!hit.mesh->normals.empty()) {
+    const Eigen::Matrix3d to_world = hit.instance->T_world_instance.linear().cast<double>().inverse().transpose();
+    Buffer<Eigen::Vector3f> turned = [&] {
+      std::vector<Eigen::Vector3f> values(hit.mesh->normals.size(), Eigen::Vector3f::Zero());
+      for (const std::uint32_t v : hit.mesh->triangles[hit.triangle]) {
+        values[v] = (to_world * hit.mesh->normals[v].cast<double>()).normalized().cast<float>();
+      }
+      return values;
+    }();
+    normal = blend(turned, *hit.mesh, hit.triangle, hit.b1, hit.b2).normalized();
+    if (normal.dot(geometric) < 0) normal = -normal;
+  }
+  return shading::ambient_light(normal.x(), normal.y(), normal.z());
+}
+
+Vector Reference::shade(const Hit& hit, const Vector& ray, double spread) const {
+  static const Material plain;
+  const Mesh& mesh = *hit.mesh;
+  const Material& material = mesh.material == kNone ? plain : scene_.materials[static_cast<std::size_t>(mesh.material)];
+  Vector color = material.base_color.head<3>().cast<double>();
+  if (material.texture != kNone && !mesh.uv.empty()) {
+    const auto last = static_cast<double>(mips_[static_cast<std::size_t>(material.texture)].size());
+    const double lod = std::clamp(level(hit, ray, spread), 0.0, last);
+    const Eigen::Vector2d uv = blend(mesh.uv, mesh, hit.triangle, hit.b1, hit.b2);
+    const int fine = static_cast<int>(lod);
+    const int coarse = std::min(fine + 1, static_cast<int>(last));
+    const Eigen::Vector4d texel = (1 - lod + fine) * bilinear(material.texture, fine, uv, true) +
+                                  (lod - fine) * bilinear(material.texture, coarse, uv, true);
+    color = color.cwiseProduct(texel.head<3>());
+  }
+  if (!mesh.colors.empty()) {
+    color = color.cwiseProduct(blend(mesh.colors, mesh, hit.triangle, hit.b1, hit.b2).head<3>()) / 255.0;
+  }
+  if (!material.emissive) {
+    if (mesh.lightmap != kNone) {
+      const Eigen::Vector2d uv = blend(mesh.lightmap_uv, mesh, hit.triangle, hit.b1, hit.b2);
+      color = 2.0 * color.cwiseProduct(bilinear(mesh.lightmap, 0, uv, false).head<3>());
+    } else {
+      color *= ambient(hit, ray);
+    }
+  }
+  return 255.0 * color.cwiseMax(0.0).cwiseMin(1.0);
+}
+
+Reference::Sample Reference::cast(const Vector& origin, const Vector& ray, double spread) const {
+  constexpr double kSlack = 1e-4;
+  Sample sample;
+  const double zenith = shading::sky_weight(ray.normalized().y());
+  sample.color = 255.0 * (zenith * scene_.sky.zenith + (1 - zenith) * scene_.sky.horizon).cast<double>();
+  double nearest = -1;
+  for (const Hit& hit : all_hits(origin, ray, kSlack)) {
+    const bool first = nearest < 0;
+    if (!first && hit.t > nearest + 1e-3) break;
+    const double least = std::min({hit.b1, hit.b2, 1 - hit.b1 - hit.b2});
+    if (is_hole(hit, sample.doubtful)) continue;
+    if (!first || least < kSlack) {
+      sample.doubtful = true;
+      if (!first) continue;
+    }
+    nearest = hit.t;
+    sample.depth = hit.t;
+    sample.instance = hit.instance->id;
+    sample.color = shade(hit, ray, spread);
+  }
+  return sample;
+}
+
+}  // namespace wiw::testing

@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <vector>
+
+#include "wiw/render/mipmap.hpp"
+#include "wiw/render/renderer.hpp"
+
+namespace wiw::testing {
+
+/// Slow twin of the renderer: every ray against every triangle, in double precision, shaded by the documented formulas.
+class Reference {
+ public:
+  explicit Reference(const Scene& scene);
+
+  struct Sample {
+    double depth = 0;
+    std::uint32_t instance = 0;
+    Eigen::Vector3d color = Eigen::Vector3d::Zero();  // [0, 255]
+    bool doubtful = false;  // so near to an edge, a crease of the sky or another surface that rounding may decide
+  };
+  /// `ray` scaled as shading.hpp says; `spread` is the width of a pixel at depth 1.
+  [[nodiscard]] Sample cast(const Eigen::Vector3d& origin, const Eigen::Vector3d& ray, double spread) const;
+
+ private:
+  struct Hit {
+    const Mesh* mesh = nullptr;
+    const Instance* instance = nullptr;
+    std::size_t triangle = 0;
+    double t = 0, b1 = 0, b2 = 0;
+    Eigen::Vector3d edge_1, edge_2;
+  };
+  [[nodiscard]] std::vector<Hit> all_hits(const Eigen::Vector3d& origin, const Eigen::Vector3d& ray,
+                                          double slack) const;
+  [[nodiscard]] bool is_hole(const Hit& hit, bool& doubtful) const;
+  [[nodiscard]] Eigen::Vector3d shade(const Hit& hit, const Eigen::Vector3d& ray, double spread) const;
+  [[nodiscard]] double level(const Hit& hit, const Eigen::Vector3d& ray, double spread) const;
+  [[nodiscard]] double ambient(const Hit& hit, const Eigen::Vector3d& ray) const;
+  [[nodiscard]] Eigen::Vector4d bilinear(std::int32_t texture, int level, const Eigen::Vector2d& uv, bool repeat) const;
+
+  const Scene& scene_;
+  std::vector<std::vector<MipLevel>> mips_;  // by texture
+  std::vector<Eigen::AlignedBox3d> bounds_;  // by instance, in the world
+};
+
+}  // namespace wiw::testing
