@@ -25,7 +25,7 @@ class ContractError(Error, TypeError):
 
 
 class InfrastructureError(Error):
-    """Something around the task failed (a server, a file, memory): the episode is recorded as such, not as a failure."""
+    """Something around the task failed (a server, a file, memory): the episode is recorded as such and not scored."""
 
 
 class StoreError(Error):

@@ -20,8 +20,22 @@ finite = st.floats(-1e3, 1e3)
 points = st.tuples(finite, finite, finite)
 
 
-@given(st.lists(st.builds(Episode, st.text(max_size=8), st.text(max_size=20), points, finite, points, finite, finite,
-                          st.dictionaries(st.text(max_size=5), st.integers())), max_size=4))
+@given(
+    st.lists(
+        st.builds(
+            Episode,
+            st.text(max_size=8),
+            st.text(max_size=20),
+            points,
+            finite,
+            points,
+            finite,
+            finite,
+            st.dictionaries(st.text(max_size=5), st.integers()),
+        ),
+        max_size=4,
+    )
+)
 def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode]) -> None:
     path = tmp_path_factory.mktemp("episodes") / "e.json"
     files.save(path, episodes, "imagenav", seed=1)
@@ -42,8 +56,12 @@ def test_the_wrong_quaternion_order_is_noticed() -> None:
 
 def habitat_file(path: Path, scene: str) -> Path:
     episode = {
-        "episode_id": "7", "scene_id": scene, "start_position": [-2.0, 0.05, 0.5], "start_rotation": [0, 0.0, 0, 1.0],
-        "info": {"geodesic_distance": 5.5}, "goals": [{"position": [3.0, 0.05, 1.0], "radius": None}],
+        "episode_id": "7",
+        "scene_id": scene,
+        "start_position": [-2.0, 0.05, 0.5],
+        "start_rotation": [0, 0.0, 0, 1.0],
+        "info": {"geodesic_distance": 5.5},
+        "goals": [{"position": [3.0, 0.05, 1.0], "radius": None}],
     }
     path.write_bytes(gzip.compress(json.dumps({"episodes": [episode]}).encode()))
     return path
@@ -60,8 +78,17 @@ def test_habitat_episodes_run(two_rooms: str, tmp_path: Path) -> None:
 
 
 def test_world_in_world_episodes_are_read(tmp_path: Path) -> None:
-    item = {"datum_id": 1, "episode_id": 3, "scene_relpath": "a/b.glb", "goal_image_relpath": "i.png", "start_position": [0, 0, 0],
-            "start_rotation": [1, 0, 0, 0], "goal_position": [1, 0, 1], "goal_rotation": [0.0, 0, 1.0, 0], "goal_radius": 0.5}
+    item = {
+        "datum_id": 1,
+        "episode_id": 3,
+        "scene_relpath": "a/b.glb",
+        "goal_image_relpath": "i.png",
+        "start_position": [0, 0, 0],
+        "start_rotation": [1, 0, 0, 0],
+        "goal_position": [1, 0, 1],
+        "goal_rotation": [0.0, 0, 1.0, 0],
+        "goal_radius": 0.5,
+    }
     path = tmp_path / "e.json"
     path.write_text(json.dumps({"version": 1, "data": [item]}))
     episode = files.load(path, "/scenes")[0]
@@ -69,9 +96,17 @@ def test_world_in_world_episodes_are_read(tmp_path: Path) -> None:
     assert np.isnan(episode.geodesic)
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[]", b'{"format": "wiw-episodes", "version": 99}',
-                                     b'{"format": "wiw-episodes", "version": 1, "episodes": [{"episode_id": "1"}]}',
-                                     b'{"episodes": [{"start_rotation": [0, 0, 0, 1]}]}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b'{"format": "wiw-episodes", "version": 99}',
+        b'{"format": "wiw-episodes", "version": 1, "episodes": [{"episode_id": "1"}]}',
+        b'{"episodes": [{"start_rotation": [0, 0, 0, 1]}]}',
+    ],
+)
 def test_damaged_files_are_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "broken.json"
     path.write_bytes(content)

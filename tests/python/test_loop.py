@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 import pytest
 
@@ -150,7 +152,7 @@ def test_a_model_of_fixed_length_is_padded_and_chunked(task: ImageNav) -> None:
         accepts = wiw.accepts(
             control="action", view="perspective", size=(64, 64), frames=3, vocabulary={0: 9, 1: 7, 2: 5, 3: 6, 4: 0}
         )
-        lengths = set()
+        lengths: ClassVar[set] = set()
 
         def rollout(self, observations, controls, seeds):
             for control in controls:

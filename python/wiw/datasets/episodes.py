@@ -30,7 +30,7 @@ def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any)
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
-    """Reads an episode file: one written by `save`, habitat-lab's navigation episodes, or World-in-World's ImageNav file.
+    """Reads an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
 
     `scenes` is the folder that scene paths of the foreign formats are relative to. Lengths that a file does not give
     are NaN until the task has measured them.
@@ -44,7 +44,9 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
     if habitat.is_world_in_world(body):
         return habitat.read_world_in_world(body, str(path), scenes)
     if not isinstance(body, Mapping) or body.get("format") != "wiw-episodes":
-        raise FileError(f"{path}: expected an episode file of wiw ('format': 'wiw-episodes'), habitat-lab or World-in-World")
+        raise FileError(
+            f"{path}: expected an episode file of wiw ('format': 'wiw-episodes'), habitat-lab or World-in-World"
+        )
     if body.get("version") != VERSION:
         raise FileError(f"{path}: version {body.get('version')}, this release reads version {VERSION}")
     return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(body.get("episodes", []))]

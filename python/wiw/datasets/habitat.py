@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episode files of other systems: Habitat's PointNav-v1 (its ImageNav has no file of its own) and World-in-World's ImageNav.
+"""Episode files of other systems: Habitat's PointNav-v1 (also its ImageNav) and World-in-World's ImageNav.
 
 Positions are metres, Y up, in all of them; the order of a quaternion is part of each format and never guessed.
 """
@@ -65,7 +65,9 @@ def _habitat(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
             info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id"},
         )
     except (KeyError, IndexError, TypeError, ValueError) as error:
-        raise FileError(f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})") from error
+        raise FileError(
+            f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})"
+        ) from error
 
 
 def is_world_in_world(body: Any) -> bool:
@@ -88,7 +90,11 @@ def _world_in_world(item: Mapping[str, Any], where: str, scenes: Path) -> Episod
             goal_position=_point(item["goal_position"]),
             goal_yaw=yaw_of(item["goal_rotation"], "wxyz", where),
             geodesic=float("nan"),
-            info={"source": "world-in-world", "goal_radius": float(item["goal_radius"]), "steps": item.get("step_to_goal")},
+            info={
+                "source": "world-in-world",
+                "goal_radius": float(item["goal_radius"]),
+                "steps": item.get("step_to_goal"),
+            },
         )
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(f"{where}: not a World-in-World ImageNav item ({type(error).__name__}: {error})") from error

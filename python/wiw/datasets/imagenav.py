@@ -73,7 +73,7 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
 
 
 def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, turn: float = np.pi / 8) -> int:
-    """Primitives that a shortest path [N, 3] takes from heading `yaw`: its turns in whole steps, its length in strides."""
+    """Primitives of a shortest path [N, 3] from heading `yaw`: its turns in whole steps, its length in strides."""
     legs = np.diff(path[:, [0, 2]], axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-6]
     headings = np.arctan2(-legs[:, 0], -legs[:, 1])
@@ -84,7 +84,7 @@ def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, t
 
 def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
     """Whether the goal camera's place can be seen from the start camera's, by the depth along the ray between them."""
-    eye, place = (np.asarray(p, np.float64) + (0, CAMERA_HEIGHT, 0) for p in (start, goal))
+    eye, place = (np.add(p, [0.0, CAMERA_HEIGHT, 0.0]) for p in (start, goal))
     way = place - eye
     pose = camera_pose(start, float(np.arctan2(-way[0], -way[2])))
     pitch = np.arctan2(way[1], np.hypot(way[0], way[2]))
@@ -99,7 +99,7 @@ def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMER
     pose = np.eye(4)
     pose[0, 0] = pose[2, 2] = np.cos(yaw)
     pose[0, 2], pose[2, 0] = np.sin(yaw), -np.sin(yaw)
-    pose[:3, 3] = np.asarray(position, np.float64) + (0, height, 0)
+    pose[:3, 3] = np.add(position, [0.0, height, 0.0])
     return pose
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Literal
 
 from wiw.nav import NavMesh
 from wiw.render import Renderer
@@ -27,7 +28,7 @@ class World:
 _worlds: OrderedDict[tuple[str, str], World] = OrderedDict()
 
 
-def world(scene: str, backend: str = "auto") -> World:
+def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
     """The world of a scene spec that names one scene, from memory where possible; the oldest unused is dropped."""
     key = (scene, backend)
     if key in _worlds:

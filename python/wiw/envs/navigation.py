@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import gymnasium
 import numpy as np
@@ -25,11 +25,13 @@ class NavigationTask(Protocol):
     """What the environment asks of its task."""
 
     seed: int
-    backend: str
-    motion: str
-    budget: int
+    backend: Literal["auto", "cpu", "gpu"]
     rules: Any
 
+    @property
+    def motion(self) -> str: ...
+    @property
+    def budget(self) -> int: ...
     def episode(self, index: int) -> Episode: ...
     def goal(self, world: World, episode: Episode) -> Goal: ...
     def succeeded(self, trip: Trip) -> bool: ...
@@ -95,7 +97,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         self.task = task
         self.render_mode = "rgb_array"
         self.outputs = ["panorama", "front", *(["depth"] if depth else [])]
-        self.action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))
+        self.action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))  # type: ignore[assignment]
         self.observation_space = gymnasium.spaces.Dict(self._spaces(depth))
         self._core: Any = None
         self._trip: Trip | None = None
@@ -125,7 +127,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         info = {"result": self.result()} if segment.terminated or segment.truncated else {}
         return segment.observation.as_dict(), float(self.trip.success), segment.terminated, segment.truncated, info
 
-    def render(self) -> NDArray[np.uint8]:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8]:
         """The front view."""
         return self._seen.front
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop's inside: propose, imagine, revise (paper, section "Unified Strategy for Closed-Loop Online Planning")."""
+"""The closed loop's inside: propose, imagine, revise (paper, "Unified Strategy for Closed-Loop Online Planning")."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from wiw.loop.clock import Clock
 from wiw.loop.imagine import Imagination, imagine
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.types import Decision, Goal, Key, Observation
+from wiw.types import Decision, Goal, Key, Observation, Rollout
 from wiw.world_models.base import WorldModel
 
 
@@ -76,7 +76,7 @@ class Agent:
         return self.decide_batch([Query(observation, goal, key, simulator)])[0]
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
-        """One decision for each live episode; the world model and the reviser see all candidates of all of them at once."""
+        """One decision for each live episode; model and reviser see all candidates of all of them at once."""
         clock = Clock()
         proposing, revising = self._situations(queries)
         with clock("propose"):
@@ -85,11 +85,12 @@ class Agent:
                 self.revision.observe(revising)
             proposals = self.policy.propose(proposing, self.candidates, self.horizon)
         if self.model is None:
-            rollouts, calls = [None] * len(queries), {}
+            rollouts: list[list[Rollout] | None] = [None] * len(queries)
+            calls: dict[str, int] = {}
             scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
         else:
             imagined: Imagination = imagine(self.model, queries, proposals, self.revision.frames, clock)
-            rollouts, calls = imagined.rollouts, imagined.calls
+            rollouts, calls = [*imagined.rollouts], imagined.calls
             with clock("revise"):
                 scores = self.revision.score(revising, proposals, imagined.rollouts)
         seconds = clock.share(len(queries))

@@ -93,15 +93,22 @@ def _turned(simulator: Any, turns: int) -> Any:
 def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8]], accepts: Accepts) -> Conditioning:
     """The rows of one call; a call that continues a long plan begins at the frame where the one before ended."""
     if part.first == 0:
-        depth = None if whole.depth is None else whole.depth[part.rows]
+        rows = _slice_of(part.rows)
+        depth = None if whole.depth is None else whole.depth[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
-        return Conditioning(whole.image[part.rows], depth=depth, simulators=simulators)
+        return Conditioning(whole.image[rows], depth=depth, simulators=simulators)
     if accepts.needs:
         raise ArgumentError(
             f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
             f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon"
         )
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
+
+
+def _slice_of(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
+    """The rows as a slice where they are consecutive, so that taking them copies nothing."""
+    first, last = int(rows[0]), int(rows[-1])
+    return slice(first, last + 1) if last - first + 1 == len(rows) else rows
 
 
 def _controls(accepts: Accepts, part: Any) -> list[Control]:

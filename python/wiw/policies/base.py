@@ -54,7 +54,8 @@ class Policy(ABC):
         return None
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Called once a decision, before `propose`, also on a policy that only revises."""
+        """Called once a decision, before `propose`, also on a policy that only revises. Default: nothing to keep."""
+        return
 
     @abstractmethod
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:

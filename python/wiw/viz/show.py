@@ -36,7 +36,9 @@ def show(decision: Decision) -> DecisionFigure:
         ArgumentError: the decision carries no observation (one that was read back from a run store does not).
     """
     if decision.observation is None:
-        raise ArgumentError("show: the decision carries no observation; take it from agent.decide, or open the run's report")
+        raise ArgumentError(
+            "show: the decision carries no observation; take it from agent.decide, or open the run's report"
+        )
     rows = len(decision.proposals)
     figure = DecisionFigure(figsize=(WIDTH, TOP + ROW * rows), layout="constrained")
     grid = figure.add_gridspec(1 + rows, 1, height_ratios=[TOP, *[ROW] * rows])
@@ -54,7 +56,11 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     columns = place.subgridspec(1, 2, width_ratios=[4, 1]) if has_image else place.subgridspec(1, 1)
     panorama = decision.observation.panorama
     height = len(panorama)
-    _picture(figure.add_subplot(columns[0, 0]), panorama[round(BAND[0] * height) : round(BAND[1] * height)], "seen, all around")
+    _picture(
+        figure.add_subplot(columns[0, 0]),
+        panorama[round(BAND[0] * height) : round(BAND[1] * height)],
+        "seen, all around",
+    )
     if goal is not None and goal.image is not None:
         _picture(figure.add_subplot(columns[0, 1]), goal.image, "goal")
     if goal is not None and goal.text:

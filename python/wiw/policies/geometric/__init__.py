@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -42,7 +43,7 @@ class GeometricMemory(Memory):
 
 
 class Geometric(Matcher):
-    """The matcher, drawn towards the place that SIFT matches, true depth and PnP with RANSAC compute for the goal camera.
+    """The matcher, drawn to where SIFT matches, true depth and PnP with RANSAC place the goal camera.
 
     A classical reference beside learnt imagination: it needs depth and texture, and nothing to be imagined.
     """
@@ -154,10 +155,10 @@ def _lift(pixel: NDArray[np.float32], yaw_deg: float, depth: NDArray[np.float32]
 
 @cache
 def _sift() -> cv2.SIFT:
-    return cv2.SIFT_create(600)
+    return cv2.SIFT_create(600)  # type: ignore[attr-defined]
 
 
-def _features(view: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+def _features(view: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
     """Pixels float32 [N, 2] and root-SIFT descriptors [N, 128] (Arandjelovic and Zisserman, CVPR 2012)."""
     keypoints, descriptors = _sift().detectAndCompute(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), None)
     if descriptors is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much a place looks like the place of the goal image: colour histograms and normalised correlation over all headings.
+"""How much a place looks like that of the goal image: colour histograms and normalised correlation, all headings.
 
 A panorama is reduced to a band of 32 x 128 pixels, latitudes within 45 degrees, 2.8 degrees a column; the goal's
 90-degree view covers 32 of those columns. The similarity of a place is the best over all 128 headings, so that turning
@@ -93,7 +93,7 @@ def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32
 
 
 def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A 90-degree view uint8 [S, S, 3] as a panorama uint8 [64, 128, 3], and the band's mask [32, 128] of what it shows.
+    """A 90-degree view uint8 [S, S, 3] as a panorama uint8 [64, 128, 3], and the band's mask [32, 128].
 
     Its border is continued outside, so that blurring finds no edge there.
     """

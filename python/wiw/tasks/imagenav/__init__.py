@@ -71,7 +71,7 @@ class ImageNav:
         episode_file: str | Path | None = None,
         scene_folder: str | Path = "",
         per_scene: int = 5,
-        backend: str = "auto",
+        backend: Literal["auto", "cpu", "gpu"] = "auto",
         **rules: Any,
     ) -> None:
         if preset not in PRESETS:
