@@ -24,7 +24,7 @@ struct MeshLayout {
   // The texel block that a quad reads and the fraction at its left and right (upper and lower) ends, per column (row)
   // of quads.
   struct Axis {
-    std::vector<std::int32_t> texel;
+    std::vector<std::uint32_t> texel;
     std::vector<float> begin, span;
   };
   Axis across, down;
@@ -34,10 +34,20 @@ struct MeshLayout {
 constexpr std::uint8_t kUpperLeft = 1;   // 00 01 10
 constexpr std::uint8_t kLowerRight = 2;  // 11 10 01
 
+/// Quads that are not part of the grid: where the mesh is cut, the nearer surface still reaches half a pixel beyond its
+/// last vertices, so objects keep their size and those a pixel wide do not vanish. Corner-major arrays.
+struct FringeQuads {
+  std::vector<float> ray_x[4], ray_y[4], ray_z[4], depth[4];
+  std::vector<std::uint8_t> triangles;
+  std::vector<std::uint32_t> texel;  // column | row << 16
+  std::vector<float> begin_x, span_x, begin_y, span_y;
+};
+
 /// Depth mesh of one image.
 struct DepthMesh {
   std::vector<float> depth;             // [rows, columns] of vertices, kFar where nothing is hit
   std::vector<std::uint8_t> triangles;  // [rows - 1, columns - 1] of quads: which triangles are part of a surface
+  FringeQuads fringe;
 };
 
 /// Builds the mesh and cuts it where two neighbouring depths differ by more than the fraction `cut` of the farther

@@ -7,15 +7,27 @@
 
 namespace wiw::reproject {
 
+/// Loose quads with their own corners 00 01 10 11, each a ray times a depth; see DepthMesh.
+struct Fringe {
+  int count;
+  const float *ray_x[4], *ray_y[4], *ray_z[4], *depth[4];
+  const std::uint8_t* triangles;
+  const std::uint32_t* texel;
+  const float *begin_x, *span_x, *begin_y, *span_y;
+};
+
+constexpr int kFringeBlock = 256;
+
 /// A depth mesh and the view it is drawn into. See MeshLayout and DepthMesh for the source's members.
 struct RasterJob {
   // Source.
   int rows, columns;
   const float *ray_x, *ray_z, *ray_m, *ray_y;
-  const std::int32_t *texel_across, *texel_down;
+  const std::uint32_t *texel_across, *texel_down;
   const float *begin_across, *span_across, *begin_down, *span_down;
   const float* depth;
   const std::uint8_t* triangles;
+  Fringe fringe;
   // Rigid transform from source to target camera, rows of [R | t].
   float transform[12];
   // Target.
@@ -23,7 +35,7 @@ struct RasterJob {
   int height, width;
   float focal;  // pixels, pinhole only
   const float *target_ray_x, *target_ray_z, *target_ray_m, *target_ray_y;
-  // Room for two rows of vertices: 12 * columns floats.
+  // Room for two rows of vertices or a block of fringe: scratch_floats(columns).
   float* scratch;
   // Results [height, width]: depth (kNothing where no triangle lands), and the texel block and fractions to look up in
   // the source image, laid out as in panorama::BilinearTable.
@@ -31,6 +43,12 @@ struct RasterJob {
   std::uint32_t* out_texel;
   std::uint32_t* out_fraction14;
 };
+
+constexpr std::size_t scratch_floats(int columns) {
+  const std::size_t rows = 12 * static_cast<std::size_t>(columns);
+  const std::size_t fringe = std::size_t{24} * kFringeBlock;
+  return rows > fringe ? rows : fringe;
+}
 
 constexpr float kNothing = 3.0e38F;
 

@@ -62,47 +62,52 @@ inline float atan2_fast(float y, float x) {
   return y < 0.0F ? -angle : angle;
 }
 
-/// One row of vertices in the target camera: point, pixel coordinates, depth (not above kNear where not drawable).
-struct VertexRow {
+/// Vertices in the target camera: point, pixel coordinates, depth (not above kNear where not drawable).
+struct Vertices {
   float *px, *py, *pz, *u, *v, *depth;
 };
 
-inline VertexRow vertex_row(float* scratch, int columns) {
-  return {scratch,
-          scratch + columns,
-          scratch + 2 * columns,
-          scratch + 3 * columns,
-          scratch + 4 * columns,
-          scratch + 5 * columns};
+inline Vertices vertices_at(float* scratch, int count) {
+  return {scratch, scratch + count, scratch + 2 * count, scratch + 3 * count, scratch + 4 * count, scratch + 5 * count};
 }
 
-WIW_NOINLINE void transform_row(const RasterJob& job, int row, float* __restrict px, float* __restrict py,
-                                float* __restrict pz) {
-  const float* depth = job.depth + static_cast<std::size_t>(row) * job.columns;
-  const float m = job.ray_m[row];
-  const float y = job.ray_y[row];
-  const float* t = job.transform;
-  const float t0 = t[0], t1 = t[1], t2 = t[2], t3 = t[3], t4 = t[4], t5 = t[5];
-  const float t6 = t[6], t7 = t[7], t8 = t[8], t9 = t[9], t10 = t[10], t11 = t[11];
-  const float *ray_x = job.ray_x, *ray_z = job.ray_z;
-  for (int j = 0; j < job.columns; ++j) {
+/// Points (x, y, z) d of the source camera in the target camera; `y_step` 0 reads one y for all.
+WIW_NOINLINE void transform(const float* matrix, const float* ray_x, const float* ray_y, int y_step, const float* ray_z,
+                            float scale, const float* depth, int count, float* __restrict px, float* __restrict py,
+                            float* __restrict pz) {
+  const float t0 = matrix[0], t1 = matrix[1], t2 = matrix[2], t3 = matrix[3], t4 = matrix[4], t5 = matrix[5];
+  const float t6 = matrix[6], t7 = matrix[7], t8 = matrix[8], t9 = matrix[9], t10 = matrix[10], t11 = matrix[11];
+  if (y_step == 0) {
+    const float level = ray_y[0];
+    for (int j = 0; j < count; ++j) {
+      const float d = depth[j];
+      const float x = ray_x[j] * scale * d;
+      const float z = ray_z[j] * scale * d;
+      const float y = level * d;
+      px[j] = t0 * x + t1 * y + t2 * z + t3;
+      py[j] = t4 * x + t5 * y + t6 * z + t7;
+      pz[j] = t8 * x + t9 * y + t10 * z + t11;
+    }
+    return;
+  }
+  for (int j = 0; j < count; ++j) {
     const float d = depth[j];
-    const float x = ray_x[j] * m * d;
-    const float z = ray_z[j] * m * d;
-    const float h = y * d;
-    px[j] = t0 * x + t1 * h + t2 * z + t3;
-    py[j] = t4 * x + t5 * h + t6 * z + t7;
-    pz[j] = t8 * x + t9 * h + t10 * z + t11;
+    const float x = ray_x[j] * scale * d;
+    const float z = ray_z[j] * scale * d;
+    const float y = ray_y[j] * d;
+    px[j] = t0 * x + t1 * y + t2 * z + t3;
+    py[j] = t4 * x + t5 * y + t6 * z + t7;
+    pz[j] = t8 * x + t9 * y + t10 * z + t11;
   }
 }
 
-WIW_NOINLINE void project_panorama(const RasterJob& job, const float* px, const float* py, const float* pz,
+WIW_NOINLINE void project_panorama(const RasterJob& job, const float* px, const float* py, const float* pz, int count,
                                    float* __restrict u, float* __restrict v, float* __restrict depth) {
   const float across = static_cast<float>(job.width) * 0.15915494309F;
   const float down = static_cast<float>(job.height) * 0.31830988618F;
   const float middle_u = static_cast<float>(job.width) * 0.5F - 0.5F;
   const float middle_v = static_cast<float>(job.height) * 0.5F - 0.5F;
-  for (int j = 0; j < job.columns; ++j) {
+  for (int j = 0; j < count; ++j) {
     const float flat2 = px[j] * px[j] + pz[j] * pz[j];
     u[j] = middle_u + across * atan2_fast(px[j], -pz[j]);
     v[j] = middle_v - down * atan2_fast(py[j], __builtin_sqrtf(flat2));
@@ -110,14 +115,14 @@ WIW_NOINLINE void project_panorama(const RasterJob& job, const float* px, const 
   }
 }
 
-WIW_NOINLINE void project_pinhole(const RasterJob& job, const float* px, const float* py, const float* pz,
+WIW_NOINLINE void project_pinhole(const RasterJob& job, const float* px, const float* py, const float* pz, int count,
                                   float* __restrict u, float* __restrict v, float* __restrict depth) {
   const float focal = job.focal;
   const float middle_u = static_cast<float>(job.width) * 0.5F - 0.5F;
   const float middle_v = static_cast<float>(job.height) * 0.5F - 0.5F;
   // Keeps far-off vertices within the range of int conversions.
   const float limit = 1.0e6F;
-  for (int j = 0; j < job.columns; ++j) {
+  for (int j = 0; j < count; ++j) {
     const float z = -pz[j];
     const float scale = focal / max_of(z, kNear);
     u[j] = max_of(-limit, min_of(limit, middle_u + scale * px[j]));
@@ -126,13 +131,18 @@ WIW_NOINLINE void project_pinhole(const RasterJob& job, const float* px, const f
   }
 }
 
-inline void build_row(const RasterJob& job, int row, const VertexRow& out) {
-  transform_row(job, row, out.px, out.py, out.pz);
+inline void project(const RasterJob& job, const Vertices& out, int count) {
   if (job.panoramic) {
-    project_panorama(job, out.px, out.py, out.pz, out.u, out.v, out.depth);
+    project_panorama(job, out.px, out.py, out.pz, count, out.u, out.v, out.depth);
   } else {
-    project_pinhole(job, out.px, out.py, out.pz, out.u, out.v, out.depth);
+    project_pinhole(job, out.px, out.py, out.pz, count, out.u, out.v, out.depth);
   }
+}
+
+inline void build_row(const RasterJob& job, int row, const Vertices& out) {
+  transform(job.transform, job.ray_x, job.ray_y + row, 0, job.ray_z, job.ray_m[row],
+            job.depth + static_cast<std::size_t>(row) * job.columns, job.columns, out.px, out.py, out.pz);
+  project(job, out, job.columns);
 }
 
 /// Depth test and write of one sample.
@@ -153,14 +163,39 @@ inline int fraction14(float begin, float span, float a) {
   return static_cast<int>(max_of(0.0F, min_of(kOne14, f)) + 0.5F);
 }
 
-/// Quads [first, first + count) of the row between two vertex rows: corners relative to the seam, boxes, triangles.
+/// Quads by their corners 00 01 10 11 (row, column): vertices, and where they lie in the source image.
+struct Quads {
+  Vertices corner[4];
+  const std::uint8_t* triangles;
+  const std::uint32_t* texel;
+  std::uint32_t texel_row;  // added to texel
+  const float *begin_x, *span_x, *begin_y, *span_y;
+  int y_step;  // 0 reads one begin_y and span_y for all
+};
+
+inline Vertices advance(const Vertices& v, int n) {
+  return {v.px + n, v.py + n, v.pz + n, v.u + n, v.v + n, v.depth + n};
+}
+
+inline Quads advance(const Quads& quads, int n) {
+  Quads moved = quads;
+  for (Vertices& corner : moved.corner) corner = advance(corner, n);
+  moved.triangles += n;
+  moved.texel += n;
+  moved.begin_x += n;
+  moved.span_x += n;
+  moved.begin_y += n * quads.y_step;
+  moved.span_y += n * quads.y_step;
+  return moved;
+}
+
+/// What is known of up to kChunk quads before and after testing one position of their boxes.
 struct Chunk {
-  float u00[kChunk], u01[kChunk], u10[kChunk], u11[kChunk];
-  float inverse_upper[kChunk], inverse_lower[kChunk];
+  float u00[kChunk], u01[kChunk], u10[kChunk], u11[kChunk];  // on the same side of the seam
+  float inverse_upper[kChunk], inverse_lower[kChunk];        // 1 / area, 0 where there is no triangle
   int left[kChunk], top[kChunk], width[kChunk], height[kChunk];
   int large[kChunk];
-  // Results of one box position.
-  int hit[kChunk], hit_u[kChunk], hit_v[kChunk], fraction_x[kChunk], fraction_y[kChunk];
+  int hit[kChunk], hit_u[kChunk], hit_v[kChunk], fraction[kChunk];
   float hit_depth[kChunk];
 };
 
@@ -173,45 +208,50 @@ inline float unwrap(float difference, float turn) {
 inline float inverse_or_zero(float area) { return absolute(area) > 1.0e-12F ? 1.0F / area : 0.0F; }
 
 struct Box {
-  int width, height;
+  int width, height, any_large;
 };
 
-/// Fills corners and boxes of a chunk; returns the largest small box.
-inline Box bound_chunk(const RasterJob& job, const VertexRow& upper, const VertexRow& lower,
-                       const std::uint8_t* triangles, int first, int count, Chunk& chunk) {
+/// Fills corners and boxes of a chunk; returns the largest box that the chunk loops take.
+WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, int count, Chunk& __restrict chunk) {
   // A pinhole image does not wrap: a turn longer than any difference leaves it alone.
   const float turn = job.panoramic ? static_cast<float>(job.width) : 1.0e9F;
   const int low_u = job.panoramic ? -job.width : 0;
   const int high_u = job.panoramic ? 2 * job.width - 1 : job.width - 1;
   const int high_v = job.height - 1;
-  const float *uu = upper.u + first, *uv = upper.v + first, *ud = upper.depth + first;
-  const float *lu = lower.u + first, *lv = lower.v + first, *ld = lower.depth + first;
+  const float *u0 = quads.corner[0].u, *u1 = quads.corner[1].u, *u2 = quads.corner[2].u, *u3 = quads.corner[3].u;
+  const float *v0 = quads.corner[0].v, *v1 = quads.corner[1].v, *v2 = quads.corner[2].v, *v3 = quads.corner[3].v;
+  const float *d0 = quads.corner[0].depth, *d1 = quads.corner[1].depth;
+  const float *d2 = quads.corner[2].depth, *d3 = quads.corner[3].depth;
+  const std::uint8_t* triangles = quads.triangles;
   int widest = 0;
   int highest = 0;
+  int any_large = 0;
   for (int k = 0; k < count; ++k) {
-    const float d01 = unwrap(uu[k + 1] - uu[k], turn);
-    const float d10 = unwrap(lu[k] - uu[k], turn);
-    const float d11 = unwrap(lu[k + 1] - uu[k], turn);
+    const float d01 = unwrap(u1[k] - u0[k], turn);
+    const float d10 = unwrap(u2[k] - u0[k], turn);
+    const float d11 = unwrap(u3[k] - u0[k], turn);
     // Around a pole the four steps do not close.
-    const float loop = d01 + unwrap(lu[k + 1] - uu[k + 1], turn) + unwrap(lu[k] - lu[k + 1], turn) - d10;
-    chunk.u00[k] = uu[k];
-    chunk.u01[k] = uu[k] + d01;
-    chunk.u10[k] = uu[k] + d10;
-    chunk.u11[k] = uu[k] + d11;
-    const float low_x = uu[k] + min_of(min_of(0.0F, d01), min_of(d10, d11));
-    const float high_x = uu[k] + max_of(max_of(0.0F, d01), max_of(d10, d11));
-    const float low_y = min_of(min_of(uv[k], uv[k + 1]), min_of(lv[k], lv[k + 1]));
-    const float high_y = max_of(max_of(uv[k], uv[k + 1]), max_of(lv[k], lv[k + 1]));
+    const float loop = d01 + unwrap(u3[k] - u1[k], turn) + unwrap(u2[k] - u3[k], turn) - d10;
+    chunk.u00[k] = u0[k];
+    chunk.u01[k] = u0[k] + d01;
+    chunk.u10[k] = u0[k] + d10;
+    chunk.u11[k] = u0[k] + d11;
+    const float low_x = u0[k] + min_of(min_of(0.0F, d01), min_of(d10, d11));
+    const float high_x = u0[k] + max_of(max_of(0.0F, d01), max_of(d10, d11));
+    const float low_y = min_of(min_of(v0[k], v1[k]), min_of(v2[k], v3[k]));
+    const float high_y = max_of(max_of(v0[k], v1[k]), max_of(v2[k], v3[k]));
     const int left = max_of(low_u, ceil_int(low_x - 1.0e-3F));
     const int top = max_of(0, ceil_int(low_y - 1.0e-3F));
     const int width = min_of(high_u, floor_int(high_x + 1.0e-3F)) - left + 1;
     const int height = min_of(high_v, floor_int(high_y + 1.0e-3F)) - top + 1;
-    const float nearest = min_of(min_of(ud[k], ud[k + 1]), min_of(ld[k], ld[k + 1]));
+    const float nearest = min_of(min_of(d0[k], d1[k]), min_of(d2[k], d3[k]));
     const int pole = absolute(loop) > 1.0F ? 1 : 0;
-    const int drawn = (triangles[first + k] != 0 ? 1 : 0) & (nearest > kNear ? 1 : 0);
-    const int large =
-        drawn & (pole | (((width > kSmallBox ? 1 : 0) | (height > kSmallBox ? 1 : 0)) & (width > 0 ? 1 : 0)));
-    const int small = drawn & (1 - large) & (width > 0 ? 1 : 0) & (height > 0 ? 1 : 0);
+    const int drawn = (triangles[k] != 0 ? 1 : 0) & (nearest > kNear ? 1 : 0);
+    const int covers = (width > 0 ? 1 : 0) & (height > 0 ? 1 : 0);
+    const int big = (width > kSmallBox ? 1 : 0) | (height > kSmallBox ? 1 : 0);
+    // A wide quad may bulge over a row's centre that its corners do not reach.
+    const int large = drawn & (pole | (big & (width > 0 ? 1 : 0)));
+    const int small = drawn & (1 - large) & covers;
     chunk.large[k] = large;
     chunk.left[k] = left;
     chunk.top[k] = top;
@@ -219,24 +259,25 @@ inline Box bound_chunk(const RasterJob& job, const VertexRow& upper, const Verte
     chunk.height[k] = small != 0 ? height : 0;
     widest = max_of(widest, small != 0 ? width : 0);
     highest = max_of(highest, small != 0 ? height : 0);
-    chunk.inverse_upper[k] =
-        (triangles[first + k] & 1) != 0 ? inverse_or_zero(d01 * (lv[k] - uv[k]) - (uv[k + 1] - uv[k]) * d10) : 0.0F;
-    chunk.inverse_lower[k] =
-        (triangles[first + k] & 2) != 0
-            ? inverse_or_zero((d10 - d11) * (uv[k + 1] - lv[k + 1]) - (lv[k] - lv[k + 1]) * (d01 - d11))
-            : 0.0F;
+    any_large |= large;
+    const float upper = d01 * (v2[k] - v0[k]) - (v1[k] - v0[k]) * d10;
+    const float lower = (d10 - d11) * (v1[k] - v3[k]) - (v2[k] - v3[k]) * (d01 - d11);
+    chunk.inverse_upper[k] = (triangles[k] & 1) != 0 ? inverse_or_zero(upper) : 0.0F;
+    chunk.inverse_lower[k] = (triangles[k] & 2) != 0 ? inverse_or_zero(lower) : 0.0F;
   }
-  return {widest, highest};
+  return {widest, highest, any_large};
 }
 
 /// Tests position (step_u, step_v) of every box in the chunk.
-inline void test_chunk(const RasterJob& job, const VertexRow& upper, const VertexRow& lower, int row, int first,
-                       int count, int step_u, int step_v, Chunk& chunk) {
-  const float *uv = upper.v + first, *ud = upper.depth + first;
-  const float *lv = lower.v + first, *ld = lower.depth + first;
-  const float *begin_across = job.begin_across + first, *span_across = job.span_across + first;
-  const float begin_down = job.begin_down[row];
-  const float span_down = job.span_down[row];
+WIW_NOINLINE void test_chunk(const Quads& quads, int count, int step_u, int step_v, Chunk& __restrict chunk) {
+  const float *v0 = quads.corner[0].v, *v1 = quads.corner[1].v, *v2 = quads.corner[2].v, *v3 = quads.corner[3].v;
+  const float *d0 = quads.corner[0].depth, *d1 = quads.corner[1].depth;
+  const float *d2 = quads.corner[2].depth, *d3 = quads.corner[3].depth;
+  const float *begin_x = quads.begin_x, *span_x = quads.span_x;
+  const float *begin_y = quads.begin_y, *span_y = quads.span_y;
+  const int y_step = quads.y_step;
+  const float begin_y0 = begin_y[0];
+  const float span_y0 = span_y[0];
   for (int k = 0; k < count; ++k) {
     const int u = chunk.left[k] + step_u;
     const int v = chunk.top[k] + step_v;
@@ -244,39 +285,37 @@ inline void test_chunk(const RasterJob& job, const VertexRow& upper, const Verte
     const float y = static_cast<float>(v);
     // Upper left triangle: p = p00 + a (p01 - p00) + b (p10 - p00).
     const float qx = x - chunk.u00[k];
-    const float qy = y - uv[k];
-    const float a1 = (qx * (lv[k] - uv[k]) - qy * (chunk.u10[k] - chunk.u00[k])) * chunk.inverse_upper[k];
-    const float b1 = ((chunk.u01[k] - chunk.u00[k]) * qy - (uv[k + 1] - uv[k]) * qx) * chunk.inverse_upper[k];
+    const float qy = y - v0[k];
+    const float a1 = (qx * (v2[k] - v0[k]) - qy * (chunk.u10[k] - chunk.u00[k])) * chunk.inverse_upper[k];
+    const float b1 = ((chunk.u01[k] - chunk.u00[k]) * qy - (v1[k] - v0[k]) * qx) * chunk.inverse_upper[k];
     const int in1 = (a1 >= -kSlack ? 1 : 0) & (b1 >= -kSlack ? 1 : 0) & (a1 + b1 <= 1.0F + kSlack ? 1 : 0) &
                     (chunk.inverse_upper[k] != 0.0F ? 1 : 0);
-    const float z1 = ud[k] + a1 * (ud[k + 1] - ud[k]) + b1 * (ld[k] - ud[k]);
+    const float z1 = d0[k] + a1 * (d1[k] - d0[k]) + b1 * (d2[k] - d0[k]);
     // Lower right triangle: p = p11 + a (p10 - p11) + b (p01 - p11).
     const float rx = x - chunk.u11[k];
-    const float ry = y - lv[k + 1];
-    const float a2 = (rx * (uv[k + 1] - lv[k + 1]) - ry * (chunk.u01[k] - chunk.u11[k])) * chunk.inverse_lower[k];
-    const float b2 = ((chunk.u10[k] - chunk.u11[k]) * ry - (lv[k] - lv[k + 1]) * rx) * chunk.inverse_lower[k];
+    const float ry = y - v3[k];
+    const float a2 = (rx * (v1[k] - v3[k]) - ry * (chunk.u01[k] - chunk.u11[k])) * chunk.inverse_lower[k];
+    const float b2 = ((chunk.u10[k] - chunk.u11[k]) * ry - (v2[k] - v3[k]) * rx) * chunk.inverse_lower[k];
     const int in2 = (a2 >= -kSlack ? 1 : 0) & (b2 >= -kSlack ? 1 : 0) & (a2 + b2 <= 1.0F + kSlack ? 1 : 0) &
                     (chunk.inverse_lower[k] != 0.0F ? 1 : 0);
-    const float z2 = ld[k + 1] + a2 * (ld[k] - ld[k + 1]) + b2 * (ud[k + 1] - ld[k + 1]);
+    const float z2 = d3[k] + a2 * (d2[k] - d3[k]) + b2 * (d1[k] - d3[k]);
     const float a = in1 != 0 ? a1 : 1.0F - a2;
     const float b = in1 != 0 ? b1 : 1.0F - b2;
+    const float from_y = y_step != 0 ? begin_y[k * y_step] : begin_y0;
+    const float over_y = y_step != 0 ? span_y[k * y_step] : span_y0;
     chunk.hit_depth[k] = in1 != 0 ? z1 : z2;
-    chunk.fraction_x[k] = fraction14(begin_across[k], span_across[k], a);
-    chunk.fraction_y[k] = fraction14(begin_down, span_down, b);
+    chunk.fraction[k] = fraction14(begin_x[k], span_x[k], a) | (fraction14(from_y, over_y, b) << 16);
     chunk.hit_u[k] = u;
     chunk.hit_v[k] = v;
     chunk.hit[k] = (step_u < chunk.width[k] ? 1 : 0) & (step_v < chunk.height[k] ? 1 : 0) & (in1 | in2);
   }
 }
 
-inline void put_chunk(const RasterJob& job, int row, int first, int count, const Chunk& chunk) {
-  const auto texel_row = static_cast<std::uint32_t>(job.texel_down[row]) << 16;
+inline void put_chunk(const RasterJob& job, const Quads& quads, int count, const Chunk& chunk) {
   for (int k = 0; k < count; ++k) {
     if (chunk.hit[k] == 0) continue;
-    const auto texel = static_cast<std::uint32_t>(job.texel_across[first + k]) | texel_row;
-    const auto fraction =
-        static_cast<std::uint32_t>(chunk.fraction_x[k]) | (static_cast<std::uint32_t>(chunk.fraction_y[k]) << 16);
-    put(job, chunk.hit_u[k], chunk.hit_v[k], chunk.hit_depth[k], texel, fraction);
+    put(job, chunk.hit_u[k], chunk.hit_v[k], chunk.hit_depth[k], quads.texel[k] + quads.texel_row,
+        static_cast<std::uint32_t>(chunk.fraction[k]));
   }
 }
 
@@ -288,7 +327,7 @@ inline Vector cross(const Vector& a, const Vector& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 inline float dot(const Vector& a, const Vector& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vector point(const VertexRow& row, int j) { return {row.px[j], row.py[j], row.pz[j]}; }
+inline Vector point(const Vertices& vertices, int k) { return {vertices.px[k], vertices.py[k], vertices.pz[k]}; }
 
 /// Triangle corner + a side_a + b side_b, prepared for rays from the origin (Moeller and Trumbore 1997, with all but
 /// the ray's direction factored out): a = normal_a . d / n . d, likewise b; the depth is n . corner / n . d.
@@ -304,13 +343,16 @@ inline RayTriangle ray_triangle(const Vector& corner, const Vector& end_a, const
   return {normal, cross(side_b, corner), cross(corner, side_a), dot(normal, corner)};
 }
 
-/// Draws one triangle over a box of pixels; `flip` as for the lower right triangle, whose corner is 11.
-inline void draw_triangle(const RasterJob& job, const RayTriangle& triangle, bool flip, int row, int column, int left,
-                          int right, int top, int bottom) {
-  const auto texel =
-      static_cast<std::uint32_t>(job.texel_across[column]) | (static_cast<std::uint32_t>(job.texel_down[row]) << 16);
-  for (int v = top; v <= bottom; ++v) {
-    for (int u = left; u <= right; ++u) {
+struct PixelBox {
+  int left, right, top, bottom;  // inclusive
+};
+
+/// Draws one triangle of quad k over a box of pixels; `flip` for the lower right triangle, whose corner is 11.
+inline void draw_triangle(const RasterJob& job, const Quads& quads, int k, const RayTriangle& triangle, bool flip,
+                          const PixelBox& box) {
+  const std::uint32_t texel = quads.texel[k] + quads.texel_row;
+  for (int v = box.top; v <= box.bottom; ++v) {
+    for (int u = box.left; u <= box.right; ++u) {
       int c = u;
       if (job.panoramic && c < 0) c += job.width;
       if (job.panoramic && c >= job.width) c -= job.width;
@@ -327,86 +369,126 @@ inline void draw_triangle(const RasterJob& job, const RayTriangle& triangle, boo
         a = 1.0F - a;
         b = 1.0F - b;
       }
-      const int fx = fraction14(job.begin_across[column], job.span_across[column], a);
-      const int fy = fraction14(job.begin_down[row], job.span_down[row], b);
-      put(job, c, v, depth, texel, static_cast<std::uint32_t>(fx) | (static_cast<std::uint32_t>(fy) << 16));
+      const int fx = fraction14(quads.begin_x[k], quads.span_x[k], a);
+      const int fy = fraction14(quads.begin_y[k * quads.y_step], quads.span_y[k * quads.y_step], b);
+      put(job, c, v, depth, texel, static_cast<std::uint32_t>(fx | (fy << 16)));
     }
   }
 }
 
-/// Draws a quad that the chunk loops do not take.
-inline void draw_large(const RasterJob& job, const VertexRow& upper, const VertexRow& lower, int row, int column,
-                       float u01, float u10, float u11) {
-  const float u00 = upper.u[column];
-  float left = min_of(min_of(u00, u01), min_of(u10, u11));
-  float right = max_of(max_of(u00, u01), max_of(u10, u11));
-  float top = min_of(min_of(upper.v[column], upper.v[column + 1]), min_of(lower.v[column], lower.v[column + 1]));
-  float bottom = max_of(max_of(upper.v[column], upper.v[column + 1]), max_of(lower.v[column], lower.v[column + 1]));
+/// Pixels that a large quad may cover.
+inline PixelBox large_box(const RasterJob& job, const Quads& quads, int k, const Chunk& chunk) {
+  float left = min_of(min_of(chunk.u00[k], chunk.u01[k]), min_of(chunk.u10[k], chunk.u11[k]));
+  float right = max_of(max_of(chunk.u00[k], chunk.u01[k]), max_of(chunk.u10[k], chunk.u11[k]));
+  const float v0 = quads.corner[0].v[k], v1 = quads.corner[1].v[k], v2 = quads.corner[2].v[k];
+  const float v3 = quads.corner[3].v[k];
+  float top = min_of(min_of(v0, v1), min_of(v2, v3));
+  float bottom = max_of(max_of(v0, v1), max_of(v2, v3));
   const auto width = static_cast<float>(job.width);
   const auto height = static_cast<float>(job.height);
   if (job.panoramic) {
     // Great circles bulge towards the pole: by a row at most while the quad spans little longitude, and a quad that
     // spans much of it may hold the pole.
     const bool wide = right - left > 0.2F * width;
-    const bool north = top + bottom < height;
-    if (north) {
+    if (top + bottom < height) {
       top = wide ? 0.0F : top - 1.0F;
     } else {
       bottom = wide ? height - 1.0F : bottom + 1.0F;
     }
-    if (wide) {
-      left = 0.0F;
-      right = width - 1.0F;
-    }
+    left = wide ? 0.0F : left;
+    right = wide ? width - 1.0F : right;
   } else {
     left = max_of(left, 0.0F);
     right = min_of(right, width - 1.0F);
   }
-  const int u0 = ceil_int(left - 1.0e-3F);
-  const int u1 = floor_int(right + 1.0e-3F);
-  const int v0 = max_of(0, ceil_int(top - 1.0e-3F));
-  const int v1 = min_of(job.height - 1, floor_int(bottom + 1.0e-3F));
-  const std::uint8_t triangles = job.triangles[static_cast<std::size_t>(row) * (job.columns - 1) + column];
-  const Vector p00 = point(upper, column);
-  const Vector p01 = point(upper, column + 1);
-  const Vector p10 = point(lower, column);
-  const Vector p11 = point(lower, column + 1);
-  if ((triangles & 1) != 0) draw_triangle(job, ray_triangle(p00, p01, p10), false, row, column, u0, u1, v0, v1);
-  if ((triangles & 2) != 0) draw_triangle(job, ray_triangle(p11, p10, p01), true, row, column, u0, u1, v0, v1);
+  return {ceil_int(left - 1.0e-3F), floor_int(right + 1.0e-3F), max_of(0, ceil_int(top - 1.0e-3F)),
+          min_of(job.height - 1, floor_int(bottom + 1.0e-3F))};
 }
 
-inline void draw_row(const RasterJob& job, const VertexRow& upper, const VertexRow& lower, int row, Chunk& chunk) {
-  const int quads = job.columns - 1;
-  const std::uint8_t* triangles = job.triangles + static_cast<std::size_t>(row) * quads;
-  for (int first = 0; first < quads; first += kChunk) {
-    const int count = min_of(kChunk, quads - first);
-    const Box box = bound_chunk(job, upper, lower, triangles, first, count, chunk);
+/// Draws a quad that the chunk loops do not take.
+inline void draw_large(const RasterJob& job, const Quads& quads, int k, const Chunk& chunk) {
+  const PixelBox box = large_box(job, quads, k, chunk);
+  const Vector p00 = point(quads.corner[0], k);
+  const Vector p01 = point(quads.corner[1], k);
+  const Vector p10 = point(quads.corner[2], k);
+  const Vector p11 = point(quads.corner[3], k);
+  if ((quads.triangles[k] & 1) != 0) draw_triangle(job, quads, k, ray_triangle(p00, p01, p10), false, box);
+  if ((quads.triangles[k] & 2) != 0) draw_triangle(job, quads, k, ray_triangle(p11, p10, p01), true, box);
+}
+
+inline void draw_quads(const RasterJob& job, const Quads& all, int total, Chunk& chunk) {
+  for (int first = 0; first < total; first += kChunk) {
+    const int count = min_of(kChunk, total - first);
+    const Quads quads = advance(all, first);
+    const Box box = bound_chunk(job, quads, count, chunk);
     for (int step_v = 0; step_v < box.height; ++step_v) {
       for (int step_u = 0; step_u < box.width; ++step_u) {
-        test_chunk(job, upper, lower, row, first, count, step_u, step_v, chunk);
-        put_chunk(job, row, first, count, chunk);
+        test_chunk(quads, count, step_u, step_v, chunk);
+        put_chunk(job, quads, count, chunk);
       }
     }
+    if (box.any_large == 0) continue;
     for (int k = 0; k < count; ++k) {
-      if (chunk.large[k] != 0) {
-        draw_large(job, upper, lower, row, first + k, chunk.u01[k], chunk.u10[k], chunk.u11[k]);
-      }
+      if (chunk.large[k] != 0) draw_large(job, quads, k, chunk);
     }
+  }
+}
+
+/// The mesh's quads between two rows of vertices.
+inline Quads quad_row(const RasterJob& job, int row, const Vertices& upper, const Vertices& lower) {
+  return {{upper, advance(upper, 1), lower, advance(lower, 1)},
+          job.triangles + static_cast<std::size_t>(row) * (job.columns - 1),
+          job.texel_across,
+          job.texel_down[row] << 16,
+          job.begin_across,
+          job.span_across,
+          job.begin_down + row,
+          job.span_down + row,
+          0};
+}
+
+inline void draw_mesh(const RasterJob& job, Chunk& chunk) {
+  Vertices upper = vertices_at(job.scratch, job.columns);
+  Vertices lower = vertices_at(job.scratch + 6 * static_cast<std::ptrdiff_t>(job.columns), job.columns);
+  build_row(job, 0, upper);
+  for (int row = 0; row + 1 < job.rows; ++row) {
+    build_row(job, row + 1, lower);
+    draw_quads(job, quad_row(job, row, upper, lower), job.columns - 1, chunk);
+    const Vertices swap = upper;
+    upper = lower;
+    lower = swap;
+  }
+}
+
+/// The fringe's quads, a few hundred at a time so that the vertices stay in the cache.
+inline void draw_fringe(const RasterJob& job, Chunk& chunk) {
+  const Fringe& fringe = job.fringe;
+  for (int first = 0; first < fringe.count; first += kFringeBlock) {
+    const int count = min_of(kFringeBlock, fringe.count - first);
+    Quads quads{{},
+                fringe.triangles + first,
+                fringe.texel + first,
+                0,
+                fringe.begin_x + first,
+                fringe.span_x + first,
+                fringe.begin_y + first,
+                fringe.span_y + first,
+                1};
+    for (int corner = 0; corner < 4; ++corner) {
+      quads.corner[corner] = vertices_at(job.scratch + 6 * corner * kFringeBlock, kFringeBlock);
+      const Vertices& out = quads.corner[corner];
+      transform(job.transform, fringe.ray_x[corner] + first, fringe.ray_y[corner] + first, 1,
+                fringe.ray_z[corner] + first, 1.0F, fringe.depth[corner] + first, count, out.px, out.py, out.pz);
+      project(job, out, count);
+    }
+    draw_quads(job, quads, count, chunk);
   }
 }
 
 inline void raster(const RasterJob& job) {
   Chunk chunk;
-  VertexRow upper = vertex_row(job.scratch, job.columns);
-  VertexRow lower = vertex_row(job.scratch + 6 * static_cast<std::ptrdiff_t>(job.columns), job.columns);
-  build_row(job, 0, upper);
-  for (int row = 0; row + 1 < job.rows; ++row) {
-    build_row(job, row + 1, lower);
-    draw_row(job, upper, lower, row, chunk);
-    const VertexRow swap = upper;
-    upper = lower;
-    lower = swap;
-  }
+  draw_mesh(job, chunk);
+  draw_fringe(job, chunk);
 }
 
 }  // namespace

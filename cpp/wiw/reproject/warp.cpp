@@ -40,12 +40,31 @@ struct Scratch {
 
 Scratch& scratch_for(std::size_t pixels, int columns) {
   thread_local Scratch scratch;
-  scratch.vertices.resize(12 * static_cast<std::size_t>(columns));
+  scratch.vertices.resize(scratch_floats(columns));
   scratch.depth.assign(pixels, kNothing);
   scratch.texel.assign(pixels, 0);
   scratch.fraction14.assign(pixels, 0);
   scratch.color.resize(3 * pixels);
   return scratch;
+}
+
+Fringe fringe_of(const DepthMesh& mesh) {
+  const FringeQuads& quads = mesh.fringe;
+  Fringe fringe{};
+  fringe.count = static_cast<int>(quads.texel.size());
+  for (int corner = 0; corner < 4; ++corner) {
+    fringe.ray_x[corner] = quads.ray_x[corner].data();
+    fringe.ray_y[corner] = quads.ray_y[corner].data();
+    fringe.ray_z[corner] = quads.ray_z[corner].data();
+    fringe.depth[corner] = quads.depth[corner].data();
+  }
+  fringe.triangles = quads.triangles.data();
+  fringe.texel = quads.texel.data();
+  fringe.begin_x = quads.begin_x.data();
+  fringe.span_x = quads.span_x.data();
+  fringe.begin_y = quads.begin_y.data();
+  fringe.span_y = quads.span_y.data();
+  return fringe;
 }
 
 const View& checked(const View& view, const char* name) {
@@ -83,6 +102,7 @@ void Warp::warp_one(const std::uint8_t* color, const DepthMesh& mesh, const Pose
                 layout_.down.span.data(),
                 mesh.depth.data(),
                 mesh.triangles.data(),
+                fringe_of(mesh),
                 {},
                 target_.panoramic,
                 target_.size.height,
