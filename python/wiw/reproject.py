@@ -42,7 +42,7 @@ def warp(
     size: Size | None = None,
     target_hfov_deg: float | None = None,
     outputs: tuple[str, ...] = ("color",),
-    cut: float = 0.05,
+    cut: float = 0.1,
 ) -> Any:
     """Show B images from T poses each.
 

@@ -93,7 +93,8 @@ def test_a_convex_room_is_seen_as_it_is(name):
     color, depth = picture(sphere())
     true_color, true_depth = picture(sphere(), POSES[name])
     out = reproject.warp(color[None], depth[None], POSES[name][None, None], outputs=("color", "depth", "hole"))
-    assert out["hole"].mean() < 0.01  # the source has no texel at its very poles
+    # The source has no texel at its very poles.
+    assert out["hole"].mean() < (0.01 if name == "up" else 5e-4)
     error = np.abs(out["depth"][0, 0] - true_depth) / true_depth
     assert np.median(error) < 1e-3
     assert np.quantile(error, 0.999) < 0.03  # triangles cut the room's edges

@@ -5,6 +5,8 @@
 #include <array>
 #include <cmath>
 
+#include "wiw/reproject/raster.hpp"
+
 namespace wiw::reproject {
 
 namespace {
@@ -33,46 +35,65 @@ MeshLayout::Axis texel_axis(int count, bool ring, int quads) {
 }
 
 /// Whether inverse depths b and c belong to one surface, given those before b and after c.
-bool continuous(float a, float b, float c, float d, float cut) {
+std::uint8_t continuous(float a, float b, float c, float d, float cut) {
   const float step = c - b;
   const float size = std::abs(step);
-  return size <= cut * std::max(b, c) || std::abs(step - (b - a)) <= 0.5F * size ||
-         std::abs(step - (d - c)) <= 0.5F * size;
+  // Bitwise on purpose: branches would keep the loops around this from being vectorised.
+  return static_cast<std::uint8_t>(static_cast<int>(size <= cut * (b > c ? b : c)) |
+                                   static_cast<int>(std::abs(step - (b - a)) <= 0.5F * size) |
+                                   static_cast<int>(std::abs(step - (d - c)) <= 0.5F * size));
 }
 
-/// Which neighbouring vertices are one surface: the edge to the right of and below each vertex.
-struct Edges {
-  std::vector<std::uint8_t> right, below;
+/// Rows of inverse depth around the one in hand, and which neighbouring vertices are one surface: the edges to the
+/// right in a row of vertices, and below it.
+class EdgeFinder {
+ public:
+  EdgeFinder(const MeshLayout& layout, const std::vector<float>& depth, float cut)
+      : columns_(layout.columns), last_row_(layout.rows - 1), wraps_(layout.view.panoramic), cut_(cut), depth_(depth) {
+    for (auto& row : inverse_) row.resize(static_cast<std::size_t>(columns_));
+    for (int row = 0; row < std::min(3, layout.rows); ++row) load(row);
+  }
+
+  /// Edges between columns j and j + 1.
+  void right(int row, std::vector<std::uint8_t>& joined) {
+    const float* here = inverse(row);
+    const int last = columns_ - 1;
+    for (int j = 1; j + 2 <= last; ++j) joined[j] = continuous(here[j - 1], here[j], here[j + 1], here[j + 2], cut_);
+    joined[0] = continuous(here[wraps_ ? last - 1 : 0], here[0], here[1], here[std::min(2, last)], cut_);
+    joined[last - 1] =
+        continuous(here[std::max(last - 2, 0)], here[last - 1], here[last], here[wraps_ ? 1 : last], cut_);
+  }
+
+  /// Edges between rows `row` and `row` + 1; called once for every row in turn.
+  void below(int row, std::vector<std::uint8_t>& joined) {
+    if (row + 2 <= last_row_) load(row + 2);
+    const float* a = inverse(std::max(row - 1, 0));
+    const float* b = inverse(row);
+    const float* c = inverse(row + 1);
+    const float* d = inverse(std::min(row + 2, last_row_));
+    for (int j = 0; j < columns_; ++j) joined[j] = continuous(a[j], b[j], c[j], d[j], cut_);
+  }
+
+ private:
+  [[nodiscard]] const float* inverse(int row) const { return inverse_[static_cast<std::size_t>(row) % 4].data(); }
+  void load(int row) {
+    const float* from = depth_.data() + static_cast<std::size_t>(row) * columns_;
+    float* to = inverse_[static_cast<std::size_t>(row) % 4].data();
+    for (int j = 0; j < columns_; ++j) to[j] = 1.0F / from[j];
+  }
+
+  int columns_, last_row_;
+  bool wraps_;
+  float cut_;
+  const std::vector<float>& depth_;
+  std::array<std::vector<float>, 4> inverse_;
 };
 
-Edges find_edges(const MeshLayout& layout, const std::vector<float>& depth, float cut) {
-  const int rows = layout.rows;
-  const int columns = layout.columns;
-  const bool wraps = layout.view.panoramic;
-  std::vector<float> inverse(depth.size());
-  std::transform(depth.begin(), depth.end(), inverse.begin(), [](float d) { return 1.0F / d; });
-  Edges edges{std::vector<std::uint8_t>(depth.size()), std::vector<std::uint8_t>(depth.size())};
-  for (int row = 0; row < rows; ++row) {
-    const std::size_t start = static_cast<std::size_t>(row) * columns;
-    const float* here = inverse.data() + start;
-    const auto joined = [&](int before, int column, int after) {
-      return continuous(here[before], here[column], here[column + 1], here[after], cut);
-    };
-    for (int column = 1; column + 2 < columns; ++column) {
-      edges.right[start + column] = joined(column - 1, column, column + 2);
-    }
-    edges.right[start] = joined(wraps ? columns - 2 : 0, 0, std::min(2, columns - 1));
-    edges.right[start + columns - 2] = joined(std::max(columns - 3, 0), columns - 2, wraps ? 1 : columns - 1);
-    if (row + 1 == rows) break;
-    const float* above = inverse.data() + static_cast<std::size_t>(std::max(row - 1, 0)) * columns;
-    const float* below = here + columns;
-    const float* beyond = inverse.data() + static_cast<std::size_t>(std::min(row + 2, rows - 1)) * columns;
-    for (int column = 0; column < columns; ++column) {
-      edges.below[start + column] = continuous(above[column], here[column], below[column], beyond[column], cut);
-    }
-  }
-  return edges;
-}
+/// Edges around one row of quads.
+struct Edges {
+  std::vector<std::uint8_t> above, below;  // along the upper and the lower row of vertices
+  std::vector<std::uint8_t> down;          // between the two rows
+};
 
 /// Part of a quad, as fractions of it.
 struct Part {
@@ -107,8 +128,7 @@ void append_fringe(const MeshLayout& layout, const std::vector<float>& depth, in
 }
 
 /// The nearer sides of a quad whose corners are not one surface.
-void append_cut_quad(const MeshLayout& layout, const DepthMesh& mesh, const Edges& edges, int row, int column,
-                     float cut, FringeQuads& fringe) {
+void append_cut_quad(const MeshLayout& layout, const Edges& edges, int row, int column, float cut, DepthMesh& mesh) {
   const std::size_t corner00 = static_cast<std::size_t>(row) * layout.columns + column;
   const std::size_t corner10 = corner00 + layout.columns;
   const std::array<float, 4> depth{mesh.depth[corner00], mesh.depth[corner00 + 1], mesh.depth[corner10],
@@ -116,12 +136,12 @@ void append_cut_quad(const MeshLayout& layout, const DepthMesh& mesh, const Edge
   const float farthest = *std::max_element(depth.begin(), depth.end());
   const auto nearer = [&](int corner) { return depth[corner] < (1.0F - cut) * farthest; };
   const auto append = [&](const Part& part, const std::array<int, 4>& from) {
-    append_fringe(layout, mesh.depth, row, column, part, from, fringe);
+    append_fringe(layout, mesh.depth, row, column, part, from, mesh.fringe);
   };
-  if (edges.below[corner00] != 0 && edges.below[corner00 + 1] != 0) {
+  if (edges.down[column] != 0 && edges.down[column + 1] != 0) {
     if (nearer(0) || nearer(2)) append({0.0F, 0.5F, 0.0F, 1.0F}, {0, 0, 2, 2});
     if (nearer(1) || nearer(3)) append({0.5F, 1.0F, 0.0F, 1.0F}, {1, 1, 3, 3});
-  } else if (edges.right[corner00] != 0 && edges.right[corner10] != 0) {
+  } else if (edges.above[column] != 0 && edges.below[column] != 0) {
     if (nearer(0) || nearer(1)) append({0.0F, 1.0F, 0.0F, 0.5F}, {0, 1, 0, 1});
     if (nearer(2) || nearer(3)) append({0.0F, 1.0F, 0.5F, 1.0F}, {2, 3, 2, 3});
   } else {
@@ -138,16 +158,28 @@ void append_cut_quad(const MeshLayout& layout, const DepthMesh& mesh, const Edge
 std::vector<float> vertex_depths(const MeshLayout& layout, const float* depth) {
   const Size& size = layout.view.size;
   const int ring = layout.view.panoramic ? 0 : 1;
-  std::vector<float> vertices;
-  vertices.reserve(static_cast<std::size_t>(layout.rows) * layout.columns);
+  const auto or_far = [](float d) { return d > 0.0F && d < kFar ? d : kFar; };
+  std::vector<float> vertices(static_cast<std::size_t>(layout.rows) * layout.columns);
   for (int row = 0; row < layout.rows; ++row) {
     const float* from = depth + static_cast<std::size_t>(std::clamp(row - ring, 0, size.height - 1)) * size.width;
-    for (int column = 0; column < layout.columns; ++column) {
-      const int pixel = ring != 0 ? std::clamp(column - 1, 0, size.width - 1) : (column < size.width ? column : 0);
-      vertices.push_back(from[pixel] > 0.0F && from[pixel] < kFar ? from[pixel] : kFar);
-    }
+    float* to = vertices.data() + static_cast<std::size_t>(row) * layout.columns;
+    for (int column = 0; column < size.width; ++column) to[column + ring] = or_far(from[column]);
+    if (ring != 0) to[0] = to[1];
+    to[layout.columns - 1] = ring != 0 ? to[layout.columns - 2] : to[0];
   }
   return vertices;
+}
+
+void pad(FringeQuads& fringe) {
+  const auto size = static_cast<std::size_t>(padded_lanes(static_cast<int>(fringe.texel.size())));
+  for (int corner = 0; corner < 4; ++corner) {
+    for (auto* values : {&fringe.ray_x[corner], &fringe.ray_y[corner], &fringe.ray_z[corner], &fringe.depth[corner]}) {
+      values->resize(size);
+    }
+  }
+  for (auto* values : {&fringe.begin_x, &fringe.span_x, &fringe.begin_y, &fringe.span_y}) values->resize(size);
+  fringe.triangles.resize(size);
+  fringe.texel.resize(size);
 }
 
 }  // namespace
@@ -162,22 +194,36 @@ MeshLayout::MeshLayout(const View& source) : view(source) {
   rays = make_rays(view, across_positions, down_positions);
   across = texel_axis(view.size.width, ring, columns - 1);
   down = texel_axis(view.size.height, ring, rows - 1);
+  const auto padded = static_cast<std::size_t>(padded_lanes(columns));
+  across.texel.resize(padded);
+  across.begin.resize(padded);
+  across.span.resize(padded);
 }
 
 DepthMesh build_mesh(const MeshLayout& layout, const float* depth, float cut) {
   DepthMesh mesh;
   mesh.depth = vertex_depths(layout, depth);
-  const Edges edges = find_edges(layout, mesh.depth, cut);
-  mesh.triangles.reserve(static_cast<std::size_t>(layout.rows - 1) * (layout.columns - 1));
+  const auto stride = static_cast<std::size_t>(padded_lanes(layout.columns));
+  mesh.triangles.resize(static_cast<std::size_t>(layout.rows - 1) * stride);
+  EdgeFinder finder(layout, mesh.depth, cut);
+  const std::vector<std::uint8_t> none(static_cast<std::size_t>(layout.columns));
+  Edges edges{none, none, none};
+  finder.right(0, edges.below);
   for (int row = 0; row + 1 < layout.rows; ++row) {
-    for (int column = 0; column + 1 < layout.columns; ++column) {
-      const std::size_t corner = static_cast<std::size_t>(row) * layout.columns + column;
-      const bool upper = (edges.right[corner] & edges.below[corner]) != 0;
-      const bool lower = (edges.right[corner + layout.columns] & edges.below[corner + 1]) != 0;
-      mesh.triangles.push_back(static_cast<std::uint8_t>((upper ? kUpperLeft : 0) | (lower ? kLowerRight : 0)));
-      if (!upper || !lower) append_cut_quad(layout, mesh, edges, row, column, cut, mesh.fringe);
+    edges.above.swap(edges.below);
+    finder.below(row, edges.down);
+    finder.right(row + 1, edges.below);
+    std::uint8_t* triangles = mesh.triangles.data() + static_cast<std::size_t>(row) * stride;
+    const std::uint8_t *above = edges.above.data(), *below = edges.below.data(), *down = edges.down.data();
+    for (int j = 0; j + 1 < layout.columns; ++j) {
+      triangles[j] = static_cast<std::uint8_t>((above[j] & down[j] & 1) | ((below[j] & down[j + 1] & 1) << 1));
+    }
+    for (int j = 0; j + 1 < layout.columns; ++j) {
+      if (triangles[j] != (kUpperLeft | kLowerRight)) append_cut_quad(layout, edges, row, j, cut, mesh);
     }
   }
+  mesh.fringe.count = static_cast<int>(mesh.fringe.texel.size());
+  pad(mesh.fringe);
   return mesh;
 }
 

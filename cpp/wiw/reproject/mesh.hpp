@@ -35,8 +35,10 @@ constexpr std::uint8_t kUpperLeft = 1;   // 00 01 10
 constexpr std::uint8_t kLowerRight = 2;  // 11 10 01
 
 /// Quads that are not part of the grid: where the mesh is cut, the nearer surface still reaches half a pixel beyond its
-/// last vertices, so objects keep their size and those a pixel wide do not vanish. Corner-major arrays.
+/// last vertices, so objects keep their size and those a pixel wide do not vanish. One array a corner; padded to whole
+/// groups of kLanes.
 struct FringeQuads {
+  int count = 0;
   std::vector<float> ray_x[4], ray_y[4], ray_z[4], depth[4];
   std::vector<std::uint8_t> triangles;
   std::vector<std::uint32_t> texel;  // column | row << 16
@@ -46,7 +48,7 @@ struct FringeQuads {
 /// Depth mesh of one image.
 struct DepthMesh {
   std::vector<float> depth;             // [rows, columns] of vertices, kFar where nothing is hit
-  std::vector<std::uint8_t> triangles;  // [rows - 1, columns - 1] of quads: which triangles are part of a surface
+  std::vector<std::uint8_t> triangles;  // [rows - 1, padded_lanes(columns)] of quads: triangles that are surface
   FringeQuads fringe;
 };
 

@@ -7,6 +7,11 @@
 
 namespace wiw::reproject {
 
+/// Quads drawn at once. Arrays of quads and of vertices are padded so that a whole group can be read anywhere; padding
+/// quads have no triangles.
+constexpr int kLanes = 16;
+constexpr int padded_lanes(int count) { return (count + 2 * kLanes) / kLanes * kLanes; }
+
 /// Loose quads with their own corners 00 01 10 11, each a ray times a depth; see DepthMesh.
 struct Fringe {
   int count;
@@ -26,7 +31,7 @@ struct RasterJob {
   const std::uint32_t *texel_across, *texel_down;
   const float *begin_across, *span_across, *begin_down, *span_down;
   const float* depth;
-  const std::uint8_t* triangles;
+  const std::uint8_t* triangles;  // [rows - 1, padded_lanes(columns)]
   Fringe fringe;
   // Rigid transform from source to target camera, rows of [R | t].
   float transform[12];
@@ -34,7 +39,9 @@ struct RasterJob {
   bool panoramic;
   int height, width;
   float focal;  // pixels, pinhole only
-  const float *target_ray_x, *target_ray_z, *target_ray_m, *target_ray_y;
+  // Per column from -width to 2 width + kLanes, so that boxes may cross the seam; per row.
+  const float *target_ray_x, *target_ray_z;
+  const float *target_ray_m, *target_ray_y;
   // Room for two rows of vertices or a block of fringe: scratch_floats(columns).
   float* scratch;
   // Results [height, width]: depth (kNothing where no triangle lands), and the texel block and fractions to look up in
@@ -45,7 +52,7 @@ struct RasterJob {
 };
 
 constexpr std::size_t scratch_floats(int columns) {
-  const std::size_t rows = 12 * static_cast<std::size_t>(columns);
+  const std::size_t rows = 12 * static_cast<std::size_t>(padded_lanes(columns)) + 1;
   const std::size_t fringe = std::size_t{24} * kFringeBlock;
   return rows > fringe ? rows : fringe;
 }

@@ -3,19 +3,22 @@
 // instruction set includes it. Internal linkage throughout, and no library headers, so that nothing compiled for a
 // newer processor can be linked into code that runs on an older one.
 //
-// Nearly all quads cover about one target pixel. They are handled in chunks: one loop finds every quad's box of pixel
-// centres, then one loop per position in the box tests all quads of the chunk at once. Quads with larger boxes, and
-// those around a pole of the target, are intersected with the pixels' rays one by one.
+// Nearly all quads cover about one target pixel. They are handled kLanes at a time: one loop finds every quad's box of
+// pixel centres, then one loop per position in the box tests all of them at once. Quads with larger boxes, and those
+// around a pole of the target, are intersected with the pixels' rays one by one.
 #pragma once
 
 #include "wiw/reproject/raster.hpp"
 
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
 namespace wiw::reproject {
 namespace {
 
-constexpr int kChunk = 64;
 constexpr int kSmallBox = 4;       // largest box, in pixels a side, that goes through the chunk loops
-constexpr float kSlack = 1.0e-4F;  // barycentric tolerance that closes cracks between neighbours
+constexpr float kSlack = 1.0e-2F;  // barycentric tolerance: closes cracks where straight edges meet great circles
 constexpr float kNear = 1.0e-3F;   // metres: nothing closer is drawn
 constexpr float kOne14 = 16384.0F;
 
@@ -189,20 +192,39 @@ inline Quads advance(const Quads& quads, int n) {
   return moved;
 }
 
-/// What is known of up to kChunk quads before and after testing one position of their boxes.
+/// What is known of up to kLanes quads before and after testing one position of their boxes.
 struct Chunk {
-  float u00[kChunk], u01[kChunk], u10[kChunk], u11[kChunk];  // on the same side of the seam
-  float inverse_upper[kChunk], inverse_lower[kChunk];        // 1 / area, 0 where there is no triangle
-  int left[kChunk], top[kChunk], width[kChunk], height[kChunk];
-  int large[kChunk];
-  int hit[kChunk], hit_u[kChunk], hit_v[kChunk], fraction[kChunk];
-  float hit_depth[kChunk];
+  float u00[kLanes], u01[kLanes], u10[kLanes], u11[kLanes];  // on the same side of the seam
+  float inverse_upper[kLanes], inverse_lower[kLanes];        // 1 / area, 0 where there is no triangle
+  int left[kLanes], top[kLanes], width[kLanes], height[kLanes];
+  int large[kLanes];
+  int hit[kLanes], hit_u[kLanes], hit_v[kLanes], fraction[kLanes];
+  float hit_depth[kLanes];
 };
 
 /// Difference of columns on the shorter way round.
 inline float unwrap(float difference, float turn) {
   const float half = 0.5F * turn;
   return difference > half ? difference - turn : (difference < -half ? difference + turn : difference);
+}
+
+/// Bit k is set where values[k] is not 0.
+inline unsigned set_lanes(const int* values) {
+#if defined(__AVX512F__)
+  const __m512i all = _mm512_loadu_si512(values);
+  return _mm512_test_epi32_mask(all, all);
+#elif defined(__AVX2__)
+  const auto half = [](const int* from) {
+    const __m256i some = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(from));
+    return static_cast<unsigned>(
+        _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpgt_epi32(some, _mm256_setzero_si256()))));
+  };
+  return half(values) | (half(values + 8) << 8);
+#else
+  unsigned set = 0;
+  for (int k = 0; k < kLanes; ++k) set |= static_cast<unsigned>(values[k] != 0 ? 1 : 0) << k;
+  return set;
+#endif
 }
 
 inline float inverse_or_zero(float area) { return absolute(area) > 1.0e-12F ? 1.0F / area : 0.0F; }
@@ -212,7 +234,7 @@ struct Box {
 };
 
 /// Fills corners and boxes of a chunk; returns the largest box that the chunk loops take.
-WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, int count, Chunk& __restrict chunk) {
+WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, Chunk& __restrict chunk) {
   // A pinhole image does not wrap: a turn longer than any difference leaves it alone.
   const float turn = job.panoramic ? static_cast<float>(job.width) : 1.0e9F;
   const int low_u = job.panoramic ? -job.width : 0;
@@ -222,11 +244,13 @@ WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, int count
   const float *v0 = quads.corner[0].v, *v1 = quads.corner[1].v, *v2 = quads.corner[2].v, *v3 = quads.corner[3].v;
   const float *d0 = quads.corner[0].depth, *d1 = quads.corner[1].depth;
   const float *d2 = quads.corner[2].depth, *d3 = quads.corner[3].depth;
-  const std::uint8_t* triangles = quads.triangles;
+  // Apart, because loops of one element size are vectorised best.
+  int triangles[kLanes];
+  for (int k = 0; k < kLanes; ++k) triangles[k] = quads.triangles[k];
   int widest = 0;
   int highest = 0;
   int any_large = 0;
-  for (int k = 0; k < count; ++k) {
+  for (int k = 0; k < kLanes; ++k) {
     const float d01 = unwrap(u1[k] - u0[k], turn);
     const float d10 = unwrap(u2[k] - u0[k], turn);
     const float d11 = unwrap(u3[k] - u0[k], turn);
@@ -269,16 +293,14 @@ WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, int count
 }
 
 /// Tests position (step_u, step_v) of every box in the chunk.
-WIW_NOINLINE void test_chunk(const Quads& quads, int count, int step_u, int step_v, Chunk& __restrict chunk) {
+template <bool kOneRow>
+WIW_NOINLINE void test_chunk(const Quads& quads, int step_u, int step_v, Chunk& __restrict chunk) {
   const float *v0 = quads.corner[0].v, *v1 = quads.corner[1].v, *v2 = quads.corner[2].v, *v3 = quads.corner[3].v;
   const float *d0 = quads.corner[0].depth, *d1 = quads.corner[1].depth;
   const float *d2 = quads.corner[2].depth, *d3 = quads.corner[3].depth;
   const float *begin_x = quads.begin_x, *span_x = quads.span_x;
   const float *begin_y = quads.begin_y, *span_y = quads.span_y;
-  const int y_step = quads.y_step;
-  const float begin_y0 = begin_y[0];
-  const float span_y0 = span_y[0];
-  for (int k = 0; k < count; ++k) {
+  for (int k = 0; k < kLanes; ++k) {
     const int u = chunk.left[k] + step_u;
     const int v = chunk.top[k] + step_v;
     const float x = static_cast<float>(u);
@@ -301,19 +323,18 @@ WIW_NOINLINE void test_chunk(const Quads& quads, int count, int step_u, int step
     const float z2 = d3[k] + a2 * (d2[k] - d3[k]) + b2 * (d1[k] - d3[k]);
     const float a = in1 != 0 ? a1 : 1.0F - a2;
     const float b = in1 != 0 ? b1 : 1.0F - b2;
-    const float from_y = y_step != 0 ? begin_y[k * y_step] : begin_y0;
-    const float over_y = y_step != 0 ? span_y[k * y_step] : span_y0;
     chunk.hit_depth[k] = in1 != 0 ? z1 : z2;
-    chunk.fraction[k] = fraction14(begin_x[k], span_x[k], a) | (fraction14(from_y, over_y, b) << 16);
+    chunk.fraction[k] =
+        fraction14(begin_x[k], span_x[k], a) | (fraction14(begin_y[kOneRow ? 0 : k], span_y[kOneRow ? 0 : k], b) << 16);
     chunk.hit_u[k] = u;
     chunk.hit_v[k] = v;
     chunk.hit[k] = (step_u < chunk.width[k] ? 1 : 0) & (step_v < chunk.height[k] ? 1 : 0) & (in1 | in2);
   }
 }
 
-inline void put_chunk(const RasterJob& job, const Quads& quads, int count, const Chunk& chunk) {
-  for (int k = 0; k < count; ++k) {
-    if (chunk.hit[k] == 0) continue;
+inline void put_chunk(const RasterJob& job, const Quads& quads, const Chunk& chunk) {
+  for (unsigned left = set_lanes(chunk.hit); left != 0; left &= left - 1) {
+    const int k = __builtin_ctz(left);
     put(job, chunk.hit_u[k], chunk.hit_v[k], chunk.hit_depth[k], quads.texel[k] + quads.texel_row,
         static_cast<std::uint32_t>(chunk.fraction[k]));
   }
@@ -330,48 +351,77 @@ inline float dot(const Vector& a, const Vector& b) { return a.x * b.x + a.y * b.
 inline Vector point(const Vertices& vertices, int k) { return {vertices.px[k], vertices.py[k], vertices.pz[k]}; }
 
 /// Triangle corner + a side_a + b side_b, prepared for rays from the origin (Moeller and Trumbore 1997, with all but
-/// the ray's direction factored out): a = normal_a . d / n . d, likewise b; the depth is n . corner / n . d.
+/// the ray's direction factored out): a = normal_a . d / n . d, likewise b; the depth is n . corner / n . d. normal_a
+/// and normal_b are perpendicular to the corner, so the ray through it, `origin`, is taken off d first: what is left is
+/// as small as the triangle, and so are the errors.
 struct RayTriangle {
-  Vector normal, normal_a, normal_b;
+  Vector normal, normal_a, normal_b, origin;
   float offset;
 };
 
-inline RayTriangle ray_triangle(const Vector& corner, const Vector& end_a, const Vector& end_b) {
+/// `depth` is the corner's.
+inline RayTriangle ray_triangle(const Vector& corner, float depth, const Vector& end_a, const Vector& end_b) {
   const Vector side_a = end_a - corner;
   const Vector side_b = end_b - corner;
   const Vector normal = cross(side_a, side_b);
-  return {normal, cross(side_b, corner), cross(corner, side_a), dot(normal, corner)};
+  const float scale = 1.0F / depth;
+  const Vector origin{corner.x * scale, corner.y * scale, corner.z * scale};
+  return {normal, cross(side_b, corner), cross(corner, side_a), origin, dot(normal, corner)};
 }
+
+/// Results of kLanes rays.
+struct Lanes {
+  int set[kLanes];
+  float a[kLanes], b[kLanes], depth[kLanes];
+};
 
 struct PixelBox {
   int left, right, top, bottom;  // inclusive
 };
 
+/// Where the rays of kLanes pixels from column `left` of row v meet the triangle.
+WIW_NOINLINE void meet_rays(const RasterJob& job, const RayTriangle& triangle, int left, int right, int v, bool flip,
+                            Lanes& __restrict lanes) {
+  const float *ray_x = job.target_ray_x + left, *ray_z = job.target_ray_z + left;
+  const float m = job.target_ray_m[v];
+  const float y = job.target_ray_y[v];
+  const Vector n = triangle.normal, normal_a = triangle.normal_a, normal_b = triangle.normal_b;
+  const Vector origin = triangle.origin;
+  const float offset = triangle.offset;
+  const float dy = y - origin.y;
+  const int count = right - left + 1;
+  for (int k = 0; k < kLanes; ++k) {
+    const float x = ray_x[k] * m;
+    const float z = ray_z[k] * m;
+    const float dx = x - origin.x;
+    const float dz = z - origin.z;
+    // Parallel rays divide by zero; what comes of it is inside nothing.
+    const float inverse = 1.0F / (n.x * x + n.y * y + n.z * z);
+    const float a = (normal_a.x * dx + normal_a.y * dy + normal_a.z * dz) * inverse;
+    const float b = (normal_b.x * dx + normal_b.y * dy + normal_b.z * dz) * inverse;
+    const float depth = offset * inverse;
+    lanes.set[k] = (a >= -kSlack ? 1 : 0) & (b >= -kSlack ? 1 : 0) & (a + b <= 1.0F + kSlack ? 1 : 0) &
+                   (depth > kNear ? 1 : 0) & (k < count ? 1 : 0);
+    lanes.a[k] = flip ? 1.0F - a : a;
+    lanes.b[k] = flip ? 1.0F - b : b;
+    lanes.depth[k] = depth;
+  }
+}
+
 /// Draws one triangle of quad k over a box of pixels; `flip` for the lower right triangle, whose corner is 11.
 inline void draw_triangle(const RasterJob& job, const Quads& quads, int k, const RayTriangle& triangle, bool flip,
                           const PixelBox& box) {
   const std::uint32_t texel = quads.texel[k] + quads.texel_row;
+  Lanes lanes;
   for (int v = box.top; v <= box.bottom; ++v) {
-    for (int u = box.left; u <= box.right; ++u) {
-      int c = u;
-      if (job.panoramic && c < 0) c += job.width;
-      if (job.panoramic && c >= job.width) c -= job.width;
-      const Vector d{job.target_ray_x[c] * job.target_ray_m[v], job.target_ray_y[v],
-                     job.target_ray_z[c] * job.target_ray_m[v]};
-      const float facing = dot(triangle.normal, d);
-      if (facing == 0.0F) continue;
-      const float inverse = 1.0F / facing;
-      float a = dot(triangle.normal_a, d) * inverse;
-      float b = dot(triangle.normal_b, d) * inverse;
-      const float depth = triangle.offset * inverse;
-      if (!(a >= -kSlack && b >= -kSlack && a + b <= 1.0F + kSlack && depth > kNear)) continue;
-      if (flip) {
-        a = 1.0F - a;
-        b = 1.0F - b;
+    for (int left = box.left; left <= box.right; left += kLanes) {
+      meet_rays(job, triangle, left, box.right, v, flip, lanes);
+      for (unsigned set = set_lanes(lanes.set); set != 0; set &= set - 1) {
+        const int lane = __builtin_ctz(set);
+        const int fx = fraction14(quads.begin_x[k], quads.span_x[k], lanes.a[lane]);
+        const int fy = fraction14(quads.begin_y[k * quads.y_step], quads.span_y[k * quads.y_step], lanes.b[lane]);
+        put(job, left + lane, v, lanes.depth[lane], texel, static_cast<std::uint32_t>(fx | (fy << 16)));
       }
-      const int fx = fraction14(quads.begin_x[k], quads.span_x[k], a);
-      const int fy = fraction14(quads.begin_y[k * quads.y_step], quads.span_y[k * quads.y_step], b);
-      put(job, c, v, depth, texel, static_cast<std::uint32_t>(fx | (fy << 16)));
     }
   }
 }
@@ -412,23 +462,25 @@ inline void draw_large(const RasterJob& job, const Quads& quads, int k, const Ch
   const Vector p01 = point(quads.corner[1], k);
   const Vector p10 = point(quads.corner[2], k);
   const Vector p11 = point(quads.corner[3], k);
-  if ((quads.triangles[k] & 1) != 0) draw_triangle(job, quads, k, ray_triangle(p00, p01, p10), false, box);
-  if ((quads.triangles[k] & 2) != 0) draw_triangle(job, quads, k, ray_triangle(p11, p10, p01), true, box);
+  if ((quads.triangles[k] & 1) != 0)
+    draw_triangle(job, quads, k, ray_triangle(p00, quads.corner[0].depth[k], p01, p10), false, box);
+  if ((quads.triangles[k] & 2) != 0)
+    draw_triangle(job, quads, k, ray_triangle(p11, quads.corner[3].depth[k], p10, p01), true, box);
 }
 
-inline void draw_quads(const RasterJob& job, const Quads& all, int total, Chunk& chunk) {
-  for (int first = 0; first < total; first += kChunk) {
-    const int count = min_of(kChunk, total - first);
+template <bool kOneRow>
+inline void draw_quads(const RasterJob& job, const Quads& all, int count, Chunk& chunk) {
+  for (int first = 0; first < count; first += kLanes) {
     const Quads quads = advance(all, first);
-    const Box box = bound_chunk(job, quads, count, chunk);
+    const Box box = bound_chunk(job, quads, chunk);
     for (int step_v = 0; step_v < box.height; ++step_v) {
       for (int step_u = 0; step_u < box.width; ++step_u) {
-        test_chunk(quads, count, step_u, step_v, chunk);
-        put_chunk(job, quads, count, chunk);
+        test_chunk<kOneRow>(quads, step_u, step_v, chunk);
+        put_chunk(job, quads, chunk);
       }
     }
     if (box.any_large == 0) continue;
-    for (int k = 0; k < count; ++k) {
+    for (int k = 0; k < kLanes; ++k) {
       if (chunk.large[k] != 0) draw_large(job, quads, k, chunk);
     }
   }
@@ -437,7 +489,7 @@ inline void draw_quads(const RasterJob& job, const Quads& all, int total, Chunk&
 /// The mesh's quads between two rows of vertices.
 inline Quads quad_row(const RasterJob& job, int row, const Vertices& upper, const Vertices& lower) {
   return {{upper, advance(upper, 1), lower, advance(lower, 1)},
-          job.triangles + static_cast<std::size_t>(row) * (job.columns - 1),
+          job.triangles + static_cast<std::size_t>(row) * padded_lanes(job.columns),
           job.texel_across,
           job.texel_down[row] << 16,
           job.begin_across,
@@ -448,12 +500,13 @@ inline Quads quad_row(const RasterJob& job, int row, const Vertices& upper, cons
 }
 
 inline void draw_mesh(const RasterJob& job, Chunk& chunk) {
-  Vertices upper = vertices_at(job.scratch, job.columns);
-  Vertices lower = vertices_at(job.scratch + 6 * static_cast<std::ptrdiff_t>(job.columns), job.columns);
+  Vertices upper = vertices_at(job.scratch, padded_lanes(job.columns));
+  Vertices lower =
+      vertices_at(job.scratch + 6 * static_cast<std::ptrdiff_t>(padded_lanes(job.columns)), padded_lanes(job.columns));
   build_row(job, 0, upper);
   for (int row = 0; row + 1 < job.rows; ++row) {
     build_row(job, row + 1, lower);
-    draw_quads(job, quad_row(job, row, upper, lower), job.columns - 1, chunk);
+    draw_quads<true>(job, quad_row(job, row, upper, lower), job.columns - 1, chunk);
     const Vertices swap = upper;
     upper = lower;
     lower = swap;
@@ -481,7 +534,7 @@ inline void draw_fringe(const RasterJob& job, Chunk& chunk) {
                 fringe.ray_z[corner] + first, 1.0F, fringe.depth[corner] + first, count, out.px, out.py, out.pz);
       project(job, out, count);
     }
-    draw_quads(job, quads, count, chunk);
+    draw_quads<false>(job, quads, count, chunk);
   }
 }
 

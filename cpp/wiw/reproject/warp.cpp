@@ -23,9 +23,10 @@ RasterFunction raster_function(Isa isa) {
   return raster_scalar;
 }
 
-std::vector<double> indices(int count) {
-  std::vector<double> values(static_cast<std::size_t>(count));
-  std::iota(values.begin(), values.end(), 0.0);
+/// begin, begin + 1, ... end - 1.
+std::vector<double> indices(int begin, int end) {
+  std::vector<double> values(static_cast<std::size_t>(end - begin));
+  std::iota(values.begin(), values.end(), static_cast<double>(begin));
   return values;
 }
 
@@ -51,7 +52,7 @@ Scratch& scratch_for(std::size_t pixels, int columns) {
 Fringe fringe_of(const DepthMesh& mesh) {
   const FringeQuads& quads = mesh.fringe;
   Fringe fringe{};
-  fringe.count = static_cast<int>(quads.texel.size());
+  fringe.count = quads.count;
   for (int corner = 0; corner < 4; ++corner) {
     fringe.ray_x[corner] = quads.ray_x[corner].data();
     fringe.ray_y[corner] = quads.ray_y[corner].data();
@@ -77,7 +78,8 @@ const View& checked(const View& view, const char* name) {
 Warp::Warp(const View& source, const View& target, float cut)
     : layout_(checked(source, "source")),
       target_(checked(target, "target")),
-      target_rays_(make_rays(target_, indices(target_.size.width), indices(target_.size.height))),
+      target_rays_(make_rays(target_, indices(-target_.size.width, 2 * target_.size.width + kLanes),
+                             indices(0, target_.size.height))),
       cut_(cut) {
   if (!(cut > 0.0F)) throw ArgumentError("cut: expected a positive fraction, got " + std::to_string(cut));
 }
@@ -108,8 +110,8 @@ void Warp::warp_one(const std::uint8_t* color, const DepthMesh& mesh, const Pose
                 target_.size.height,
                 target_.size.width,
                 static_cast<float>(focal),
-                target_rays_.x.data(),
-                target_rays_.z.data(),
+                target_rays_.x.data() + target_.size.width,
+                target_rays_.z.data() + target_.size.width,
                 target_rays_.m.data(),
                 target_rays_.y.data(),
                 scratch.vertices.data(),

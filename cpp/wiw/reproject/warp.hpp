@@ -22,7 +22,7 @@ struct WarpTargets {
 class Warp {
  public:
   /// `cut`: see build_mesh.
-  Warp(const View& source, const View& target, float cut = 0.05F);
+  Warp(const View& source, const View& target, float cut = 0.1F);
 
   /// `color` [B, H, W, 3], `depth` [B, H, W]; `T_source_target` [B, T] maps the target camera's coordinates to the
   /// source camera's, that is: it is the pose of the imagined camera in the frame of the real one.
