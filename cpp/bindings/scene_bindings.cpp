@@ -178,8 +178,11 @@ void bind_scene_class(py::module_& module) {
 
 }  // namespace
 
+void bind_apartment(py::module_& module);
+
 void bind_scene(py::module_& module) {
   bind_scene_class(module);
+  bind_apartment(module);
   module.def("import_scene", &import_scene, py::arg("path"), py::kw_only(), py::arg("up") = py::none(),
              py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
              py::arg("model_folders") = Paths{},
