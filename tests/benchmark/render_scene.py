@@ -7,7 +7,8 @@ count. One atlas texture, one lightmap. Y up, metres, both faces of every triang
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,6 +186,34 @@ def make(triangles: int, seed: int = 7) -> Arrays:
         positions.astype(np.float32), normals.astype(np.float32), uv.astype(np.float32), light_uv.astype(np.float32),
         faces.astype(np.uint32), starts[:, 0], starts[:, 1], atlas, lightmap, _views(rng),
     )  # fmt: skip
+
+
+def perspective_rays(size: tuple[int, int], hfov_deg: float) -> NDArray[np.float32]:
+    """[H, W, 3] in the camera frame, planar depth 1."""
+    height, width = size
+    focal = width / 2 / np.tan(np.radians(hfov_deg) / 2)
+    x, y = (np.arange(width) + 0.5 - width / 2) / focal, (height / 2 - np.arange(height) - 0.5) / focal
+    x, y = np.meshgrid(x, y)
+    return np.stack([x, y, -np.ones_like(x)], -1).astype(np.float32)
+
+
+def panorama_rays(size: tuple[int, int]) -> NDArray[np.float32]:
+    """[H, W, 3] unit vectors in the camera frame."""
+    height, width = size
+    longitude = ((np.arange(width) + 0.5) / width - 0.5) * 2 * np.pi
+    latitude = (0.5 - (np.arange(height) + 0.5) / height)[:, None] * np.pi
+    cos = np.cos(latitude)
+    rays = (np.sin(longitude) * cos, np.sin(latitude) + 0 * longitude, -np.cos(longitude) * cos)
+    return np.stack(rays, -1).astype(np.float32)
+
+
+def save(arrays: Arrays, path: Path) -> None:
+    np.savez(path, **{field.name: getattr(arrays, field.name) for field in fields(arrays)})
+
+
+def load(path: Path) -> Arrays:
+    with np.load(path) as file:
+        return Arrays(**{field.name: file[field.name] for field in fields(Arrays)})
 
 
 def to_scene(arrays: Arrays):
