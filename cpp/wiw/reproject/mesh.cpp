@@ -154,6 +154,25 @@ void append_cut_quad(const MeshLayout& layout, const Edges& edges, int row, int 
   }
 }
 
+/// Gives pixels of a row without depth what lies in the plane between their neighbours in the row: sky seen through a
+/// window then moves with the window. Sky left at infinity would shine through every gap beside it. Rows without any
+/// depth stay at kFar.
+void span_sky(float* row, int count) {
+  int last = -1;
+  for (int column = 0; column <= count; ++column) {
+    if (column < count && row[column] >= kFar) continue;
+    if (column > last + 1 && (last >= 0 || column < count)) {
+      const float left = 1.0F / row[last >= 0 ? last : column];
+      const float right = 1.0F / row[column < count ? column : last];
+      for (int j = last + 1; j < column; ++j) {
+        const float share = static_cast<float>(j - last) / static_cast<float>(column - last);
+        row[j] = 1.0F / (left + share * (right - left));
+      }
+    }
+    last = column;
+  }
+}
+
 /// The image's depths at the vertices.
 std::vector<float> vertex_depths(const MeshLayout& layout, const float* depth) {
   const Size& size = layout.view.size;
@@ -164,6 +183,7 @@ std::vector<float> vertex_depths(const MeshLayout& layout, const float* depth) {
     const float* from = depth + static_cast<std::size_t>(std::clamp(row - ring, 0, size.height - 1)) * size.width;
     float* to = vertices.data() + static_cast<std::size_t>(row) * layout.columns;
     for (int column = 0; column < size.width; ++column) to[column + ring] = or_far(from[column]);
+    span_sky(to + ring, size.width);
     if (ring != 0) to[0] = to[1];
     to[layout.columns - 1] = ring != 0 ? to[layout.columns - 2] : to[0];
   }

@@ -47,14 +47,15 @@ struct FringeQuads {
 
 /// Depth mesh of one image.
 struct DepthMesh {
-  std::vector<float> depth;             // [rows, columns] of vertices, kFar where nothing is hit
+  std::vector<float> depth;             // [rows, columns] of vertices, none missing: see build_mesh
   std::vector<std::uint8_t> triangles;  // [rows - 1, padded_lanes(columns)] of quads: triangles that are surface
   FringeQuads fringe;
 };
 
 /// Builds the mesh and cuts it where two neighbouring depths differ by more than the fraction `cut` of the farther
 /// one, unless inverse depth goes on in the same slope on either side: on any plane it is linear, so a grazing wall
-/// stays whole.
+/// stays whole. Pixels without depth (sky) are spread between their neighbours in the row, or lie at kFar where the row
+/// has none.
 DepthMesh build_mesh(const MeshLayout& layout, const float* depth, float cut);
 
 }  // namespace wiw::reproject

@@ -68,6 +68,16 @@ Fringe fringe_of(const DepthMesh& mesh) {
   return fringe;
 }
 
+/// Whether the source texel nearest to a sample has no depth. Holes read texel 0 and are not sky for that.
+bool saw_sky(std::uint32_t texel, std::uint32_t fraction14, const float* depth, const Size& size) {
+  if (texel == 0 && fraction14 == 0) return false;
+  const std::uint32_t half = 1u << (panorama::kWeightBits - 1);
+  const std::uint32_t column = (texel & 0xFFFFu) + ((fraction14 & 0xFFFFu) >= half ? 1 : 0);
+  const std::uint32_t row = (texel >> 16) + ((fraction14 >> 16) >= half ? 1 : 0);
+  const auto width = static_cast<std::uint32_t>(size.width);
+  return !(depth[static_cast<std::size_t>(row) * width + (column < width ? column : 0)] > 0.0F);
+}
+
 const View& checked(const View& view, const char* name) {
   check_view(view, name);
   return view;
@@ -84,8 +94,8 @@ Warp::Warp(const View& source, const View& target, float cut)
   if (!(cut > 0.0F)) throw ArgumentError("cut: expected a positive fraction, got " + std::to_string(cut));
 }
 
-void Warp::warp_one(const std::uint8_t* color, const DepthMesh& mesh, const Pose& T_source_target, std::size_t frame,
-                    const WarpTargets& out, Isa isa) const {
+void Warp::warp_one(const std::uint8_t* color, const float* depth, const DepthMesh& mesh, const Pose& T_source_target,
+                    std::size_t frame, const WarpTargets& out, Isa isa) const {
   const std::size_t pixels = target_.size.pixels();
   Scratch& scratch = scratch_for(pixels, layout_.columns);
   const Pose T_target_source = T_source_target.inverse();
@@ -132,9 +142,10 @@ void Warp::warp_one(const std::uint8_t* color, const DepthMesh& mesh, const Pose
   panorama::remap_blocks({color, layout_.view.size, 3}, scratch.texel, scratch.fraction14, to, isa);
   fill_holes({to, target_.size, 3}, {scratch.depth.data(), target_.size, 1}, target_.panoramic);
   if (out.depth != nullptr) {
-    // Half way to kFar is farther than any real surface.
-    std::transform(scratch.depth.begin(), scratch.depth.end(), out.depth + frame * pixels,
-                   [](float d) { return d < 0.5F * kFar ? d : 0.0F; });
+    for (std::size_t i = 0; i < pixels; ++i) {
+      const bool sky = saw_sky(scratch.texel[i], scratch.fraction14[i], depth, layout_.view.size);
+      out.depth[frame * pixels + i] = sky || scratch.depth[i] >= 0.5F * kFar ? 0.0F : scratch.depth[i];
+    }
   }
 }
 
@@ -151,7 +162,7 @@ void Warp::operator()(const std::uint8_t* color, const float* depth, std::size_t
   parallel_for(sources, [&](std::size_t b) { meshes[b] = build_mesh(layout_, depth + b * pixels, cut_); });
   parallel_for(T_source_target.size(), [&](std::size_t frame) {
     const std::size_t b = frame / poses;
-    warp_one(color + 3 * b * pixels, meshes[b], T_source_target[frame], frame, out, isa);
+    warp_one(color + 3 * b * pixels, depth + b * pixels, meshes[b], T_source_target[frame], frame, out, isa);
   });
 }
 

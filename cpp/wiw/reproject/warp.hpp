@@ -33,8 +33,8 @@ class Warp {
   [[nodiscard]] const View& target() const { return target_; }
 
  private:
-  void warp_one(const std::uint8_t* color, const DepthMesh& mesh, const Pose& T_source_target, std::size_t frame,
-                const WarpTargets& out, Isa isa) const;
+  void warp_one(const std::uint8_t* color, const float* depth, const DepthMesh& mesh, const Pose& T_source_target,
+                std::size_t frame, const WarpTargets& out, Isa isa) const;
 
   MeshLayout layout_;
   View target_;
