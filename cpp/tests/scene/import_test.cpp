@@ -165,7 +165,18 @@ TEST_CASE("textures in Basis Universal are counted, never dropped in silence") {
       R"({"extensions":{"KHR_texture_basisu" : {"source":0}}},{"extensions":{"GOOGLE_texture_basis":{"source":0}}})";
   const auto scene = load_mesh(folder.write("x.basis.glb", sample_glb(parts)));
   REQUIRE_FALSE(scene->warnings.empty());
-  CHECK(scene->warnings[0].find("2 textures of x.basis.glb are stored in Basis Universal") == 0);
+  CHECK(scene->warnings[0].find("2 textures of x.basis.glb are stored as Basis Universal") == 0);
+}
+
+TEST_CASE("glTF extensions that a file needs and nobody reads are refused") {
+  const Folder folder;
+  GlbParts parts;
+  parts.material =
+      R"({}],"extensionsUsed":["EXT_meshopt_compression"],"extensionsRequired" : ["KHR_texture_transform", "EXT_meshopt_compression"],"x":[0)";
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("a.glb", sample_glb(parts))),
+                       doctest::Contains("needs the glTF extension 'EXT_meshopt_compression'"), FileError);
+  parts.material = R"({}],"extensionsRequired":["KHR_texture_transform","KHR_materials_unlit"],"x":[0)";
+  CHECK(load_mesh(folder.write("b.glb", sample_glb(parts)))->triangle_count() == 2);
 }
 
 TEST_CASE("only the supported formats are read") {

@@ -64,11 +64,7 @@ void check_content(const FileContext& context, Scene& scene) {
   if (context.format == MeshFormat::kPly) check_ply(context.path);
   if (context.format == MeshFormat::kDae) check_collada(context.path);
   if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return;
-  const std::size_t count = check_gltf(context.path, context.format);
-  if (count == 0) return;
-  scene.warnings.push_back(std::to_string(count) + " textures of " + context.path.filename().string() +
-                           " are stored in Basis Universal, which cannot be decoded here; drawn without texture "
-                           "(convert them to PNG or JPEG, or use the uncompressed mesh)");
+  for (std::string& warning : check_gltf(context.path, context.format)) scene.warnings.push_back(std::move(warning));
 }
 
 }  // namespace

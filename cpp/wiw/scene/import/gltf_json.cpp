@@ -1,7 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/import/gltf_json.hpp"
 
+#include <algorithm>
+#include <array>
 #include <cstring>
+#include <initializer_list>
 #include <string_view>
 
 #include "wiw/core/error.hpp"
@@ -53,20 +56,53 @@ void for_each_key(std::string_view json, std::string_view name, const Use& use) 
   }
 }
 
+/// Extensions that assimp reads, that change only how light is reflected, or that are named in a warning.
+constexpr std::array<std::string_view, 6> kReadExtensions{"KHR_draco_mesh_compression", "KHR_texture_transform",
+                                                          "KHR_texture_basisu",         "GOOGLE_texture_basis",
+                                                          "EXT_texture_webp",           "KHR_lights_punctual"};
+
+bool is_read(std::string_view extension) {
+  return extension.starts_with("KHR_materials_") ||
+         std::ranges::find(kReadExtensions, extension) != kReadExtensions.end();
+}
+
+/// `list` begins at the value of "extensionsRequired": an array of strings.
+void check_required(std::string_view list, const std::string& path) {
+  const std::string_view array = list.substr(0, list.find(']'));
+  for (std::size_t open = array.find('"'); open != std::string_view::npos; open = array.find('"', open)) {
+    const std::size_t close = std::min(array.find('"', open + 1), array.size());
+    const std::string_view extension = array.substr(open + 1, close - open - 1);
+    if (!is_read(extension)) {
+      throw FileError(
+          path, "needs the glTF extension '" + std::string(extension) + "', which is not supported; export it without");
+    }
+    open = std::min(close + 1, array.size());
+  }
+}
+
 }  // namespace
 
-std::size_t check_gltf(const std::filesystem::path& path, MeshFormat format) {
+std::vector<std::string> check_gltf(const std::filesystem::path& path, MeshFormat format) {
   const auto bytes = json_of(path, format);
   const std::string_view json(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   for_each_key(json, "\"mimeType\"", [&](std::string_view value) {
     if (value.starts_with("\"image/") || value.starts_with("\"application/")) return;
     throw FileError(path.string(), "has an image of unknown type (damaged file)");
   });
-  std::size_t basis_textures = 0;
-  for (const char* extension : {"\"KHR_texture_basisu\"", "\"GOOGLE_texture_basis\""}) {
-    for_each_key(json, extension, [&](std::string_view) { ++basis_textures; });
-  }
-  return basis_textures;
+  for_each_key(json, "\"extensionsRequired\"", [&](std::string_view value) { check_required(value, path.string()); });
+
+  std::vector<std::string> warnings;
+  const auto count = [&](std::initializer_list<const char*> extensions, const char* format_name) {
+    std::size_t textures = 0;
+    for (const char* extension : extensions) for_each_key(json, extension, [&](std::string_view) { ++textures; });
+    if (textures == 0) return;
+    warnings.push_back(
+        std::to_string(textures) + " textures of " + path.filename().string() + " are stored as " + format_name +
+        ", which cannot be decoded here; drawn without texture unless the file holds a PNG or JPEG beside it");
+  };
+  count({"\"KHR_texture_basisu\"", "\"GOOGLE_texture_basis\""}, "Basis Universal");
+  count({"\"EXT_texture_webp\""}, "WebP");
+  return warnings;
 }
 
 }  // namespace wiw

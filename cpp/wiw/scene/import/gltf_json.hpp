@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
-#include <cstddef>
 #include <filesystem>
+#include <string>
+#include <vector>
 
 #include "wiw/scene/import/mesh_format.hpp"
 
 namespace wiw {
 
-/// Checks the parts of a GLB or glTF file that assimp takes for granted, and returns the number of textures stored in
-/// Basis Universal (KHR_texture_basisu or GOOGLE_texture_basis), which assimp drops without a word. Throws FileError
-/// for chunks that do not fit the file's length and for images of no known type.
-std::size_t check_gltf(const std::filesystem::path& path, MeshFormat format);
+/// Checks the parts of a GLB or glTF file that assimp takes for granted, and returns warnings about textures that it
+/// drops without a word (Basis Universal, WebP), counted. Throws FileError for chunks that do not fit the file's
+/// length, images of no known type and required extensions that are not read.
+std::vector<std::string> check_gltf(const std::filesystem::path& path, MeshFormat format);
 
 }  // namespace wiw
