@@ -2,7 +2,8 @@
 """Opening a scene: imported afresh, imported in a process of its own, mapped from the cache; beside trimesh.
 
 The first two are what the first process pays, once; mapping is what every later one pays, for textures, materials and
-all. The CPU time of the second row leaves out the child's. trimesh, where installed, reads the same mesh without the checks, the textures or the cache.
+all. A child's CPU time is not in the CPU column. trimesh, where installed, reads the same mesh without the checks, the
+textures or the cache.
 """
 
 from __future__ import annotations
