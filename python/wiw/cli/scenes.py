@@ -39,8 +39,10 @@ def scenes(
         print(f"{spec} names {len(names)} scenes; showing the first {LIMIT}")
         names = names[:LIMIT]
     table = Table(box=None, pad_edge=False)
-    for column in ("scene", "size m", "triangles", "objects", "kinds", "rooms", "walkable m2", "islands"):
-        table.add_column(column, justify="left" if column == "scene" else "right")
+    for column in ("scene", "size m", "triangles", "objects", "kinds", "rooms", "walk m2", "islands"):
+        table.add_column(
+            column, justify="left" if column == "scene" else "right", no_wrap=column in ("scene", "size m")
+        )
     rows = []
     for name in names:
         place = _load(name, backend)
@@ -56,7 +58,7 @@ LIMIT = 8
 """Scenes on a sheet."""
 
 
-def _load(name: str, backend: str) -> Any:
+def _load(name: str, backend: Any) -> Any:
     from wiw.datasets.worlds import world
 
     return world(name, backend)
