@@ -111,6 +111,16 @@ void for_plans(std::uint64_t seeds, const Check& check) {
   }
 }
 
+/// One apartment a split, built once for all tests with two threads.
+const Scene& example(Split split) {
+  static const std::array<Scene, 3> kScenes = [] {
+    wiw::ThreadPool two(2);
+    return std::array<Scene, 3>{wiw::apartment(7, Split::kTrain, two), wiw::apartment(7, Split::kVal, two),
+                                wiw::apartment(7, Split::kTest, two)};
+  }();
+  return kScenes[static_cast<std::size_t>(split)];
+}
+
 bool same_bytes(const Scene& a, const Scene& b) {
   const auto equal = [](const auto& x, const auto& y) {
     return x.size() == y.size() && std::memcmp(x.data(), y.data(), x.size() * sizeof(x[0])) == 0;
@@ -219,7 +229,7 @@ TEST_CASE("apartment splits share neither layouts nor palettes") {
 TEST_CASE("apartment scenes are valid, rich, and every room can be walked to") {
   std::set<std::string> categories;
   for (const Split split : kSplits) {
-    const Scene scene = wiw::apartment(7, split);
+    const Scene& scene = example(split);
     CHECK_NOTHROW(scene.validate());
     CHECK(scene.triangle_count() > 40000);
     CHECK(scene.triangle_count() < 300000);
@@ -252,7 +262,7 @@ TEST_CASE("apartment scenes are valid, rich, and every room can be walked to") {
 }
 
 TEST_CASE("apartment light is smooth on a bare ceiling and neither murky nor blown out") {
-  const Scene scene = wiw::apartment(3, Split::kTrain);
+  const Scene& scene = example(Split::kTrain);
   const auto& lightmap = scene.textures[scene.textures.size() - 2];
   REQUIRE(lightmap.name == "lightmap");
   double steps = 0., total = 0.;
@@ -287,11 +297,9 @@ TEST_CASE("apartment light is smooth on a bare ceiling and neither murky nor blo
 }
 
 TEST_CASE("apartment bytes depend on seed and split alone, not on threads") {
-  wiw::ThreadPool one(1), two(2);
-  const Scene scene = wiw::apartment(11, Split::kVal, one);
-  CHECK(same_bytes(scene, wiw::apartment(11, Split::kVal, two)));
-  CHECK_FALSE(same_bytes(scene, wiw::apartment(12, Split::kVal, two)));
-  CHECK_FALSE(same_bytes(scene, wiw::apartment(11, Split::kTest, two)));
+  wiw::ThreadPool one(1);
+  CHECK(same_bytes(example(Split::kVal), wiw::apartment(7, Split::kVal, one)));
+  CHECK_FALSE(same_bytes(example(Split::kVal), example(Split::kTest)));
 }
 
 TEST_CASE("apartment split names are checked") {

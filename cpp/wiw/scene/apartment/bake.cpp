@@ -14,7 +14,7 @@ using Bytes4 = Eigen::Matrix<std::uint8_t, 4, 1>;
 
 /// Light as the display shows it, halved (see Material): a gentle shoulder keeps bright spots from clipping.
 Rgb to_display(const Rgb& light) {
-  const Rgb exposed = 1.05f * light;
+  const Rgb exposed = 1.18f * light;
   const Rgb shown = (exposed.array() * (1.f + exposed.array() / 9.f) / (1.f + 0.35f * exposed.array())).matrix();
   return 0.5f * to_encoded(shown);
 }

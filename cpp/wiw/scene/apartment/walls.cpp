@@ -140,18 +140,20 @@ std::size_t add_chart(Draft& draft, Chart chart) {
   return draft.charts.size() - 1;
 }
 
-/// Board along the foot of a wall, left out at doors.
+/// Board along a wall, left out at the holes it would cross.
 void add_skirting(Object& object, const Chart& chart, MaterialId material, float bottom, float height, float proud) {
   const Vec3 inward = chart.u.cross(chart.v);
   std::set<float> xs{0.f, chart.size.x()};
   for (const auto& hole : chart.holes) {
-    if (hole.min().y() < 0.01f) xs.insert({hole.min().x() - 0.07f, hole.max().x() + 0.07f});
+    if (hole.min().y() < bottom + height && hole.max().y() > bottom)
+      xs.insert({hole.min().x() - 0.07f, hole.max().x() + 0.07f});
   }
   for (auto x = xs.begin(); std::next(x) != xs.end(); ++x) {
     const float a = std::max(0.f, *x), b = std::min(chart.size.x(), *std::next(x));
-    const bool door = std::any_of(chart.holes.begin(), chart.holes.end(),
-                                  [&](const auto& hole) { return hole.contains(Vec2(0.5f * (a + b), 0.02f)); });
-    if (door || b - a < 0.01f) continue;
+    const bool hollow = std::any_of(chart.holes.begin(), chart.holes.end(), [&](const auto& hole) {
+      return hole.contains(Vec2(0.5f * (a + b), bottom + 0.5f * height));
+    });
+    if (hollow || b - a < 0.01f) continue;
     const Vec3 foot = chart.origin + a * chart.u + bottom * chart.v + proud * inward;
     object.shape.quad(material, foot, (b - a) * chart.u, height * chart.v);
     object.shape.quad(material, foot + height * chart.v, (b - a) * chart.u, -proud * inward);
