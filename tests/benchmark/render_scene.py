@@ -79,8 +79,8 @@ class _Mesh:
 
     def turned(self, base: NDArray, profile: NDArray) -> None:
         """Surface of revolution; profile [k, 2] of radius and height."""
-        turns = self.steps(2.5 * 2 * np.pi * float(profile[:, 0].max())) + 6
-        levels = self.steps(2.5 * float(np.linalg.norm(np.diff(profile, axis=0), axis=1).sum())) + 2
+        turns = self.steps(2.5 * 2 * np.pi * float(profile[:, 0].max())) + 3
+        levels = self.steps(2.5 * float(np.linalg.norm(np.diff(profile, axis=0), axis=1).sum())) + 1
         at = np.linspace(0, len(profile) - 1, levels)
         radius = np.interp(at, np.arange(len(profile)), profile[:, 0])[None, :]
         height = np.interp(at, np.arange(len(profile)), profile[:, 1])[None, :]
