@@ -66,7 +66,8 @@ class Glb:
         self.nodes.append({"mesh": mesh, **entries})
         return len(self.nodes) - 1
 
-    def bytes(self) -> bytes:
+    def document(self) -> dict[str, Any]:
+        """The JSON, without what is empty."""
         document = {
             "asset": {"version": "2.0"},
             "scene": 0,
@@ -80,7 +81,10 @@ class Glb:
             "images": self.images,
             "textures": [{"source": i} for i in range(len(self.images))],
         }
-        text = json.dumps({key: value for key, value in document.items() if value != []}).encode()
+        return {key: value for key, value in document.items() if value != []}
+
+    def bytes(self) -> bytes:
+        text = json.dumps(self.document()).encode()
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
         chunks += struct.pack("<II", len(self.binary), 0x004E4942) + self.binary

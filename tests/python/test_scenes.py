@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 import logging
 import os
 import subprocess
@@ -173,6 +174,27 @@ def test_embedded_textures_and_colours_are_drawn_as_written(tmp_path: Path, kind
     for y, x in ((16, 16), (16, 48), (48, 16), (48, 48)):  # same hue: light scales all channels alike
         wanted = image[y, x] > 128
         assert ((seen[y, x].astype(int) > seen[y, x].max() // 2) == wanted).all(), (y, x, seen[y, x])
+
+
+def test_a_gltf_with_files_beside_it_is_read_and_followed(tmp_path: Path) -> None:
+    glb = Glb()
+    material = glb.textured(0)
+    uv = np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32)
+    glb.node(glb.mesh(TWO, material, POSITION=SQUARE, TEXCOORD_0=uv), scale=[2, 2, 2])
+    document = glb.document()
+    document["buffers"][0]["uri"] = "data.bin"
+    document |= {"images": [{"uri": "my%20photo.png"}], "textures": [{"source": 0}]}
+    (tmp_path / "data.bin").write_bytes(glb.binary)
+    (tmp_path / "my photo.png").write_bytes(cv2.imencode(".png", np.zeros((4, 2, 3), np.uint8))[1].tobytes())
+    (tmp_path / "a.gltf").write_text(json.dumps(document))
+    scene, read, _ = _core.scene.import_scene(tmp_path / "a.gltf")
+    assert scene.warnings == []
+    assert scene.texture_bytes == 4 * 2 * 4
+    np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [2, 2, 0]])
+    assert {path.name for path in read} == {"a.gltf", "data.bin", "my photo.png"}
+    (tmp_path / "data.bin").unlink()
+    with pytest.raises(FileError, match=r"a.gltf: cannot be read"):
+        plain(tmp_path / "a.gltf")
 
 
 def test_limits_are_options(tmp_path: Path) -> None:
