@@ -59,6 +59,8 @@ class Memory:
     """Similarity of the present place at each heading column."""
     gate: float = 0.0
     histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
+    planned: NDArray[np.int8] | None = None
+    """The plan that was chosen last; where it did not lead anywhere, something unseen is in the way."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
     """Odometry and similarity of every place the agent has really seen."""
 
@@ -102,6 +104,8 @@ class Matcher(Policy):
             memory.histogram = at_headings(appearance.histogram_similarity(band, memory.goal)[0])
             observation = situation.observation
             assert observation.depth is not None
+            if memory.planned is not None and FORWARD in memory.planned[:2]:
+                memory.map.note_blocked(observation.odometry)
             memory.map.update(observation.depth[4::8, 4::8], observation.odometry)
             memory.places.append((observation.odometry, memory.similarity))
 
@@ -124,6 +128,13 @@ class Matcher(Policy):
             weight = options.imagined * (1 + options.near * memory.gate)
             scores.append(np.array([plan.prior + weight * gain for plan, gain in zip(plans, gains, strict=True)]))
         return scores
+
+    def revise(
+        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int8], int | None]:
+        """The best plan, remembered to notice whether it leads anywhere."""
+        situation.memory.planned, chosen = super().revise(situation, proposals, scores)
+        return situation.memory.planned, chosen
 
     def _propose(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         memory: Memory = situation.memory

@@ -56,6 +56,12 @@ class ExplorationMap:
         x, y = odometry[0] + steps * np.cos(azimuth), odometry[1] + steps * np.sin(azimuth)
         self.seen[cells(x[inside], y[inside])] = True
 
+    def note_blocked(self, odometry: NDArray[np.float64]) -> None:
+        """Marks what is just ahead as solid if the agent has not moved since the last update: its step was refused."""
+        if self.trail and np.linalg.norm(odometry[:2] - self.trail[-1]) < 1e-3:
+            ahead = odometry[:2] + 2.5 * CELL * np.array([np.cos(odometry[2]), np.sin(odometry[2])])
+            self.occupied[cells(ahead[:1], ahead[1:])] = 1
+
     def free(self) -> NDArray[np.bool_]:
         """Cells where the agent may stand: seen, and further than its radius from anything solid."""
         return self.seen & ~ndimage.binary_dilation(self.occupied > 0, _disk(1))
