@@ -51,7 +51,8 @@ inline std::vector<Pose> to_poses(const Array<double>& matrices, const char* nam
     const Eigen::Matrix3d rotation = matrix.topLeftCorner<3, 3>();
     if (!matrix.allFinite() || !(rotation * rotation.transpose()).isIdentity(1e-4) || rotation.determinant() < 0 ||
         !matrix.row(3).isApprox(Eigen::RowVector4d(0, 0, 0, 1), 1e-9)) {
-      throw ArgumentError(std::string(name) + "[" + std::to_string(i) + "] is not a rigid transform (finite, orthonormal rotation, last row 0 0 0 1)");
+      throw ArgumentError(std::string(name) + "[" + std::to_string(i) +
+                          "] is not a rigid transform (finite, orthonormal rotation, last row 0 0 0 1)");
     }
     poses[i].linear() = rotation;
     poses[i].translation() = matrix.topRightCorner<3, 1>();

@@ -10,11 +10,13 @@
 namespace py = pybind11;
 
 void bind_core(py::module_& module) {
-  module.def("active_isa", [] { return wiw::isa_name(wiw::active_isa()); },
-             "Instruction set in use: 'scalar', 'avx2' or 'avx512' (override with WIW_ISA).");
+  module.def(
+      "active_isa", [] { return wiw::isa_name(wiw::active_isa()); },
+      "Instruction set in use: 'scalar', 'avx2' or 'avx512' (override with WIW_ISA).");
   module.def("native_isa", [] { return wiw::isa_name(wiw::native_isa()); }, "Best instruction set of this processor.");
-  module.def("num_threads", [] { return wiw::ThreadPool::shared().size(); },
-             "Threads of the shared pool (the machine's cores, or WIW_NUM_THREADS).");
+  module.def(
+      "num_threads", [] { return wiw::ThreadPool::shared().size(); },
+      "Threads of the shared pool (the machine's cores, or WIW_NUM_THREADS).");
   module.def(
       "fold_key",
       [](const std::vector<std::uint64_t>& parts) {

@@ -1,11 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "wiw/env/vector_env.hpp"
-
 #include <pybind11/eigen.h>
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
 #include "arrays.hpp"
+#include "wiw/env/vector_env.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -88,16 +87,18 @@ void bind_env(py::module_& module) {
       .def(
           "step", [](NavigationEnv& env, int action) { return env.step(to_action(action)); }, py::arg("action"),
           "Carries out one primitive; True if the pose changed.")
-      .def_property_readonly("position", [](const NavigationEnv& env) { return Eigen::Vector3d(env.position()); },
-                             "float64 [3] world metres, on the floor.")
+      .def_property_readonly(
+          "position", [](const NavigationEnv& env) { return Eigen::Vector3d(env.position()); },
+          "float64 [3] world metres, on the floor.")
       .def_property_readonly("yaw", &NavigationEnv::yaw, "Heading in radians, left positive.")
       .def_property_readonly("odometry", &NavigationEnv::odometry,
                              "float64 [3]: x forward, y left, azimuth, in the frame of the reset.")
       .def_property_readonly("T_world_camera",
                              [](const NavigationEnv& env) { return Eigen::Matrix4d(env.T_world_camera().matrix()); })
       .def_property_readonly("renderer", [](const NavigationEnv& env) { return env.world().renderer; })
-      .def("fork", [](const NavigationEnv& env) { return NavigationEnv(env); },
-           "A copy that moves on its own in the same world.")
+      .def(
+          "fork", [](const NavigationEnv& env) { return NavigationEnv(env); },
+          "A copy that moves on its own in the same world.")
       .def(
           "camera_poses_after",
           [](const NavigationEnv& env, const Array<std::int8_t>& actions) {
@@ -115,7 +116,8 @@ void bind_env(py::module_& module) {
             return images.arrays;
           },
           py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
-          "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the ray).");
+          "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the "
+          "ray).");
 
   py::class_<VectorEnv>(module, "VectorEnv")
       .def(py::init<std::vector<NavigationEnv>>(), py::arg("envs"))

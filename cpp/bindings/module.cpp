@@ -12,10 +12,10 @@ namespace py = pybind11;
 PYBIND11_MODULE(_core, module) {
   module.doc() = "Compiled core of wiw: one submodule a room. Use the faces in `wiw`, e.g. `wiw.panorama`.";
   register_errors(module);
-#define ROOM(name)                                          \
-  {                                                         \
-    py::module_ submodule = module.def_submodule(#name);    \
-    bind_##name(submodule);                                 \
+#define ROOM(name)                                       \
+  {                                                      \
+    py::module_ submodule = module.def_submodule(#name); \
+    bind_##name(submodule);                              \
   }
 #include "rooms.inc"
 #undef ROOM

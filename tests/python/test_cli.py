@@ -108,7 +108,8 @@ def test_debug_shows_the_traceback(tmp_path):
 def start(*arguments):
     paths = os.pathsep.join(sys.path)
     # Where tests run as a background job, SIGINT is ignored and would stay so in the child.
-    command = ["env", "--default-signal=INT", sys.executable, "-m", "wiw.cli", "run", TASK, "--policy", "heuristic", *map(str, arguments)]
+    wiw = ["env", "--default-signal=INT", sys.executable, "-m", "wiw.cli"]
+    command = [*wiw, "run", TASK, "--policy", "heuristic", *map(str, arguments)]
     return subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stderr=subprocess.PIPE, text=True)
 
 

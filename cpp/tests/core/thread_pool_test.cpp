@@ -26,10 +26,12 @@ TEST_CASE("nested calls run inline and errors reach the caller after all work is
   pool.parallel_for(4, [&](std::size_t) { pool.parallel_for(5, [&](std::size_t) { ++inner; }); });
   CHECK(inner == 20);
   std::atomic<int> done{0};
-  CHECK_THROWS_AS(pool.parallel_for(100, [&](std::size_t i) {
-    ++done;
-    if (i == 3) throw std::runtime_error("three");
-  }), std::runtime_error);
+  CHECK_THROWS_AS(pool.parallel_for(100,
+                                    [&](std::size_t i) {
+                                      ++done;
+                                      if (i == 3) throw std::runtime_error("three");
+                                    }),
+                  std::runtime_error);
   CHECK(done == 100);
 }
 

@@ -11,7 +11,9 @@ struct Size {
   int height = 0;
   int width = 0;
   bool operator==(const Size&) const = default;
-  [[nodiscard]] std::size_t pixels() const { return static_cast<std::size_t>(height) * static_cast<std::size_t>(width); }
+  [[nodiscard]] std::size_t pixels() const {
+    return static_cast<std::size_t>(height) * static_cast<std::size_t>(width);
+  }
 };
 
 /// Non-owning view of a densely packed image, row-major [height, width, channels].
@@ -22,7 +24,8 @@ struct ImageView {
   int channels = 1;
 
   [[nodiscard]] T* row(int y) const {
-    return data + static_cast<std::size_t>(y) * static_cast<std::size_t>(size.width) * static_cast<std::size_t>(channels);
+    return data +
+           static_cast<std::size_t>(y) * static_cast<std::size_t>(size.width) * static_cast<std::size_t>(channels);
   }
   [[nodiscard]] T* at(int y, int x) const {
     return row(y) + static_cast<std::size_t>(x) * static_cast<std::size_t>(channels);

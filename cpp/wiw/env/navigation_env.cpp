@@ -29,8 +29,9 @@ NavigationEnv::NavigationEnv(World world, const NavigationConfig& config) : worl
 void NavigationEnv::reset(const Eigen::Vector3d& position, double yaw, double tolerance) {
   const auto snapped = world_.navmesh->snap(position.cast<float>());
   if (!snapped || (snapped->cast<double>() - position).norm() > tolerance) {
-    throw NavigationError("NavigationEnv.reset: " + text_of(position) + " is not on the navigation mesh (nearest point " +
-                          (snapped ? text_of(snapped->cast<double>()) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
+    throw NavigationError(
+        "NavigationEnv.reset: " + text_of(position) + " is not on the navigation mesh (nearest point " +
+        (snapped ? text_of(snapped->cast<double>()) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
   }
   position_ = start_position_ = snapped->cast<double>();
   start_yaw_ = yaw;
@@ -62,7 +63,8 @@ Pose NavigationEnv::T_world_camera() const {
 }
 
 Eigen::Vector3d NavigationEnv::odometry() const {
-  const Eigen::Vector3d moved = Eigen::AngleAxisd(-start_yaw_, Eigen::Vector3d::UnitY()) * (position_ - start_position_);
+  const Eigen::Vector3d moved =
+      Eigen::AngleAxisd(-start_yaw_, Eigen::Vector3d::UnitY()) * (position_ - start_position_);
   return {-moved.z(), -moved.x(), wrapped(turns_ * config_.actions.turn_rad)};
 }
 

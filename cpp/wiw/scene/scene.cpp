@@ -27,7 +27,8 @@ namespace {
 
 void check_index(std::int32_t index, std::size_t size, const std::string& what) {
   if (index < kNone || index >= static_cast<std::int32_t>(size)) {
-    throw ArgumentError("Scene: " + what + " is " + std::to_string(index) + ", but there are only " + std::to_string(size));
+    throw ArgumentError("Scene: " + what + " is " + std::to_string(index) + ", but there are only " +
+                        std::to_string(size));
   }
 }
 
@@ -66,11 +67,13 @@ void Scene::validate() const {
       throw ArgumentError("Scene: texture '" + texture.name + "' has a size that does not fit its data");
     }
   }
-  for (const Material& material : materials) check_index(material.texture, textures.size(), "texture of '" + material.name + "'");
+  for (const Material& material : materials)
+    check_index(material.texture, textures.size(), "texture of '" + material.name + "'");
   for (std::size_t i = 0; i < meshes.size(); ++i) check_mesh(*this, meshes[i], "mesh " + std::to_string(i));
   for (std::size_t i = 0; i < instances.size(); ++i) {
     const Instance& instance = instances[i];
-    if (instance.id != i + 1) throw ArgumentError("Scene: instance '" + instance.name + "' must have id " + std::to_string(i + 1));
+    if (instance.id != i + 1)
+      throw ArgumentError("Scene: instance '" + instance.name + "' must have id " + std::to_string(i + 1));
     check_index(instance.category, categories.size(), "category of '" + instance.name + "'");
     for (const std::uint32_t mesh : instance.meshes) {
       check_index(static_cast<std::int32_t>(mesh), meshes.size(), "mesh of '" + instance.name + "'");

@@ -47,14 +47,16 @@ struct Mesh {
   std::int32_t lightmap = kNone;  // index into Scene::textures
 };
 
-/// One placed object. `id` is what the renderer writes into the instance image; 0 means "nothing hit" and is never an id.
+/// One placed object. `id` is what the renderer writes into the instance image; 0 means "nothing hit" and is never an
+/// id.
 struct Instance {
   std::uint32_t id = 0;
   std::string name;
   std::int32_t category = kNone;  // index into Scene::categories
   std::vector<std::uint32_t> meshes;
   Eigen::Affine3f T_world_instance = Eigen::Affine3f::Identity();
-  std::map<std::string, std::string> attributes;  // "color": "red", "material": "wood", "state": "open", "room": "kitchen 1"
+  std::map<std::string, std::string>
+      attributes;  // "color": "red", "material": "wood", "state": "open", "room": "kitchen 1"
 };
 
 struct Room {
