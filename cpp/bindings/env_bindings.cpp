@@ -123,6 +123,7 @@ void bind_env(py::module_& module) {
       .def(py::init<std::vector<NavigationEnv>>(), py::arg("envs"))
       .def("__len__", &VectorEnv::size)
       .def("__getitem__", &VectorEnv::env, py::return_value_policy::reference_internal)
+      .def("__setitem__", &VectorEnv::replace, "Puts a copy of another environment in a place.")
       .def(
           "step",
           [](VectorEnv& envs, const Array<std::int8_t>& ids) {

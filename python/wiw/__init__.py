@@ -28,6 +28,7 @@ __all__ = [
     "evaluate",
     "load_run",
     "make",
+    "make_vec",
     "metrics",
     "nav",
     "panorama",
@@ -50,6 +51,7 @@ _HOME = {
     "evaluate": "wiw.evaluation.evaluate",
     "load_run": "wiw.evaluation.runlog",
     "make": "wiw.registry",
+    "make_vec": "wiw.registry",
     "policy": "wiw.registry",
     "show": "wiw.viz.show",
     "world_model": "wiw.registry",
@@ -75,6 +77,6 @@ if TYPE_CHECKING:
     from wiw.evaluation.runlog import load_run
     from wiw.loop.agent import Agent
     from wiw.policies.base import Policy
-    from wiw.registry import make, policy, world_model
+    from wiw.registry import make, make_vec, policy, world_model
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts

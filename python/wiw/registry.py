@@ -183,5 +183,18 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     Raises:
         RegistryError: unknown task, or options that do not fit; the message says what is known.
     """
-    name = task_id.removesuffix("-v0").lower()
-    return TASKS.make(name, **options).environment(depth=depth)
+    return _task(task_id, options).environment(depth=depth)
+
+
+def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) -> Any:
+    """A gymnasium vector environment of a task: `num_envs` episodes at a time, stepped and observed as a batch.
+
+    Raises:
+        RegistryError: unknown task, or options that do not fit; the message says what is known.
+        ArgumentError: `num_envs` below 1.
+    """
+    return _task(task_id, options).vector_environment(num_envs, depth=depth)
+
+
+def _task(task_id: str, options: dict[str, Any]) -> Any:
+    return TASKS.make(task_id.removesuffix("-v0").lower(), **options)

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
-from wiw.envs.navigation import PRIMITIVES
+from wiw.envs.trip import PRIMITIVES
 from wiw.errors import ArgumentError
 from wiw.types import Episode
 

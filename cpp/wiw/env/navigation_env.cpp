@@ -79,14 +79,21 @@ std::vector<Pose> NavigationEnv::camera_poses_after(std::span<const Action> acti
   return poses;
 }
 
-void NavigationEnv::observe(const ObservationTargets& targets) const {
-  const Pose pose = T_world_camera();
+void NavigationEnv::observe(const ObservationTargets& targets) const { wiw::observe({this, 1}, targets); }
+
+void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targets) {
+  if (envs.empty()) return;
+  std::vector<Pose> poses;
+  poses.reserve(envs.size());
+  for (const NavigationEnv& env : envs) poses.push_back(env.T_world_camera());
+  const NavigationConfig& config = envs[0].config();
+  Renderer& renderer = *envs[0].world().renderer;
   if (targets.panorama != nullptr || targets.depth != nullptr) {
-    world_.renderer->render({&pose, 1}, {.projection = Projection::kEquirectangular, .size = config_.panorama},
-                            {.color = targets.panorama, .depth = targets.depth});
+    renderer.render(poses, {.projection = Projection::kEquirectangular, .size = config.panorama},
+                    {.color = targets.panorama, .depth = targets.depth});
   }
   if (targets.front != nullptr) {
-    world_.renderer->render({&pose, 1}, {.size = config_.front, .hfov = config_.front_hfov}, {.color = targets.front});
+    renderer.render(poses, {.size = config.front, .hfov = config.front_hfov}, {.color = targets.front});
   }
 }
 

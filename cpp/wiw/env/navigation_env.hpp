@@ -77,4 +77,7 @@ class NavigationEnv {
   int turns_ = 0;  // left positive, since reset
 };
 
+/// Observations of several agents in one scene, rendered as one batch: members of `targets` are [N, ...].
+void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targets);
+
 }  // namespace wiw

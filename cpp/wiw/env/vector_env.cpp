@@ -6,13 +6,25 @@
 
 namespace wiw {
 
+namespace {
+
+void expect_alike(const NavigationConfig& one, const NavigationConfig& other) {
+  if (one.panorama != other.panorama || one.front != other.front || one.front_hfov != other.front_hfov) {
+    throw ArgumentError("VectorEnv: all environments must have the same observation sizes and field of view");
+  }
+}
+
+}  // namespace
+
 VectorEnv::VectorEnv(std::vector<NavigationEnv> envs) : envs_(std::move(envs)) {
   if (envs_.empty()) throw ArgumentError("VectorEnv: expected at least one environment");
-  for (const NavigationEnv& env : envs_) {
-    if (env.config().panorama != envs_[0].config().panorama || env.config().front != envs_[0].config().front) {
-      throw ArgumentError("VectorEnv: all environments must have the same observation sizes");
-    }
-  }
+  for (const NavigationEnv& env : envs_) expect_alike(env.config(), envs_[0].config());
+}
+
+void VectorEnv::replace(std::size_t i, const NavigationEnv& env) {
+  NavigationEnv& place = envs_.at(i);
+  expect_alike(env.config(), place.config());
+  place = env;
 }
 
 void VectorEnv::step(std::span<const Action> actions, std::span<bool> moved) {
@@ -26,11 +38,13 @@ void VectorEnv::step(std::span<const Action> actions, std::span<bool> moved) {
 void VectorEnv::observe(const ObservationTargets& targets) const {
   const std::size_t panorama = envs_[0].config().panorama.pixels();
   const std::size_t front = envs_[0].config().front.pixels();
-  // A renderer spreads one view over all threads, so the views themselves go one after the other.
-  for (std::size_t i = 0; i < envs_.size(); ++i) {
-    envs_[i].observe({.panorama = targets.panorama != nullptr ? targets.panorama + i * panorama * 3 : nullptr,
-                      .front = targets.front != nullptr ? targets.front + i * front * 3 : nullptr,
-                      .depth = targets.depth != nullptr ? targets.depth + i * panorama : nullptr});
+  const auto at = [](auto* base, std::size_t offset) { return base == nullptr ? nullptr : base + offset; };
+  for (std::size_t first = 0, last; first < envs_.size(); first = last) {
+    last = first + 1;
+    while (last < envs_.size() && envs_[last].world().renderer == envs_[first].world().renderer) ++last;
+    wiw::observe(std::span(envs_).subspan(first, last - first), {.panorama = at(targets.panorama, first * panorama * 3),
+                                                                 .front = at(targets.front, first * front * 3),
+                                                                 .depth = at(targets.depth, first * panorama)});
   }
 }
 

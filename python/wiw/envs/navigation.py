@@ -5,71 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw._core import env as _env
-from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
-from wiw.datasets.worlds import World, world
+from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, observation_space, outputs, start
 from wiw.errors import ArgumentError
 from wiw.types import Episode, Goal, Key, Observation, Truth
-
-PRIMITIVES = (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)
-"""What the discrete action space counts: `env.step(0)` goes forward."""
-
-
-class NavigationTask(Protocol):
-    """What the environment asks of its task."""
-
-    seed: int
-    backend: Literal["auto", "cpu", "gpu"]
-    rules: Any
-
-    @property
-    def motion(self) -> str: ...
-    @property
-    def budget(self) -> int: ...
-    def episode(self, index: int) -> Episode: ...
-    def goal(self, world: World, episode: Episode) -> Goal: ...
-    def succeeded(self, trip: Trip) -> bool: ...
-    def result(self, trip: Trip) -> dict[str, float]: ...
-
-
-@dataclass
-class Trip:
-    """The privileged record of one episode so far: what metrics are computed from."""
-
-    episode: Episode
-    world: World
-    positions: list[NDArray[np.float64]]
-    """After each primitive, beginning with the start."""
-    decisions: int = 0
-    """Segments carried out by `run`."""
-    at_decision: bool = True
-    """Whether the agent stands at the end of an executed segment."""
-    stopped: bool = False
-    success: bool = False
-
-    @property
-    def actions(self) -> int:
-        """Primitives carried out, refused moves and stop included."""
-        return len(self.positions) - 1
-
-    @property
-    def travelled(self) -> float:
-        """Metres walked."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()) if self.actions else 0.0
-
-    def distance_to_goal(self) -> float:
-        """Straight-line metres from the agent to the goal's position."""
-        return float(np.linalg.norm(self.positions[-1] - np.asarray(self.episode.goal_position)))
-
-    def geodesic_to_goal(self) -> float:
-        """Metres of the shortest walk to the goal; inf when it cannot be reached."""
-        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
 
 
 @dataclass(frozen=True)
@@ -96,9 +40,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
     def __init__(self, task: NavigationTask, depth: bool = False) -> None:
         self.task = task
         self.render_mode = "rgb_array"
-        self.outputs = ["panorama", "front", *(["depth"] if depth else [])]
+        self.outputs = outputs(depth)
         self.action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))  # type: ignore[assignment]
-        self.observation_space = gymnasium.spaces.Dict(self._spaces(depth))
+        self.observation_space = observation_space(depth)
         self._core: Any = None
         self._trip: Trip | None = None
         self._goal: Goal | None = None
@@ -135,12 +79,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
 
     def begin(self, episode: Episode) -> Observation:
         """Starts a given episode and observes."""
-        place = world(episode.scene, self.task.backend)
-        config = _env.NavigationConfig(motion=_env.Motion.__members__[self.task.motion])
-        self._core = _env.NavigationEnv(place.renderer.core, place.navmesh, config)
-        self._core.reset(np.asarray(episode.start_position), episode.start_yaw)
-        self._trip = Trip(episode, place, [self._core.position])
-        self._goal = self.task.goal(place, episode)
+        self._core, self._trip, self._goal = start(self.task, episode)
         return self._observe()
 
     def run(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
@@ -155,15 +94,11 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         for i, action in enumerate(actions):
             self._core.step(int(action))
             executed.append(int(action))
-            trip.positions.append(self._core.position)
-            trip.stopped, trip.at_decision = action == STOP, i + 1 == len(actions)
-            trip.success = self.task.succeeded(trip)
-            done = trip.success or trip.stopped
+            done = trip.note(self.task, int(action), self._core.position, at_decision=i + 1 == len(actions))
             if done or trip.actions >= self.task.budget:
                 break
         path = np.stack(trip.positions[first:])
-        spent = trip.actions >= self.task.budget or trip.decisions >= self.task.rules.decisions
-        return Segment(self._observe(), np.array(executed, np.int8), path, done, spent and not done)
+        return Segment(self._observe(), np.array(executed, np.int8), path, done, trip.spent(self.task) and not done)
 
     @property
     def goal(self) -> Goal:
@@ -188,8 +123,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
 
     def truth(self) -> Truth:
         """Where the agent truly is; for metrics, records and reports alone."""
-        trip = self.trip
-        return Truth(trip.positions[-1], self._core.yaw, trip.distance_to_goal(), trip.geodesic_to_goal())
+        return self.trip.truth(self._core.yaw)
 
     def result(self) -> dict[str, float]:
         """The task's metrics of the running episode."""
@@ -210,13 +144,3 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
     def _require_episode(self) -> None:
         if self._trip is None:
             raise ArgumentError("the environment has no episode yet; call reset() first")
-
-    @staticmethod
-    def _spaces(depth: bool) -> dict[str, gymnasium.Space[Any]]:
-        box = gymnasium.spaces.Box
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            "panorama": box(0, 255, (576, 1024, 3), np.uint8),
-            "front": box(0, 255, (480, 480, 3), np.uint8),
-            "odometry": box(-1e4, 1e4, (3,), np.float64),
-        }
-        return {**spaces, "depth": box(0, 1e4, (576, 1024), np.float32)} if depth else spaces

@@ -12,7 +12,9 @@ import numpy as np
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.imagenav import camera_pose, generate, ideal_primitives
 from wiw.datasets.worlds import World, world
-from wiw.envs.navigation import NavigationEnv, Trip
+from wiw.envs.navigation import NavigationEnv
+from wiw.envs.trip import Trip
+from wiw.envs.vector import VectorEnv
 from wiw.errors import ArgumentError
 from wiw.scenes import resolve
 from wiw.types import Episode, Goal
@@ -114,6 +116,10 @@ class ImageNav:
     def environment(self, depth: bool = False) -> NavigationEnv:
         """A gymnasium environment of this task; `depth` adds it to the observations."""
         return NavigationEnv(self, depth)
+
+    def vector_environment(self, num_envs: int, depth: bool = False) -> VectorEnv:
+        """A gymnasium vector environment of this task, with `num_envs` episodes at a time."""
+        return VectorEnv(self, num_envs, depth)
 
     def episodes(self, count: int) -> list[Episode]:
         """The first `count` episodes; generated scene by scene, `per_scene` each.

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One navigation episode in progress, as the single and the vector environment both keep it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import env as _env
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.worlds import World, world
+from wiw.types import Episode, Goal, Truth
+
+PRIMITIVES = (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)
+"""What the discrete action space counts: `env.step(0)` goes forward."""
+
+
+class NavigationTask(Protocol):
+    """What an environment asks of its task."""
+
+    seed: int
+    backend: Literal["auto", "cpu", "gpu"]
+    rules: Any
+
+    @property
+    def motion(self) -> str: ...
+    @property
+    def budget(self) -> int: ...
+    def episode(self, index: int) -> Episode: ...
+    def goal(self, world: World, episode: Episode) -> Goal: ...
+    def succeeded(self, trip: Trip) -> bool: ...
+    def result(self, trip: Trip) -> dict[str, float]: ...
+
+
+@dataclass
+class Trip:
+    """The privileged record of one episode so far: what metrics are computed from."""
+
+    episode: Episode
+    world: World
+    positions: list[NDArray[np.float64]]
+    """After each primitive, beginning with the start."""
+    decisions: int = 0
+    """Segments carried out by `run`."""
+    at_decision: bool = True
+    """Whether the agent stands at the end of an executed segment."""
+    stopped: bool = False
+    success: bool = False
+
+    @property
+    def actions(self) -> int:
+        """Primitives carried out, refused moves and stop included."""
+        return len(self.positions) - 1
+
+    @property
+    def travelled(self) -> float:
+        """Metres walked."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()) if self.actions else 0.0
+
+    def distance_to_goal(self) -> float:
+        """Straight-line metres from the agent to the goal's position."""
+        return float(np.linalg.norm(self.positions[-1] - np.asarray(self.episode.goal_position)))
+
+    def geodesic_to_goal(self) -> float:
+        """Metres of the shortest walk to the goal; inf when it cannot be reached."""
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
+
+    def truth(self, yaw: float) -> Truth:
+        """Where the agent truly is, heading `yaw` radians."""
+        return Truth(self.positions[-1], yaw, self.distance_to_goal(), self.geodesic_to_goal())
+
+    def note(self, task: NavigationTask, action: int, position: NDArray[np.float64], at_decision: bool) -> bool:
+        """Records where a primitive led; True when the episode has ended by success or by stopping."""
+        self.positions.append(position)
+        self.stopped, self.at_decision = action == STOP, at_decision
+        self.success = task.succeeded(self)
+        return self.success or self.stopped
+
+    def spent(self, task: NavigationTask) -> bool:
+        """Whether the budget of primitives or of decisions is used up."""
+        return self.actions >= task.budget or self.decisions >= task.rules.decisions
+
+
+def start(task: NavigationTask, episode: Episode) -> tuple[Any, Trip, Goal]:
+    """The simulator at the start of an episode, its record, and what the agent is asked to reach."""
+    place = world(episode.scene, task.backend)
+    config = _env.NavigationConfig(motion=_env.Motion.__members__[task.motion])
+    core = _env.NavigationEnv(place.renderer.core, place.navmesh, config)
+    core.reset(np.asarray(episode.start_position), episode.start_yaw)
+    return core, Trip(episode, place, [core.position]), task.goal(place, episode)
+
+
+def outputs(depth: bool) -> list[str]:
+    """Images of an observation, by the simulator's names."""
+    return ["panorama", "front", *(["depth"] if depth else [])]
+
+
+def observation_space(depth: bool) -> gymnasium.spaces.Dict:
+    """What an environment shows; the shapes that `wiw.types.Observation` documents."""
+    box = gymnasium.spaces.Box
+    spaces: dict[str, gymnasium.Space[Any]] = {
+        "panorama": box(0, 255, (576, 1024, 3), np.uint8),
+        "front": box(0, 255, (480, 480, 3), np.uint8),
+        "odometry": box(-1e4, 1e4, (3,), np.float64),
+    }
+    return gymnasium.spaces.Dict({**spaces, "depth": box(0, 1e4, (576, 1024), np.float32)} if depth else spaces)
