@@ -302,7 +302,8 @@ void bind_views(py::module_& module) {
 void bind_batch(py::module_& module) {
   module.attr("Part") =
       py::module_::import("collections")
-          .attr("namedtuple")("Part", "first steps rows actions trajectories viewpoints length shared start");
+          .attr("namedtuple")("Part", "first steps rows actions trajectories viewpoints length shared start",
+                              py::arg("module") = module.attr("__name__"));
   module.attr("Part").attr("__doc__") =
       "One rectangular call of the model. rows int64 [r] index the batch's rows; first: frame of the rows the call "
       "begins "

@@ -99,7 +99,7 @@ def _prepare(
         raise ArgumentError(f"expected outputs among {OUTPUTS}, got {unknown}")
     if len(size) != 2 or min(size) < 1:
         raise ArgumentError(f"expected size (H, W) of at least 1, got {size}")
-    pictures = {}
+    pictures: dict[str, NDArray[Any]] = {}
     for name in outputs:
         given = None if out is None else out.get(name)
         shape = (batch, *size, 3) if name == "color" else (batch, *size)

@@ -12,7 +12,7 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.policies.base import Policy, Situation
 from wiw.types import Goal, Key, Proposal
 
-INVERSE = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
+INVERSE: dict[int, int] = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
 
 
 class Heuristic(Policy):
@@ -48,11 +48,12 @@ class Heuristic(Policy):
     def allowed(self, history: Sequence[int]) -> list[int]:
         """Primitives that may follow `history`."""
         last = history[-1] if history else None
+        undoing = None if last is None else INVERSE.get(last)
         turns = 0
         while turns < len(history) and last in INVERSE and history[-1 - turns] == last:
             turns += 1
         return [
             action
             for action in (FORWARD, TURN_LEFT, TURN_RIGHT)
-            if action != INVERSE.get(last) and not (action == last and turns >= self.max_turns)  # type: ignore[arg-type]
+            if action != undoing and not (action == last and turns >= self.max_turns)
         ]

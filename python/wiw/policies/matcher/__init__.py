@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A policy without a VLM: straight runs in diverse headings, judged by colour, edges and a map of what is unexplored."""
+"""A policy without a VLM: straight runs in diverse headings, judged by colour, edges and a map of the unexplored."""
 
 from __future__ import annotations
 

@@ -100,7 +100,8 @@ def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[
     u, v, inside = _front_map()
     size = image.shape[0]
     small = cv2.resize(image, (64, 64), interpolation=cv2.INTER_AREA) if size != 64 else image
-    return cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), inside[ROWS]
+    wide = cv2.remap(small, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(wide, np.uint8), inside[ROWS]
 
 
 @cache
@@ -143,7 +144,8 @@ def _edge_map(lab: NDArray[np.float32]) -> NDArray[np.float32]:
 def _blur(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     margin = int(3 * sigma) + 1
     wide = cv2.copyMakeBorder(image, 0, 0, margin, margin, cv2.BORDER_WRAP)
-    return cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)[:, margin:-margin]
+    blurred = cv2.GaussianBlur(wide, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred[:, margin:-margin], np.float32)
 
 
 def _bins(lab: NDArray[np.float32]) -> NDArray[np.intp]:
