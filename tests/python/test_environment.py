@@ -97,6 +97,24 @@ def test_official_rules_look_only_where_a_decision_is_due(two_rooms: str) -> Non
     assert env.task.rules.decisions == 21
 
 
+def test_official_rules_carry_out_all_but_two_of_the_chosen_plan(two_rooms: str) -> None:
+    class Short(wiw.Policy):
+        def propose(self, situations, candidates, horizon):
+            return [[wiw.types.Proposal([TURN_LEFT] * self.length)] for _ in situations]
+
+    policy = Short()
+    for preset, carried_out in (
+        ("official", {1: 1, 2: 1, 3: 1, 4: 2, 5: 3}),
+        ("paper", {1: 1, 2: 2, 3: 3, 4: 3, 5: 3}),
+    ):
+        env = wiw.make("ImageNav-v0", scenes=two_rooms, preset=preset)
+        agent = wiw.Agent(policy, **env.task.defaults)
+        observation, info = env.reset(options={"episode": 0})
+        for policy.length, expected in carried_out.items():
+            assert agent.decide(observation, env.goal, info["key"]).execute == expected
+    assert env.task.budget == 60
+
+
 def test_the_budget_truncates(env) -> None:
     start_at(env, (-2.0, 0.0, 0.5), 0.0)
     for _ in range(20):

@@ -30,7 +30,7 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
-    (list_names, "list", "Names of world models, policies, tasks and metrics."),
+    (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
     (report, "report", "Table and HTML report of a run."),

@@ -10,7 +10,7 @@ from rich.markup import escape
 
 
 def list_names() -> int:
-    """Lists world models, policies, tasks and metrics: built-in ones, and those that installed packages register.
+    """Lists world models, policies, tasks, metrics and presets: built-in ones, and those of installed packages.
 
     A package adds its own by entry points in the groups named in the headings.
     """
@@ -18,6 +18,7 @@ def list_names() -> int:
     from rich.table import Table
 
     from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS
+    from wiw.tasks import presets
 
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
@@ -28,6 +29,10 @@ def list_names() -> int:
         for name in registry.names():
             table.add_row(f"  {name}", _first_line(registry, name))
         table.add_row()
+    for task in TASKS.built_in:
+        table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
+        for name in presets.names(task):
+            table.add_row(f"  {name}", escape(presets.about(task, name)))
     Console().print(table)
     return 0
 

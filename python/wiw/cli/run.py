@@ -34,7 +34,7 @@ def run(
     candidates: Annotated[int | None, arg(metavar="M")] = None,
     horizon: Annotated[int | None, arg(metavar="L")] = None,
     motion: Literal["refuse", "slide"] | None = None,
-    preset: Literal["paper", "official"] = "paper",
+    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     live: Count = 4,
     keep_images: Count = 2,
@@ -63,7 +63,7 @@ def run(
         candidates: Plans imagined at each decision; the task's own number if not given.
         horizon: Primitives in a plan; the task's own number if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
-        preset: Rules of the paper, or of its published code where that differs.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         keep_images: Episodes that keep pictures for the report.
@@ -72,7 +72,7 @@ def run(
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
 
-    options = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
+    options = {"scenes": scenes, "seed": seed, "preset": _preset(preset), "backend": backend}
     recipe = TaskRecipe(task, options if motion is None else {**options, "motion": motion})
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(absolute(policy), model, revision and absolute(revision), candidates, horizon)
@@ -136,6 +136,11 @@ def finish(log: Any, report: bool) -> int:
         print(f"\nreport  {log.report()}")
     print(f"run     {log.path}")
     return 1 if len(failed) == len(log.episodes) else 0
+
+
+def _preset(preset: str) -> str:
+    """A preset's file by its absolute path, so that it means the same in any folder; a name as it is."""
+    return str(Path(preset).expanduser().resolve()) if preset.endswith((".yaml", ".yml")) else preset
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:

@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ArgumentError, StoreError
+from wiw.errors import ArgumentError, Error, StoreError
 from wiw.evaluation.platform import describe_platform
 from wiw.evaluation.progress import Tracker, make_board
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
@@ -36,16 +36,18 @@ def evaluate(
     live: int = 4,
     keep_images: int = 2,
     resume: bool = False,
+    **task_options: Any,
 ) -> RunLog:
     """Runs an agent on the first `episodes` episodes of a task.
 
         log = wiw.evaluate(env, agent, episodes=20)
         log = wiw.evaluate(env, agent, episodes=20, arms=["none", "copy", "warp", "oracle"])
+        log = wiw.evaluate("imagenav", agent, episodes=20, scenes="apartments:val", preset="official")
 
     All randomness is keyed by (seed, episode, decision, candidate): neither `workers` nor `live` changes a result.
 
     Args:
-        env_or_task: an environment from `wiw.make`, its task, or a `TaskRecipe`.
+        env_or_task: an environment from `wiw.make`, its task, a `TaskRecipe`, or a task's name.
         agent: a `wiw.Agent` or an `AgentRecipe`.
         episodes: how many.
         seed: of the run; None means the task's own.
@@ -56,14 +58,16 @@ def evaluate(
         live: episodes kept live at a time in each process, so that model calls are batched.
         keep_images: how many episodes keep pictures for the report, spread evenly.
         resume: whether to go on with the run in `out` where it was stopped.
+        task_options: options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
+        ArgumentError: options for a task that is already made; a number out of range.
         StoreError: `out` holds a run and `resume` is off, or a run of another configuration.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
     """
     options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume)
-    return _run(task_recipe(env_or_task), arm_recipes(agent, arms), options)
+    return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
 
 
 def run_arms(
@@ -96,7 +100,8 @@ def resume_run(
         retry_failed: whether to run episodes again whose infrastructure failed.
 
     Raises:
-        StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory.
+        StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
+            its preset's file has changed.
     """
     store = RunStore.resume(run)
     info = store.info
@@ -107,6 +112,11 @@ def resume_run(
             "call the same wiw.evaluate(..., out=..., resume=True) again"
         )
     task = TaskRecipe(**info["task"])
+    try:
+        store.require_task(task.build().describe())
+    except Error:
+        store.close()
+        raise
     agents = {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
     return _finish(store, task, agents, workers or info["workers"], progress, retry_failed=retry_failed)
 

@@ -49,7 +49,7 @@ class AgentRecipe:
         from wiw.loop.agent import Agent
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
-        if "horizon" in given:  # the task's number of executed primitives belongs to the task's horizon
+        if "horizon" in given and defaults.get("execute", 0) > 0:  # that number belongs to the task's horizon
             defaults = {name: value for name, value in defaults.items() if name != "execute"}
         return Agent(**{**defaults, **given})
 
@@ -81,8 +81,16 @@ class Ready:
         """Nothing: an object in memory cannot be written down."""
 
 
-def task_recipe(task: Any) -> TaskRecipe | Ready:
-    """A recipe of a task, or of a gymnasium environment's task."""
+def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskRecipe | Ready:
+    """A recipe of a task by name and options, of a task, or of a gymnasium environment's task.
+
+    Raises:
+        ArgumentError: options for a task that is already made.
+    """
+    if isinstance(task, str):
+        return TaskRecipe(task.removesuffix("-v0").lower() if task.endswith("-v0") else task, dict(options or {}))
+    if options:
+        raise ArgumentError(f"the task is made already and cannot take {', '.join(options)}; give them to wiw.make")
     if isinstance(task, TaskRecipe):
         return task
     unwrapped = getattr(task, "unwrapped", task)

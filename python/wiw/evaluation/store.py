@@ -107,6 +107,14 @@ class RunStore:
                 )
         return store
 
+    def require_task(self, task: dict[str, Any]) -> None:
+        """Holds the run to the task it was begun with, whose preset may be a file that has changed since.
+
+        Raises:
+            StoreError: the task differs; says in what.
+        """
+        _require_same(self.path, self.config["task"], json.loads(to_json(task)))
+
     @classmethod
     def read(cls, run: str | Path) -> RunStore:
         """An existing store for reading, also while it is being written.

@@ -38,7 +38,8 @@ class Agent:
         revision: policy that scores imagined futures; None means the policy itself, or its default reviser.
         candidates: plans per decision (M); None means the task's default, 3.
         horizon: primitives per plan (L); None means the task's default, 5.
-        execute: primitives carried out before the next decision; None means L - 2, as in the paper's ImageNav.
+        execute: primitives carried out before the next decision; None means L - 2, as in the paper's ImageNav. A
+            negative number leaves that many of the chosen plan undone, but carries out at least one.
     """
 
     def __init__(
@@ -56,9 +57,9 @@ class Agent:
         self.candidates = 3 if candidates is None else candidates
         self.horizon = 5 if horizon is None else horizon
         self.execute = max(1, self.horizon - 2) if execute is None else execute
-        if self.candidates < 1 or self.horizon < 1 or not 1 <= self.execute <= self.horizon:
+        if self.candidates < 1 or self.horizon < 1 or not 1 <= abs(self.execute) <= self.horizon:
             raise ArgumentError(
-                f"Agent: expected candidates >= 1 and 1 <= execute <= horizon, got candidates="
+                f"Agent: expected candidates >= 1 and execute from 1 to horizon or below 0, got candidates="
                 f"{self.candidates}, horizon={self.horizon}, execute={self.execute}"
             )
         self._memories: dict[tuple[int, int], tuple[Any, Any]] = {}
@@ -148,7 +149,7 @@ class Agent:
         actions, chosen = self.revision.revise(situation, proposals, scores)
         return Decision(
             actions=actions,
-            execute=min(self.execute, len(actions)),
+            execute=min(self.execute, len(actions)) if self.execute > 0 else max(1, len(actions) + self.execute),
             proposals=tuple(proposals),
             rollouts=None if rollouts is None else tuple(rollouts),
             scores=np.asarray(scores, np.float64),

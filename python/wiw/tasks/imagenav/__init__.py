@@ -17,36 +17,34 @@ from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
 from wiw.errors import ArgumentError
 from wiw.scenes import resolve
+from wiw.tasks import presets
 from wiw.types import Episode, Goal
 
 
 @dataclass(frozen=True)
 class ImageNavRules:
-    """Budget, stop rule and metric variants; the defaults are the paper's."""
+    """Budget, stop rule and metric variants; their values are in the presets (`wiw/configs`)."""
 
-    decisions: int = 20
+    decisions: int
     """K."""
-    candidates: int = 3
+    candidates: int
     """M, plans imagined per decision."""
-    horizon: int = 5
+    horizon: int
     """L, primitives per plan."""
-    execute: int = 3
-    """Primitives carried out per decision, L - 2."""
-    radius: float = 0.5
+    execute: int
+    """Primitives carried out per decision; negative: all but that many of the chosen plan, at least one."""
+    radius: float
     """Metres; the episode succeeds on entering this sphere around the goal's position."""
-    checked: Literal["primitive", "decision"] = "primitive"
+    checked: Literal["primitive", "decision"]
     """Whether success is looked at after every primitive or only where a decision is due."""
-    distance: Literal["euclidean", "geodesic"] = "euclidean"
-    spl: Literal["metres", "actions"] = "metres"
+    distance: Literal["euclidean", "geodesic"]
+    spl: Literal["metres", "actions"]
     """SPL by path length (the paper's formula) or by number of primitives."""
-    motion: Literal["refuse", "slide"] = "refuse"
+    motion: Literal["refuse", "slide"]
 
-
-PRESETS = {
-    "paper": ImageNavRules(),
-    "official": ImageNavRules(decisions=21, checked="decision", distance="geodesic", spl="actions"),
-}
-"""`official` repeats what the authors' published code does where it differs from the paper."""
+    def __post_init__(self) -> None:
+        if min(self.decisions, self.candidates, self.horizon) < 1 or self.radius <= 0:
+            raise ArgumentError(f"imagenav: decisions, candidates, horizon and radius must be positive, got {self}")
 
 
 class ImageNav:
@@ -55,7 +53,7 @@ class ImageNav:
     Args:
         scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world.
         seed: seed of the generated episodes and of the run.
-        preset: "paper" or "official"; `rules` overrides it field by field.
+        preset: "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
         scene_folder: folder that scene paths in a foreign episode file are relative to.
         per_scene: generated episodes a scene.
@@ -69,21 +67,14 @@ class ImageNav:
         self,
         scenes: str = "apartments:val",
         seed: int = 0,
-        preset: str = "paper",
+        preset: str | Path = presets.DEFAULT,
         episode_file: str | Path | None = None,
         scene_folder: str | Path = "",
         per_scene: int = 5,
         backend: Literal["auto", "cpu", "gpu"] = "auto",
         **rules: Any,
     ) -> None:
-        if preset not in PRESETS:
-            raise ArgumentError(f"imagenav: no preset '{preset}'; there are {', '.join(PRESETS)}")
-        unknown = set(rules) - set(asdict(PRESETS[preset]))
-        if unknown:
-            raise ArgumentError(
-                f"imagenav: unknown rules {sorted(unknown)}; there are {sorted(asdict(PRESETS[preset]))}"
-            )
-        self.rules = replace(PRESETS[preset], **rules)
+        self.rules = presets.rules(ImageNavRules, self.name, preset, rules)
         self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
         self.episode_file = None if episode_file is None else str(episode_file)
         self.scene_folder = str(scene_folder)
@@ -97,7 +88,8 @@ class ImageNav:
     @property
     def budget(self) -> int:
         """Primitives an episode may take."""
-        return self.rules.decisions * self.rules.execute
+        rules = self.rules
+        return rules.decisions * (rules.execute if rules.execute > 0 else max(1, rules.horizon + rules.execute))
 
     @property
     def defaults(self) -> dict[str, int]:
