@@ -192,6 +192,22 @@ py::array_t<std::uint8_t> views(const BoundBatch& self, const py::array& panoram
   return images;
 }
 
+py::array_t<std::uint8_t> ends(const BoundBatch& self, const Array<std::int64_t>& candidates,
+                               const py::array& panoramas, const py::sequence& rollouts, const ViewMaker& maker,
+                               const std::string& frames) {
+  expect_shape(candidates, {-1}, "candidates int64 [n]");
+  const Bytes real = to_bytes(panoramas, "panoramas uint8 [episodes, H, W, 3]");
+  const Answers answers = to_answers(rollouts, frames);
+  const ViewIndex index =
+      index_ends(self.batch, std::span(candidates.data(), static_cast<std::size_t>(candidates.size())));
+  py::array_t<std::uint8_t> images(with_view_shape({candidates.size()}, maker));
+  std::uint8_t* pixels = images.mutable_data();
+  const Panoramas source = to_panoramas(real);
+  const py::gil_scoped_release release;
+  make_views(self.batch, index, source, answers.imagination, maker, pixels);
+  return images;
+}
+
 void expect_episodes(const Batch& batch, py::ssize_t count) {
   for (const Row& row : batch.rows()) {
     if (row.episode >= count) {
@@ -399,7 +415,10 @@ void bind_batch(py::module_& module) {
             return views(self, panoramas, rollouts, maker, frames, out, false);
           },
           py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"), py::arg("frames") = "panorama",
-          py::arg("out") = py::none(), "uint8 [distinct, (4,) h, w, 3], to be looked up by view_index.");
+          py::arg("out") = py::none(), "uint8 [distinct, (4,) h, w, 3], to be looked up by view_index.")
+      .def("ends", &ends, py::arg("candidates"), py::arg("panoramas"), py::arg("rollouts"), py::arg("maker"),
+           py::arg("frames") = "panorama",
+           "uint8 [n, (4,) h, w, 3]: what each of the named candidates (counted over all episodes) ends with.");
 }
 
 void bind_beam(py::module_& module) {

@@ -32,7 +32,14 @@ def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS):
         queries.append(Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
     model = wiw.world_model(name_or_model)
     proposals = [[Proposal(plan) for plan in plans] for _ in queries]
-    return imagine(model, queries, proposals, FrameSpec("panorama", (144, 256)), Clock()).rollouts
+    return imagine(
+        model,
+        queries,
+        proposals,
+        [range(len(plans)) for plans in proposals],
+        FrameSpec("panorama", (144, 256)),
+        Clock(),
+    ).rollouts
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -43,6 +43,17 @@ TEST_CASE("each cell shows its own source, repeated where plans agree, empty beh
     const auto begin = views.begin() + static_cast<std::ptrdiff_t>(cell * kBytes);
     CHECK(std::count(begin, begin + kBytes, expected[cell]) == kBytes);
   }
+
+  const std::int64_t candidates[] = {1, 2, 0, 1};
+  const int ending[] = {6, 1, 3, 6};
+  make_views(batch, index_ends(batch, candidates), {.data = real.data(), .count = 1, .size = kSize}, imagined, maker,
+             views.data());
+  for (std::size_t i = 0; i < 4; ++i) {
+    const auto begin = views.begin() + static_cast<std::ptrdiff_t>(i * kBytes);
+    CHECK(std::count(begin, begin + kBytes, ending[i]) == kBytes);
+  }
+  const std::int64_t beyond[] = {3};
+  CHECK_THROWS_AS((void)index_ends(batch, beyond), ArgumentError);
 }
 
 TEST_CASE("a rollout of the wrong length is refused") {

@@ -51,6 +51,19 @@ ViewIndex index_views(const Batch& batch) {
   return index;
 }
 
+ViewIndex index_ends(const Batch& batch, std::span<const std::int64_t> candidates) {
+  ViewIndex index;
+  for (const std::int64_t candidate : candidates) {
+    const auto i = static_cast<std::size_t>(candidate);
+    if (candidate < 0 || i >= batch.candidates() || batch.sources(i).empty()) {
+      throw ArgumentError("index_ends: expected candidates from 0 to " + std::to_string(batch.candidates()) +
+                          " (exclusive) that have steps, got " + std::to_string(candidate));
+    }
+    index.distinct.push_back({batch.episodes()[i], batch.sources(i).back()});
+  }
+  return index;
+}
+
 void check_inputs(const Batch& batch, const Panoramas& real, const Imagination& imagined) {
   for (const int episode : batch.episodes()) {
     if (static_cast<std::size_t>(episode) >= real.count) {

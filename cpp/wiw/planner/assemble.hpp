@@ -25,6 +25,10 @@ struct ViewIndex {
 
 ViewIndex index_views(const Batch& batch);
 
+/// What each of `candidates` ends with, one distinct observation each, for make_views. Throws ArgumentError for a
+/// candidate that is not in the batch or has no steps.
+ViewIndex index_ends(const Batch& batch, std::span<const std::int64_t> candidates);
+
 /// Real panoramas of the episodes, uint8 [episodes, H, W, 3].
 struct Panoramas {
   const std::uint8_t* data = nullptr;

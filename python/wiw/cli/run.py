@@ -33,6 +33,8 @@ def run(
     out: Folder = None,
     candidates: Annotated[int | None, arg(metavar="M")] = None,
     horizon: Annotated[int | None, arg(metavar="L")] = None,
+    depth: Count = 1,
+    width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     backend: Literal["auto", "cpu", "gpu"] = "auto",
@@ -62,6 +64,8 @@ def run(
         out: Folder of the run; runs/TASK-TIME if not given.
         candidates: Plans imagined at each decision; the task's own number if not given.
         horizon: Primitives in a plan; the task's own number if not given.
+        depth: Levels of the beam search; each one after the first extends the best plans by another horizon.
+        width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         backend: Renderer.
@@ -75,7 +79,9 @@ def run(
     options = {"scenes": scenes, "seed": seed, "preset": _preset(preset), "backend": backend}
     recipe = TaskRecipe(task, options if motion is None else {**options, "motion": motion})
     model = None if world_model == "none" else absolute(world_model)
-    agent = AgentRecipe(absolute(policy), model, revision and absolute(revision), candidates, horizon)
+    agent = AgentRecipe(
+        absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width
+    )
     names = _arms(arms, world_model)
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 

@@ -43,6 +43,8 @@ class AgentRecipe:
     candidates: int | None = None
     horizon: int | None = None
     execute: int | None = None
+    depth: int | None = None
+    width: int | None = None
 
     def build(self, defaults: Mapping[str, Any]) -> Any:
         """The agent; what is None is taken from the task's defaults (M, L and the executed primitives)."""
@@ -138,6 +140,8 @@ def _with_model(agent: Any, model: str) -> AgentRecipe | Ready:
             agent.candidates,
             agent.horizon,
             agent.execute,
+            agent.depth,
+            agent.width,
         )
     )
 

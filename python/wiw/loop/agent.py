@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.imagine import Imagination, imagine
 from wiw.policies.base import Policy, Situation
@@ -39,7 +41,15 @@ class Agent:
         candidates: plans per decision (M); None means the task's default, 3.
         horizon: primitives per plan (L); None means the task's default, 5.
         execute: primitives carried out before the next decision; None means L - 2, as in the paper's ImageNav. A
-            negative number leaves that many of the chosen plan undone, but carries out at least one.
+            negative number leaves that many of the plan's first `horizon` undone, but carries out at least one.
+        depth: levels of the beam search. At 1, the paper's, the proposals are what is chosen from; each further level
+            extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
+            Without a model nothing is imagined, and there is one level.
+        width: plans of an episode that are kept and extended; None means `candidates`.
+
+    Raises:
+        ArgumentError: a number out of range; with depth > 1, a model that shows no panorama or a policy that needs
+            depth, which no imagined place has, and does not say how to extend.
     """
 
     def __init__(
@@ -50,6 +60,8 @@ class Agent:
         candidates: int | None = None,
         horizon: int | None = None,
         execute: int | None = None,
+        depth: int = 1,
+        width: int | None = None,
     ) -> None:
         self.policy: Policy = POLICIES.make(policy)
         self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model)
@@ -57,11 +69,19 @@ class Agent:
         self.candidates = 3 if candidates is None else candidates
         self.horizon = 5 if horizon is None else horizon
         self.execute = max(1, self.horizon - 2) if execute is None else execute
-        if self.candidates < 1 or self.horizon < 1 or not 1 <= abs(self.execute) <= self.horizon:
+        self.depth, self.width = depth, self.candidates if width is None else width
+        if (
+            min(self.candidates, self.depth, self.width) < 1
+            or self.horizon < 1
+            or not 1 <= abs(self.execute) <= self.horizon
+        ):
             raise ArgumentError(
-                f"Agent: expected candidates >= 1 and execute from 1 to horizon or below 0, got candidates="
-                f"{self.candidates}, horizon={self.horizon}, execute={self.execute}"
+                f"Agent: expected candidates, depth and width >= 1 and execute from 1 to horizon or below 0, got "
+                f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
+                f"width={self.width}"
             )
+        if self.depth > 1 and self.model is not None:
+            self._check_depth(self.model)
         self._memories: dict[tuple[int, int], tuple[Any, Any]] = {}
 
     @property
@@ -90,10 +110,13 @@ class Agent:
             calls: dict[str, int] = {}
             scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
         else:
-            imagined: Imagination = imagine(self.model, queries, proposals, self.revision.frames, clock)
-            rollouts, calls = [*imagined.rollouts], imagined.calls
-            with clock("revise"):
-                scores = self.revision.score(revising, proposals, imagined.rollouts)
+            beams = Beams(proposing, proposals, self.width, self.depth)
+            imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
+            while beams.level < self.depth:
+                with clock("propose"):
+                    beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
+                imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
+            proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], dict(beams.calls)
         seconds = clock.share(len(queries))
         return [
             self._decision(query, situation, plans, rollout, score, seconds, calls)
@@ -116,7 +139,31 @@ class Agent:
             "candidates": self.candidates,
             "horizon": self.horizon,
             "execute": self.execute,
+            "depth": self.depth,
+            "width": self.width,
         }
+
+    def _look_ahead(
+        self, model: WorldModel, queries: Sequence[Query], revising: Sequence[Situation], beams: Beams, clock: Clock
+    ) -> tuple[Imagination, list[NDArray[np.float64]]]:
+        """Imagines and scores the plans of one level."""
+        imagined = imagine(model, queries, beams.proposals, beams.origins, self.revision.frames, clock)
+        beams.calls.update(imagined.calls)
+        with clock("revise"):
+            return imagined, self.revision.score(revising, beams.proposals, imagined.rollouts)
+
+    def _check_depth(self, model: WorldModel) -> None:
+        if model.accepts.view != "panorama":
+            raise ArgumentError(
+                f"Agent: depth={self.depth} proposes from imagined panoramas, but {type(model).__name__} imagines the "
+                "front view alone; use depth=1, or a panorama model"
+            )
+        if not self.policy.can_extend:
+            raise ArgumentError(
+                f"Agent: with depth={self.depth} plans are proposed from imagined places, which have no depth, but "
+                f"{type(self.policy).__name__} needs it; write its `extend`, or propose with another policy and give "
+                "this one as revision="
+            )
 
     def _reviser(self, revision: Any) -> Policy:
         if revision is not None:
@@ -149,7 +196,7 @@ class Agent:
         actions, chosen = self.revision.revise(situation, proposals, scores)
         return Decision(
             actions=actions,
-            execute=min(self.execute, len(actions)) if self.execute > 0 else max(1, len(actions) + self.execute),
+            execute=self._segment(len(actions)),
             proposals=tuple(proposals),
             rollouts=None if rollouts is None else tuple(rollouts),
             scores=np.asarray(scores, np.float64),
@@ -160,3 +207,9 @@ class Agent:
             seconds=seconds,
             calls=calls,
         )
+
+    def _segment(self, length: int) -> int:
+        """How many primitives of a plan are carried out."""
+        if self.execute > 0:
+            return min(self.execute, length)
+        return max(1, min(length, self.horizon) + self.execute)

@@ -27,19 +27,41 @@ class Imagination:
     rollouts: list[list[Rollout]]
     """[episode][candidate]."""
     calls: dict[str, int]
-    """What an episode's share of the batch cost: rows asked and frames imagined, over all live episodes."""
+    """What the batch cost: rows asked and frames imagined, over all live episodes."""
+    queries: Sequence[Any]
+    batch: Any
+    answers: list[NDArray[np.uint8]]
+    """What the world model gave, one array a part of the batch."""
+
+    def ends(self, candidates: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """What the named candidates (counted over all episodes) end with: panoramas and front views, as observed."""
+        panoramas = np.stack([query.observation.panorama for query in self.queries])
+        sizes = panoramas.shape[1:3], self.queries[0].observation.front.shape[:2]
+        whole, front = (
+            self.batch.ends(candidates, panoramas, self.answers, _maker(view, size))
+            for view, size in zip(("panorama", "front"), sizes, strict=True)
+        )
+        return whole, front
 
 
 def imagine(
-    model: WorldModel, queries: Sequence[Any], proposals: Sequence[Sequence[Proposal]], frames: FrameSpec, clock: Clock
+    model: WorldModel,
+    queries: Sequence[Any],
+    proposals: Sequence[Sequence[Proposal]],
+    origins: Sequence[Sequence[int]],
+    frames: FrameSpec,
+    clock: Clock,
 ) -> Imagination:
-    """Imagines every proposal of every episode and shows the futures in the views that the reviser asked for."""
+    """Imagines every proposal of every episode and shows the futures in the views that the reviser asked for.
+
+    `origins` numbers the seed of each proposal.
+    """
     accepts = model.accepts
     with clock("platform"):
         batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], _spec(accepts))
         panoramas = np.stack([query.observation.panorama for query in queries])
         conditioning = _conditioning(accepts, batch, queries, panoramas)
-        seeds = _seeds(batch, queries, proposals)
+        seeds = _seeds(batch, queries, origins)
     answers: list[NDArray[np.uint8]] = []
     for part in batch.parts:
         with clock("platform"):
@@ -52,7 +74,7 @@ def imagine(
         view = "front" if kind == "perspective" else frames.view
         size = frames.size if view == frames.view else (384, 384)
         shown = batch.views(panoramas, answers, _maker(view, size), kind)
-        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch))
+        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch), queries, batch, answers)
 
 
 def _spec(accepts: Accepts) -> Any:
@@ -100,7 +122,7 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
     if accepts.needs:
         raise ArgumentError(
             f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
-            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon"
+            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon or search less deep"
         )
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
@@ -134,12 +156,12 @@ def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
     return action.to_controls(action.with_null(actions) if accepts.null_first else actions, accepts.vocabulary)
 
 
-def _seeds(batch: Any, queries: Sequence[Any], proposals: Sequence[Sequence[Proposal]]) -> NDArray[np.uint64]:
+def _seeds(batch: Any, queries: Sequence[Any], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
     """uint64 [rows]: keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
     keys = [
         core.fold_key([query.key.seed, query.key.episode, query.key.decision, candidate])
-        for query, plans in zip(queries, proposals, strict=True)
-        for candidate in range(len(plans))
+        for query, numbers in zip(queries, origins, strict=True)
+        for candidate in numbers
     ]
     return np.array(keys, np.uint64)[batch.row_owner]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,18 @@ class Policy(ABC):
         """At most `candidates` plans of at most `horizon` primitives for each episode, best first."""
         raise NotImplementedError
 
+    def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Continuations of imagined plans, one list a situation; asked for where the beam search goes deeper.
+
+        Each situation stands at the end of a kept plan: its images are imagined, its odometry is what the plan leads to
+        when no step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default:
+        proposes as if the agent had come there, with a copy of its memory that has observed the place. A policy that
+        observes depth has to write its own.
+        """
+        there = [replace(situation, memory=deepcopy(situation.memory)) for situation in situations]
+        self.observe(there)
+        return self.propose(there, candidates, horizon)
+
     def score(
         self,
         situations: Sequence[Situation],
@@ -82,6 +95,11 @@ class Policy(ABC):
     def can_revise(self) -> bool:
         """Whether this policy scores imagined futures itself."""
         return type(self).score is not Policy.score
+
+    @property
+    def can_extend(self) -> bool:
+        """Whether this policy can propose from an imagined place, which has no depth."""
+        return type(self).extend is not Policy.extend or "depth" not in self.needs
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest."""
