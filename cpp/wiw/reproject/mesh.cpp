@@ -147,8 +147,8 @@ void append_cut_quad(const MeshLayout& layout, const Edges& edges, int row, int 
   } else {
     for (int corner = 0; corner < 4; ++corner) {
       if (!nearer(corner)) continue;
-      const float x = 0.5F * static_cast<float>(corner % 2);
-      const float y = 0.5F * static_cast<float>(corner / 2);
+      const int right = corner % 2, below = corner / 2;
+      const float x = 0.5F * static_cast<float>(right), y = 0.5F * static_cast<float>(below);
       append({x, x + 0.5F, y, y + 0.5F}, {corner, corner, corner, corner});
     }
   }

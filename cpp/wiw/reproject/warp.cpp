@@ -78,7 +78,7 @@ bool saw_sky(std::uint32_t texel, std::uint32_t fraction14, const float* depth, 
   return !(depth[static_cast<std::size_t>(row) * width + (column < width ? column : 0)] > 0.0F);
 }
 
-const View& checked(const View& view, const char* name) {
+View checked(const View& view, const char* name) {
   check_view(view, name);
   return view;
 }

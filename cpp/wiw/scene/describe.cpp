@@ -55,11 +55,11 @@ std::string summary(const Scene& scene) {
 std::string describe(const Scene& scene) {
   constexpr double kMegabyte = 1e6;
   std::string text = summary(scene);
-  for (const auto& [key, value] : scene.attributes) text += "\n  " + key + ": " + value;
+  for (const auto& [key, value] : scene.attributes) text.append("\n  ").append(key).append(": ").append(value);
   text += "\n  categories: " + categories_line(scene);
   if (!scene.rooms.empty()) {
     text += "\n  rooms: ";
-    for (std::size_t i = 0; i < scene.rooms.size(); ++i) text += (i ? ", " : "") + scene.rooms[i].name;
+    for (std::size_t i = 0; i < scene.rooms.size(); ++i) text.append(i ? ", " : "").append(scene.rooms[i].name);
   }
   text += "\n  memory: " + counted(scene.meshes.size(), "mesh buffer") + " " +
           fixed(static_cast<double>(mesh_bytes(scene)) / kMegabyte, 1) + " MB, " +

@@ -14,6 +14,7 @@ constexpr int kPadding = 4;  // kernels read whole packets of 4 columns and up t
 template <class Formula>
 std::vector<float> tabulate(int count, const Formula& formula) {
   std::vector<float> values;
+  values.reserve(static_cast<std::size_t>(count + kPadding));
   for (int i = 0; i < count + kPadding; ++i) values.push_back(static_cast<float>(formula(i)));
   return values;
 }

@@ -34,7 +34,7 @@ bool needs_detail(const Scene& scene, const Mesh& mesh) {
 /// Value at vertex 0, then the differences that barycentric interpolation needs.
 void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& triangle, float* out) {
   if (values.empty()) return;
-  const Eigen::Vector2f first = values[triangle[0]];
+  const Eigen::Vector2f& first = values[triangle[0]];
   const Eigen::Vector2f to_1 = values[triangle[1]] - first;
   const Eigen::Vector2f to_2 = values[triangle[2]] - first;
   for (int c = 0; c < 2; ++c) {

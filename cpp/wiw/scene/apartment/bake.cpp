@@ -119,6 +119,7 @@ class Assembler {
   std::uint32_t add_panel(const Panel& panel) {
     Mesh mesh = to_mesh(panel.part);
     std::vector<Vec2> uv;
+    uv.reserve(panel.part.positions.size());
     for (const Vec3& position : panel.part.positions)
       uv.push_back(atlas_.uv(draft_.charts[panel.chart], atlas_.places[panel.chart], position));
     mesh.lightmap_uv = std::move(uv);

@@ -116,7 +116,7 @@ bool kitchen_is_well_placed(const Row& row) {
 }
 
 /// Joins the laundry behind a bathroom, or a second bathroom, into one slot in half of the plans.
-Row slots_of(Rooms rooms, Rng& rng) {
+Row slots_of(const Rooms& rooms, Rng& rng) {
   Row row;
   const bool join = rng.chance(0.6);
   for (const RoomType type : rooms) {
@@ -133,7 +133,7 @@ Row slots_of(Rooms rooms, Rng& rng) {
 }
 
 /// Shares the rooms out to rows of wanted lengths.
-std::vector<Row> share_out(Rooms rooms, std::vector<float> lengths, Rng& rng) {
+std::vector<Row> share_out(Rooms rooms, const std::vector<float>& lengths, Rng& rng) {
   std::vector<Row> rows;
   for (int attempt = 0; attempt < 8; ++attempt) {
     shuffle(rng, rooms);

@@ -21,7 +21,7 @@ NeutralStyle neutral_style(Pattern pattern) {
     case Pattern::kLeather: return {"leather", {0.5f, 0.5f}, {256, 256}};
     case Pattern::kBrushed: return {"metal", {1.f, 0.5f}, {128, 128}};
     case Pattern::kPlanks: return {"wood planks", {2.4f, 1.2f}, {512, 512}};
-    case Pattern::kHerringbone: return {"wood parquet", {1.6f, 1.6f}, {512, 512}};
+    case Pattern::kHerringbone:
     case Pattern::kBasketParquet: return {"wood parquet", {1.6f, 1.6f}, {512, 512}};
     case Pattern::kCarpet: return {"carpet", {1.f, 1.f}, {256, 256}};
     case Pattern::kConcrete: return {"concrete", {3.f, 3.f}, {512, 512}};

@@ -131,7 +131,7 @@ bool RoomPlan::stand_at_wall(Placed piece, Side side, float middle) {
   return true;
 }
 
-bool RoomPlan::stand_free(Placed piece, float front) {
+bool RoomPlan::stand_free(const Placed& piece, float front) {
   const Rect body = footprint(piece);
   if (!floor.fits(body, body.grown(front))) return false;
   floor.stand(body, {});

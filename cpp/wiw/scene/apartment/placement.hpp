@@ -41,7 +41,7 @@ struct RoomPlan {
   Placed design(std::size_t category);
   /// Back to the wall with the middle at `middle`; false and unchanged if it does not fit.
   bool stand_at_wall(Placed piece, Side side, float middle);
-  bool stand_free(Placed piece, float front);
+  bool stand_free(const Placed& piece, float front);
   bool hang(Placed piece, Side side, float middle, float height);
 };
 

@@ -126,11 +126,12 @@ void Shape::soft_box(MaterialId material, const Vec3& low, const Vec3& high, flo
   const Vec3 inner_low = low.array() + r, inner_high = high.array() - r;
   // Coordinates of the grid lines of an axis before rounding: quarter circles at both ends, even cells between.
   const auto lines = [&](int axis) {
+    const int count = cells(inner_high[axis] - inner_low[axis], bulge > 0.f ? std::min(edge_, 0.12f) : edge_);
     std::vector<float> values;
+    values.reserve(static_cast<std::size_t>(count + 2 * steps + 1));
     for (int i = 0; i < steps; ++i)
       values.push_back(inner_low[axis] -
                        r * std::tan(kTurn / 8 * static_cast<float>(steps - i) / static_cast<float>(steps)));
-    const int count = cells(inner_high[axis] - inner_low[axis], bulge > 0.f ? std::min(edge_, 0.12f) : edge_);
     for (int i = 0; i <= count; ++i)
       values.push_back(inner_low[axis] +
                        (inner_high[axis] - inner_low[axis]) * static_cast<float>(i) / static_cast<float>(count));

@@ -32,8 +32,8 @@ void add_ceiling(Scene& scene, float height) {
   const Eigen::AlignedBox3f all = scene.bounds();
   const Eigen::AlignedBox3f floor = floor_bounds(scene);
   const float y = height + (floor.isEmpty() ? all.min().y() : floor.max().y());
-  const Eigen::Vector3f a = all.min();
-  const Eigen::Vector3f b = all.max();
+  const Eigen::Vector3f& a = all.min();
+  const Eigen::Vector3f& b = all.max();
 
   Mesh mesh;
   mesh.positions =

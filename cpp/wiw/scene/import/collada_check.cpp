@@ -83,7 +83,7 @@ void check_accessors(const pugi::xml_document& document, const std::string& path
   for (const pugi::xpath_node& found : document.select_nodes("//accessor")) {
     const pugi::xml_node accessor = found.node();
     const std::string name = accessor.attribute("source").value();
-    const auto array = counts.find(name.substr(name.starts_with("#") ? 1 : 0));
+    const auto array = counts.find(name.substr(name.starts_with('#') ? 1 : 0));
     const std::uint64_t count = accessor.attribute("count").as_ullong();
     const std::uint64_t stride = accessor.attribute("stride").as_ullong(1);
     const std::uint64_t offset = accessor.attribute("offset").as_ullong(0);

@@ -39,7 +39,7 @@ RotationStretch split_rotation(const Eigen::Matrix3f& linear) {
   }
   const Eigen::JacobiSVD<Eigen::Matrix3d> svd(linear.cast<double>(), Eigen::ComputeFullU | Eigen::ComputeFullV);
   Eigen::Matrix3d u = svd.matrixU();
-  const Eigen::Matrix3d v = svd.matrixV();
+  const Eigen::Matrix3d& v = svd.matrixV();
   if ((u * v.transpose()).determinant() < 0.) u.col(2) *= -1.;
   const Eigen::Matrix3d rotation = u * v.transpose();
   const Eigen::Matrix3d stretch = rotation.transpose() * linear.cast<double>();

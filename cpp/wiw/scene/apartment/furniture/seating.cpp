@@ -85,7 +85,8 @@ void make_sofa(Make& m) {
   const int pillows = static_cast<int>(m.rng.below(4));
   for (int i = 0; i < pillows; ++i) {
     const float side = i % 2 == 0 ? -1.f : 1.f;
-    add_throw_pillow(m, pick(m.rng, m.look.fabrics), side * (0.5f * m.w() - 0.42f - 0.2f * static_cast<float>(i / 2)),
+    const int inward = i / 2;
+    add_throw_pillow(m, pick(m.rng, m.look.fabrics), side * (0.5f * m.w() - 0.42f - 0.2f * static_cast<float>(inward)),
                      0.6f, -0.5f * m.d() + 0.4f, -0.35f * side);
   }
 }
