@@ -139,7 +139,7 @@ def ended(out):
 def test_doctor_names_what_matters(capsys):
     assert main(["doctor"]) == 0
     shown = capsys.readouterr().out
-    for name in ("python", "processor", "threads", "instructions", "memory", "torch", "runs folder"):
+    for name in ("python", "processor", "threads", "instructions", "memory", "torch", "runs folder", "scene cache"):
         assert name in shown
     assert "torch" not in sys.modules
 
@@ -148,6 +148,17 @@ def test_doctor_warns_with_a_remedy(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "access", lambda *_: False)
     findings = {finding.name: finding for finding in examine()}
     assert "not writable" in findings["runs folder"].remedy and findings["wiw"].remedy == ""
+
+
+def test_doctor_says_where_scenes_are_kept_and_how_big_they_are(monkeypatch, tmp_path):
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
+    found = {finding.name: finding for finding in examine()}["scene cache"]
+    assert str(tmp_path / "cache" / "scenes") in found.detail and "0 files, 0 MB" in found.detail and not found.remedy
+    (tmp_path / "cache" / "scenes").mkdir(parents=True)
+    (tmp_path / "cache" / "scenes" / "a.wiwscene").write_bytes(bytes(3 << 20))
+    assert "1 files, 3 MB" in {finding.name: finding for finding in examine()}["scene cache"].detail
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "set WIW_CACHE" in {finding.name: finding for finding in examine()}["scene cache"].remedy
 
 
 def test_scenes_draws_a_sheet(tmp_path, capsys):

@@ -2,6 +2,7 @@
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -10,10 +11,11 @@ from pathlib import Path
 import pytest
 from fakes import LineAgent, LineTask
 
-from wiw.errors import ArgumentError, ContractError, InfrastructureError, StoreError
+from wiw.errors import ArgumentError, ContractError, InfrastructureError, RegistryError, StoreError
 from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
 from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
 from wiw.evaluation.runlog import load_run
+from wiw.evaluation.store import store_path
 
 HERE = Path(__file__).parent
 TIMINGS = ("seconds",)
@@ -166,3 +168,75 @@ def test_recipes_survive_json():
     assert Ready(LineTask()).to_json() is None
     assert agent.with_model("none").arm == "none" and AgentRecipe("m", "/x/y.py:Mine").arm == "Mine"
     assert absolute("a.py:Mine") == f"{Path.cwd() / 'a.py'}:Mine" and absolute("pkg.mod:Mine") == "pkg.mod:Mine"
+
+
+MODEL = """
+from pathlib import Path
+
+import numpy as np
+import wiw
+
+
+class Heavy(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", causal=True)
+
+    def __init__(self):
+        with Path(__file__).with_suffix(".log").open("a") as log:
+            log.write("{name} built\\n")
+        self.network, self.steps, self.weights = object(), {steps}, Path("weights.pt")
+        self.table, self._secret, self.sizes = np.zeros(3), 1, {{"a": (1, 2)}}
+
+    def rollout(self, observations, controls, seeds):
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+"""
+
+
+def models(folder, steps=5):
+    names = ("first", "second")
+    for name in names:
+        (folder / f"{name}.py").write_text(MODEL.format(name=name, steps=steps))
+    return [f"{folder / name}.py:Heavy" for name in names]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_models_are_built_once_and_described_by_plain_values(tmp_path, two_rooms, workers):
+    first, second = models(tmp_path)
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
+    agent = AgentRecipe("heuristic", first, revision="geometric")
+    log = run_arms(
+        task,
+        {"first": agent, "second": agent.with_model(second)},
+        1,
+        out=tmp_path / "run",
+        workers=workers,
+        progress=False,
+    )
+    assert [(tmp_path / f"{n}.log").read_text() for n in ("first", "second")] == ["first built\n", "second built\n"]
+    assert log.store.info["built"]["first"]["model"] == {
+        "name": "Heavy",
+        "steps": 5,
+        "weights": "weights.pt",
+        "sizes": {"a": [1, 2]},
+    }
+    assert log.store.config["arms"][0]["agent"]["model"] == first
+
+
+def test_a_run_is_not_resumed_with_an_agent_that_has_changed(tmp_path, two_rooms, monkeypatch):
+    first, _ = models(tmp_path)
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
+    evaluate(task, AgentRecipe("heuristic", first), 2, out=tmp_path / "run", progress=False)
+    with sqlite3.connect(store_path(tmp_path / "run")) as store:
+        store.execute("DELETE FROM outcome WHERE episode = 1")
+    models(tmp_path, steps=6)
+    monkeypatch.setattr(sys, "modules", {k: v for k, v in sys.modules.items() if not k.startswith("wiw_user_first")})
+    with pytest.raises(StoreError, match="steps"):
+        resume_run(tmp_path / "run", progress=False)
+
+
+def test_an_unknown_part_is_named_before_a_run_begins(tmp_path):
+    with pytest.raises(RegistryError, match="no world model is named 'wrap'"):
+        evaluate(LineTask(), AgentRecipe("heuristic", "wrap"), 2, out=tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()
+    for wrong in ("candidates", "horizon", "depth", "width"):
+        with pytest.raises(ArgumentError, match=f"{wrong} of at least 1"):
+            AgentRecipe("heuristic", **{wrong: 0})

@@ -116,7 +116,7 @@ def test_evaluate_takes_a_task_by_name_with_its_preset(two_rooms: str, tmp_path:
         decisions=1,
     )
     assert log.store.config["task"]["checked"] == "decision"
-    assert log.store.config["arms"][0]["agent"]["execute"] == -2
+    assert log.store.info["built"]["none"]["execute"] == -2
     with pytest.raises(ArgumentError, match="cannot take preset"):
         evaluate(ImageNav(scenes=two_rooms), AgentRecipe("heuristic"), 1, preset="official")
 

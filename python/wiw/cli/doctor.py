@@ -52,6 +52,7 @@ def examine() -> Iterator[Finding]:
     yield from _rendering()
     yield _torch()
     yield _writable("runs folder", Path.cwd())
+    yield _cache()
     yield _writable("temporary files", Path(tempfile.gettempdir()))
 
 
@@ -121,12 +122,30 @@ def _torch() -> Finding:
 
 
 def _writable(name: str, folder: Path) -> Finding:
-    free = os.statvfs(folder)
-    gigabytes = free.f_bavail * free.f_frsize / 2**30
+    gigabytes = _free_gigabytes(folder)
     detail = f"{folder}, {gigabytes:.0f} GB free"
     if not os.access(folder, os.W_OK):
         return Finding(name, detail, "not writable: go to another folder or give --out")
     return Finding(name, detail, "nearly full: a run with pictures may need 1 GB" if gigabytes < 1 else "")
+
+
+def _cache() -> Finding:
+    """The folder of imported and generated scenes: where it is, what it holds, whether it can grow."""
+    from wiw.scenes.store import folder
+
+    cache = folder()
+    files = [path.stat() for path in cache.glob("*")] if cache.is_dir() else []
+    there = next(path for path in (cache, *cache.parents) if path.exists())
+    used, free = sum(file.st_size for file in files) / 2**20, _free_gigabytes(there)
+    remedy = "nearly full: delete the folder, or set WIW_CACHE to another" if free < 1 else ""
+    if not os.access(there, os.W_OK):
+        remedy = f"{there} is not writable: set WIW_CACHE to another folder"
+    return Finding("scene cache", f"{cache}, {len(files)} files, {used:.0f} MB, {free:.0f} GB free", remedy)
+
+
+def _free_gigabytes(folder: Path) -> float:
+    disk = os.statvfs(folder)
+    return disk.f_bavail * disk.f_frsize / 2**30
 
 
 def _version(package: str) -> str | None:

@@ -15,7 +15,7 @@ from wiw.errors import ArgumentError, Error, StoreError
 from wiw.evaluation.platform import describe_platform
 from wiw.evaluation.progress import Tracker, make_board
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
-from wiw.evaluation.rows import DecisionRow
+from wiw.evaluation.rows import AgentRow, DecisionRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore, store_path
@@ -147,7 +147,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
         "task": built.describe(),
         "seed": seed,
         "episodes": options.episodes,
-        "arms": _describe_arms(agents, built),
+        "arms": [{"name": arm, "agent": recipe.describe()} for arm, recipe in agents.items()],
     }
     if options.resume and options.out is not None and store_path(options.out).exists():
         store = RunStore.resume(options.out, config)
@@ -164,11 +164,6 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
         }
         store = RunStore.create(folder, config, info, built.episodes(options.episodes))
     return _finish(store, task, agents, options.workers, options.progress)
-
-
-def _describe_arms(agents: Mapping[str, Any], task: Any) -> list[dict[str, Any]]:
-    """What each arm is, for the record; one agent at a time exists, for models may fill the memory."""
-    return [{"name": arm, "agent": recipe.build(task.defaults).describe()} for arm, recipe in agents.items()]
 
 
 def _spread(episodes: int, count: int) -> list[int]:
@@ -229,8 +224,14 @@ class _Desk:
 
     def __init__(self, store: RunStore, tracker: Tracker) -> None:
         self._store, self._tracker = store, tracker
+        self._known: set[str] = set()
 
     def write(self, row: Row) -> None:
+        if isinstance(row, AgentRow):
+            if row.arm not in self._known:  # every worker builds its own
+                self._store.write_agent(row)
+            self._known.add(row.arm)
+            return
         self._store.write(row)
         if isinstance(row, DecisionRow):
             self._tracker.decision(row.arm, row.episode)

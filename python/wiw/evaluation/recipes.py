@@ -46,6 +46,12 @@ class AgentRecipe:
     depth: int | None = None
     width: int | None = None
 
+    def __post_init__(self) -> None:
+        for name in ("candidates", "horizon", "depth", "width"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
+
     def build(self, defaults: Mapping[str, Any]) -> Any:
         """The agent; what is None is taken from the task's defaults (M, L and the executed primitives)."""
         from wiw.loop.agent import Agent
@@ -63,6 +69,19 @@ class AgentRecipe:
         """For the run store; `AgentRecipe(**...)` is the way back."""
         return asdict(self)
 
+    def describe(self) -> dict[str, Any]:
+        """Identity of the agent before it is built: a model is made once, when its turn comes.
+
+        Raises:
+            RegistryError: a part is not known.
+        """
+        from wiw.registry import POLICIES, WORLD_MODELS
+
+        for registry, name in ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision)):
+            if name is not None:
+                registry.find(name)
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
     @property
     def arm(self) -> str:
         """Short name of the world model: "none", "warp", or the class behind a path."""
@@ -78,6 +97,10 @@ class Ready:
     def build(self, *_: Any) -> Any:
         """The thing itself."""
         return self.thing
+
+    def describe(self) -> dict[str, Any]:
+        """What the thing says of itself."""
+        return dict(self.thing.describe())
 
     def to_json(self) -> None:
         """Nothing: an object in memory cannot be written down."""

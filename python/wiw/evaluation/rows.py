@@ -41,6 +41,14 @@ class OutcomeRow:
     result: EpisodeResult
 
 
+@dataclass(frozen=True)
+class AgentRow:
+    """What an arm's agent said of itself when it was built."""
+
+    arm: str
+    agent: dict[str, Any]
+
+
 def to_json(value: Any) -> str:
     """Standard JSON of arrays and numbers; what is not finite becomes null.
 

@@ -19,7 +19,7 @@ from typing import Any
 
 import wiw
 from wiw.errors import StoreError
-from wiw.evaluation.rows import DecisionRow, OutcomeRow, to_json
+from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
 SCHEMA_VERSION = 1
@@ -236,6 +236,22 @@ class RunStore:
                         "error": result.error,
                     },
                 )
+
+    def write_agent(self, row: AgentRow) -> None:
+        """Keeps what an arm's agent says of itself, as `info["built"][arm]`.
+
+        Raises:
+            StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
+        """
+        info = self.info
+        agent = json.loads(to_json(row.agent))
+        built = info.setdefault("built", {})
+        if row.arm in built:
+            _require_same(self.path, built[row.arm], agent)
+            return
+        built[row.arm] = agent
+        with self._writing() as connection:
+            connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         """Forgets what was written of episodes that are to be run again."""

@@ -20,17 +20,17 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError
-from wiw.evaluation.rows import DecisionRow, OutcomeRow, decision_row
+from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, decision_row
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
-Row = DecisionRow | OutcomeRow
+Row = AgentRow | DecisionRow | OutcomeRow
 
 
 class Desk(Protocol):
     """What the workers report to."""
 
     def write(self, row: Row) -> None:
-        """A decision was taken, or an episode has ended."""
+        """An agent was built, a decision was taken, or an episode has ended."""
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         """These episodes are run again from their beginning."""
@@ -92,6 +92,7 @@ class Runner:
             self._agent = None
             self._agent = self._plan.agents[job.arm].build(self._task.defaults)
             self._arm = job.arm
+            send(AgentRow(job.arm, self._agent.describe()))
         sink = RowSink(job, self._plan, send)
         run_episodes(self._task, self._agent, job.episodes, seed=self._plan.seed, live=self._plan.live, sink=sink)
 

@@ -131,11 +131,10 @@ class Agent:
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest."""
-        model = None if self.model is None else {"name": type(self.model).__name__, **vars(self.model)}
         return {
             "policy": self.policy.describe(),
             "revision": self.revision.describe(),
-            "model": model,
+            "model": None if self.model is None else self.model.describe(),
             "candidates": self.candidates,
             "horizon": self.horizon,
             "execute": self.execute,

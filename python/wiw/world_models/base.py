@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -112,6 +113,24 @@ class WorldModel(ABC):
             uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation.
         """
         raise NotImplementedError
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity for the run's manifest: the class and its options.
+
+        Default: public attributes that are plain values (numbers, text, paths, lists and mappings of them); networks
+        and arrays are left out. Override it to name what they were loaded from.
+        """
+        public = {name: value for name, value in vars(self).items() if not name.startswith("_") and _is_plain(value)}
+        options = {name: str(value) if isinstance(value, Path) else value for name, value in public.items()}
+        return {"name": type(self).__name__, **options}
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(isinstance(name, str) and _is_plain(item) for name, item in value.items())
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or type(value) in (bool, int, float, str) or isinstance(value, Path)
 
 
 def checked_rollout(
