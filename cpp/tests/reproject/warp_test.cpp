@@ -3,6 +3,7 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
 
 #include "wiw/core/error.hpp"
@@ -154,6 +155,46 @@ TEST_CASE("a surface one pixel wide stays one pixel wide") {
     for (int x = 0; x < kPinhole.size.width; ++x)
       near += result.depth[static_cast<std::size_t>(y * kPinhole.size.width + x)] < 2.0F ? 1 : 0;
     CHECK(near == 1);
+  }
+}
+
+TEST_CASE("a surface seen from behind hides what lies beyond it and is a hole") {
+  // A screen stands before a wall; the camera goes past the screen and looks back at it.
+  Picture picture = room(kPanorama, 6);
+  const Size& size = kPanorama.size;
+  for (int y = 0; y < size.height; ++y) {
+    for (int x = 0; x < size.width; ++x) {
+      const Eigen::Vector3d d = ray(kPanorama, x, y);
+      if (d.z() < 0 && std::abs(d.x()) < -0.5 * d.z() && std::abs(d.y()) < -0.5 * d.z())
+        picture.depth[static_cast<std::size_t>(y * size.width + x)] = static_cast<float>(-1.0 / d.z());
+    }
+  }
+  const Warp warp(kPanorama, {false, {40, 40}, radians(40)});
+  const Result result = run(warp, picture, {pose_from_yaw({0, 0, -2}, kPi)}, active_isa());
+  CHECK(std::count(result.hole.begin(), result.hole.end(), 1) == 40 * 40);
+}
+
+TEST_CASE("sky behind something near lies in the window, not on what hangs before it") {
+  // A window fills the wall 4 m ahead from column to column; the left of it ends at a curtain 1 m away.
+  Picture picture = room(kPinhole, 7);
+  const Size& size = kPinhole.size;
+  for (int y = 0; y < size.height; ++y) {
+    for (int x = 0; x < size.width; ++x) {
+      const bool window = x >= 20 && x < 60 && y >= 20 && y < 50;
+      picture.depth[static_cast<std::size_t>(y * size.width + x)] = window ? 0.0F : x < 20 ? 1.0F : 4.0F;
+    }
+  }
+  const Warp warp(kPinhole, kPinhole);
+  // A sky hung between curtain and wall would slant and cover what the curtain uncovers.
+  const Result result = run(warp, picture, {pose_from_yaw({0.5, 0, 0}, 0)}, active_isa());
+  const double focal = Intrinsics{size, kPinhole.hfov}.focal();
+  const int moved = static_cast<int>(std::lround(0.5 / 4.0 * focal));
+  const std::size_t row = 35 * static_cast<std::size_t>(size.width);
+  for (int x = 0; x < 20 - moved - 1; ++x) CHECK(result.hole[row + static_cast<std::size_t>(x)] == 1);
+  for (int x = 20 - moved + 1; x < size.width - moved - 1; ++x) {
+    CHECK(result.hole[row + static_cast<std::size_t>(x)] == 0);
+    if (x < 60 - moved - 1) CHECK(result.depth[row + static_cast<std::size_t>(x)] == 0.0F);
+    if (x > 60 - moved) CHECK(result.depth[row + static_cast<std::size_t>(x)] == doctest::Approx(4.0));
   }
 }
 

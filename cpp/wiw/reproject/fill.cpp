@@ -5,6 +5,7 @@
 #include <cmath>
 #include <vector>
 
+#include "wiw/reproject/fill_color.hpp"
 #include "wiw/reproject/raster.hpp"
 
 namespace wiw::reproject {
@@ -15,7 +16,6 @@ namespace {
 constexpr float kSameSurface = 0.1F;
 
 struct Row {
-  std::uint8_t* color;
   float* depth;
   int width;
   [[nodiscard]] int wrap(int column) const { return ((column % width) + width) % width; }
@@ -30,27 +30,12 @@ float right_weight(float left_depth, float right_depth, float share) {
 
 /// Fills columns (begin, end) exclusive, which may lie beyond the width if the row wraps.
 void fill_gap(const Row& row, int begin, int end) {
-  const int left = row.wrap(begin);
-  const int right = row.wrap(end);
-  const float left_depth = row.depth[left];
-  const float right_depth = row.depth[right];
+  const float left_depth = row.depth[row.wrap(begin)];
+  const float right_depth = row.depth[row.wrap(end)];
   for (int column = begin + 1; column < end; ++column) {
-    const int at = row.wrap(column);
     const float share = static_cast<float>(column - begin) / static_cast<float>(end - begin);
     const float weight = right_weight(left_depth, right_depth, share);
-    row.depth[at] = left_depth + weight * (right_depth - left_depth);
-    for (int c = 0; c < 3; ++c) {
-      const auto a = static_cast<float>(row.color[3 * left + c]);
-      const auto b = static_cast<float>(row.color[3 * right + c]);
-      row.color[3 * at + c] = static_cast<std::uint8_t>(a + weight * (b - a) + 0.5F);
-    }
-  }
-}
-
-void copy_pixels(const Row& row, int from, int first, int last) {
-  for (int column = first; column <= last; ++column) {
-    row.depth[column] = row.depth[from];
-    std::copy_n(row.color + 3 * from, 3, row.color + 3 * column);
+    row.depth[row.wrap(column)] = left_depth + weight * (right_depth - left_depth);
   }
 }
 
@@ -68,34 +53,40 @@ bool fill_row(const Row& row, bool wraps) {
   if (wraps) {
     if (first + row.width > last + 1) fill_gap(row, last, first + row.width);
   } else {
-    copy_pixels(row, first, 0, first - 1);
-    copy_pixels(row, last, last + 1, row.width - 1);
+    std::fill_n(row.depth, first, row.depth[first]);
+    std::fill(row.depth + last + 1, row.depth + row.width, row.depth[last]);
   }
   return true;
 }
 
-}  // namespace
-
-void fill_holes(ImageView<std::uint8_t> color, ImageView<float> depth, bool wraps) {
+void fill_depth(ImageView<float> depth, bool wraps) {
   const int height = depth.size.height;
   const int width = depth.size.width;
   std::vector<int> filled;
   for (int y = 0; y < height; ++y) {
-    if (fill_row({color.row(y), depth.row(y), width}, wraps)) filled.push_back(y);
-  }
-  if (filled.empty()) {
-    std::fill_n(color.data, 3 * color.size.pixels(), std::uint8_t{0});
-    std::fill_n(depth.data, depth.size.pixels(), 0.0F);
-    return;
+    if (fill_row({depth.row(y), width}, wraps)) filled.push_back(y);
   }
   if (static_cast<int>(filled.size()) == height) return;
   auto next = filled.begin();
   for (int y = 0; y < height; ++y) {
     while (std::next(next) != filled.end() && std::abs(*std::next(next) - y) <= std::abs(*next - y)) ++next;
-    if (*next == y) continue;
-    std::copy_n(color.row(*next), 3 * width, color.row(y));
-    std::copy_n(depth.row(*next), width, depth.row(y));
+    if (*next != y) std::copy_n(depth.row(*next), width, depth.row(y));
   }
+}
+
+}  // namespace
+
+void fill_holes(ImageView<std::uint8_t> color, ImageView<float> depth, bool wraps) {
+  const std::size_t pixels = depth.size.pixels();
+  const auto holes = static_cast<std::size_t>(std::count(depth.data, depth.data + pixels, kNothing));
+  if (holes == 0) return;
+  if (holes == pixels) {
+    std::fill_n(color.data, 3 * pixels, std::uint8_t{0});
+    std::fill_n(depth.data, pixels, 0.0F);
+    return;
+  }
+  fill_color(color, depth, wraps);
+  fill_depth(depth, wraps);
 }
 
 }  // namespace wiw::reproject

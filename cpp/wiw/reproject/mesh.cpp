@@ -154,22 +154,58 @@ void append_cut_quad(const MeshLayout& layout, const Edges& edges, int row, int 
   }
 }
 
-/// Gives pixels of a row without depth what lies in the plane between their neighbours in the row: sky seen through a
-/// window then moves with the window. Sky left at infinity would shine through every gap beside it. Rows without any
-/// depth stay at kFar.
-void span_sky(float* row, int count) {
-  int last = -1;
-  for (int column = 0; column <= count; ++column) {
-    if (column < count && row[column] >= kFar) continue;
-    if (column > last + 1 && (last >= 0 || column < count)) {
-      const float left = 1.0F / row[last >= 0 ? last : column];
-      const float right = 1.0F / row[column < count ? column : last];
-      for (int j = last + 1; j < column; ++j) {
-        const float share = static_cast<float>(j - last) / static_cast<float>(column - last);
-        row[j] = 1.0F / (left + share * (right - left));
+float blend(float a, float b, int i, int begin, int end) {
+  return a + static_cast<float>(i - begin) / static_cast<float>(end - begin) * (b - a);
+}
+
+/// Inverse depth of sky with surfaces above and below it: what lies in the plane between them; 0 elsewhere.
+std::vector<float> sky_along_columns(const Size& size, std::ptrdiff_t stride, const float* depth) {
+  std::vector<float> inverse(size.pixels(), 0.0F);
+  std::vector<int> last(static_cast<std::size_t>(size.width), -1);
+  for (int row = 0; row < size.height; ++row) {
+    const float* here = depth + row * stride;
+    for (int column = 0; column < size.width; ++column) {
+      if (here[column] >= kFar) continue;
+      const int begin = last[static_cast<std::size_t>(column)];
+      last[static_cast<std::size_t>(column)] = row;
+      if (begin < 0) continue;
+      for (int i = begin + 1; i < row; ++i) {
+        inverse[static_cast<std::size_t>(i) * size.width + column] =
+            blend(1.0F / depth[begin * stride + column], 1.0F / here[column], i, begin, row);
       }
     }
+  }
+  return inverse;
+}
+
+/// Gives a row's sky the farther of the plane between its neighbours in the row and `along_columns`. With a neighbour
+/// on one side only that one's depth counts, with none the sky stays at kFar.
+void span_sky_row(float* depth, const float* along_columns, int count) {
+  int last = -1;
+  for (int column = 0; column <= count; ++column) {
+    if (column < count && depth[column] >= kFar) continue;
+    const bool between = last >= 0 && column < count;
+    for (int j = last + 1; j < column; ++j) {
+      float inverse = along_columns[j];
+      if (between) {
+        const float along_row = blend(1.0F / depth[last], 1.0F / depth[column], j, last, column);
+        inverse = inverse > 0.0F ? std::min(inverse, along_row) : along_row;
+      } else if (inverse == 0.0F && (last >= 0 || column < count)) {
+        inverse = 1.0F / depth[last >= 0 ? last : column];
+      }
+      depth[j] = inverse > 0.0F ? 1.0F / inverse : kFar;
+    }
     last = column;
+  }
+}
+
+/// Gives sky the depth of what frames it: seen through a window it then moves with the window. Sky left at infinity
+/// would shine through every gap beside it. The farther of two frames counts, since the nearer may hang in front of
+/// the window.
+void span_sky(const Size& size, std::ptrdiff_t stride, float* depth) {
+  const std::vector<float> along_columns = sky_along_columns(size, stride, depth);
+  for (int row = 0; row < size.height; ++row) {
+    span_sky_row(depth + row * stride, along_columns.data() + static_cast<std::size_t>(row) * size.width, size.width);
   }
 }
 
@@ -179,11 +215,21 @@ std::vector<float> vertex_depths(const MeshLayout& layout, const float* depth) {
   const int ring = layout.view.panoramic ? 0 : 1;
   const auto or_far = [](float d) { return d > 0.0F && d < kFar ? d : kFar; };
   std::vector<float> vertices(static_cast<std::size_t>(layout.rows) * layout.columns);
+  bool has_sky = false;
+  const auto vertex_row = [&](int row) { return vertices.data() + static_cast<std::size_t>(row) * layout.columns; };
+  for (int row = 0; row < size.height; ++row) {
+    const float* from = depth + static_cast<std::size_t>(row) * size.width;
+    float* to = vertex_row(row + ring) + ring;
+    std::transform(from, from + size.width, to, or_far);
+    has_sky = has_sky || std::find(to, to + size.width, kFar) != to + size.width;
+  }
+  if (has_sky) span_sky(size, layout.columns, vertex_row(ring) + ring);
+  if (ring != 0) {
+    std::copy_n(vertex_row(1), layout.columns, vertex_row(0));
+    std::copy_n(vertex_row(layout.rows - 2), layout.columns, vertex_row(layout.rows - 1));
+  }
   for (int row = 0; row < layout.rows; ++row) {
-    const float* from = depth + static_cast<std::size_t>(std::clamp(row - ring, 0, size.height - 1)) * size.width;
-    float* to = vertices.data() + static_cast<std::size_t>(row) * layout.columns;
-    for (int column = 0; column < size.width; ++column) to[column + ring] = or_far(from[column]);
-    span_sky(to + ring, size.width);
+    float* to = vertex_row(row);
     if (ring != 0) to[0] = to[1];
     to[layout.columns - 1] = ring != 0 ? to[layout.columns - 2] : to[0];
   }

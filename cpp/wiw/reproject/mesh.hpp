@@ -54,8 +54,8 @@ struct DepthMesh {
 
 /// Builds the mesh and cuts it where two neighbouring depths differ by more than the fraction `cut` of the farther
 /// one, unless inverse depth goes on in the same slope on either side: on any plane it is linear, so a grazing wall
-/// stays whole. Pixels without depth (sky) are spread between their neighbours in the row, or lie at kFar where the row
-/// has none.
+/// stays whole. Pixels without depth (sky) lie in the plane between their neighbours in the row or in the column,
+/// whichever is farther, or at kFar where neither has any.
 DepthMesh build_mesh(const MeshLayout& layout, const float* depth, float cut);
 
 }  // namespace wiw::reproject

@@ -58,6 +58,8 @@ constexpr std::size_t scratch_floats(int columns) {
 }
 
 constexpr float kNothing = 3.0e38F;
+/// Set in out_fraction14 where the surface is seen from the side that the source did not see.
+constexpr int kBehind = 1 << 15;
 
 /// Draws the mesh with a depth test; out_depth must be filled with kNothing before.
 using RasterFunction = void (*)(const RasterJob&);

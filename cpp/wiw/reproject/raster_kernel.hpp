@@ -323,9 +323,10 @@ WIW_NOINLINE void test_chunk(const Quads& quads, int step_u, int step_v, Chunk& 
     const float z2 = d3[k] + a2 * (d2[k] - d3[k]) + b2 * (d1[k] - d3[k]);
     const float a = in1 != 0 ? a1 : 1.0F - a2;
     const float b = in1 != 0 ? b1 : 1.0F - b2;
+    const int behind = (in1 != 0 ? chunk.inverse_upper[k] : chunk.inverse_lower[k]) < 0.0F ? kBehind : 0;
     chunk.hit_depth[k] = in1 != 0 ? z1 : z2;
-    chunk.fraction[k] =
-        fraction14(begin_x[k], span_x[k], a) | (fraction14(begin_y[kOneRow ? 0 : k], span_y[kOneRow ? 0 : k], b) << 16);
+    chunk.fraction[k] = fraction14(begin_x[k], span_x[k], a) |
+                        (fraction14(begin_y[kOneRow ? 0 : k], span_y[kOneRow ? 0 : k], b) << 16) | behind;
     chunk.hit_u[k] = u;
     chunk.hit_v[k] = v;
     chunk.hit[k] = (step_u < chunk.width[k] ? 1 : 0) & (step_v < chunk.height[k] ? 1 : 0) & (in1 | in2);
@@ -412,6 +413,8 @@ WIW_NOINLINE void meet_rays(const RasterJob& job, const RayTriangle& triangle, i
 inline void draw_triangle(const RasterJob& job, const Quads& quads, int k, const RayTriangle& triangle, bool flip,
                           const PixelBox& box) {
   const std::uint32_t texel = quads.texel[k] + quads.texel_row;
+  // The normal points away from the source.
+  const int behind = triangle.offset < 0.0F ? kBehind : 0;
   Lanes lanes;
   for (int v = box.top; v <= box.bottom; ++v) {
     for (int left = box.left; left <= box.right; left += kLanes) {
@@ -420,7 +423,7 @@ inline void draw_triangle(const RasterJob& job, const Quads& quads, int k, const
         const int lane = __builtin_ctz(set);
         const int fx = fraction14(quads.begin_x[k], quads.span_x[k], lanes.a[lane]);
         const int fy = fraction14(quads.begin_y[k * quads.y_step], quads.span_y[k * quads.y_step], lanes.b[lane]);
-        put(job, left + lane, v, lanes.depth[lane], texel, static_cast<std::uint32_t>(fx | (fy << 16)));
+        put(job, left + lane, v, lanes.depth[lane], texel, static_cast<std::uint32_t>(fx | (fy << 16) | behind));
       }
     }
   }

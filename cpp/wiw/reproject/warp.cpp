@@ -68,6 +68,16 @@ Fringe fringe_of(const DepthMesh& mesh) {
   return fringe;
 }
 
+/// Makes holes of surfaces seen from behind: they hide what is there, but the source saw their other side.
+void forget_behind(Scratch& scratch) {
+  for (std::size_t i = 0; i < scratch.depth.size(); ++i) {
+    if ((scratch.fraction14[i] & kBehind) == 0) continue;
+    scratch.depth[i] = kNothing;
+    scratch.texel[i] = 0;
+    scratch.fraction14[i] = 0;
+  }
+}
+
 /// Whether the source texel nearest to a sample has no depth. Holes read texel 0 and are not sky for that.
 bool saw_sky(std::uint32_t texel, std::uint32_t fraction14, const float* depth, const Size& size) {
   if (texel == 0 && fraction14 == 0) return false;
@@ -134,6 +144,7 @@ void Warp::warp_one(const std::uint8_t* color, const float* depth, const DepthMe
     }
   }
   raster_function(isa)(job);
+  forget_behind(scratch);
   if (out.hole != nullptr) {
     std::transform(scratch.depth.begin(), scratch.depth.end(), out.hole + frame * pixels,
                    [](float d) { return static_cast<std::uint8_t>(d == kNothing ? 1 : 0); });

@@ -13,7 +13,8 @@ namespace wiw::reproject {
 struct WarpTargets {
   std::uint8_t* color = nullptr;  // [B, T, h, w, 3]
   float* depth = nullptr;         // [B, T, h, w] metres, 0 where nothing is hit
-  std::uint8_t* hole = nullptr;   // [B, T, h, w] 1 where the source did not see what is there, so the fill guessed
+  std::uint8_t* hole =
+      nullptr;  // [B, T, h, w] 1 where the source did not see what is there, or saw its other side: guesses
 };
 
 /// Shows RGB-D images from other poses: the depth mesh of each source is drawn into the target's depth, and every
