@@ -20,6 +20,8 @@ from wiw.types import Goal, Key, Proposal, Rollout
 HEADINGS = 16
 TURN = 2 * np.pi / HEADINGS
 STEP = 0.2
+SAME_PLACE = 0.15
+"""Metres within which a place that was imagined before tells about this one."""
 
 
 @dataclass(frozen=True)
@@ -28,21 +30,25 @@ class MatcherOptions:
 
     histogram: float = 2.0
     """Of the overlap between the goal's colours and those seen in a heading."""
-    frontier: float = 0.3
-    """Per metre gained towards the nearest frontier."""
+    frontier: float = 1.0
+    """Per metre gained towards the place most worth exploring."""
+    likeness: float = 4.0
+    """What makes a frontier worth it: how much the views towards it look like the goal,"""
+    travel: float = 0.1
+    """less this for each metre of the way there."""
     novelty: float = 0.3
     """Per metre (at most one) from where the agent has been."""
     turn: float = 0.04
     """Cost of one turn."""
-    imagined: float = 1.0
+    imagined: float = 1.5
     """Of the best imagined similarity less the present one."""
     near: float = 4.0
     """How much more it weighs when the goal is near."""
     calm: float = 0.8
     """Share of the exploration terms that fades when the goal is near."""
-    gate: float = 2.9
+    gate: float = 2.5
     """Similarity at which the goal counts as near with probability one half."""
-    gate_width: float = 0.12
+    gate_width: float = 0.15
     spread: int = 3
     """Least difference between headings of imagined plans, in turns, when the goal is near."""
     reach: float = 1.0
@@ -59,6 +65,10 @@ class Memory:
     """Similarity of the present place at each heading column."""
     gate: float = 0.0
     histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
+    imagined: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
+    """Position in the start frame and similarity of every place that was imagined."""
+    recalled: list[float] = field(default_factory=list)
+    """Of each proposal, what was imagined of its places before: similarity gained over the present one."""
     planned: NDArray[np.int8] | None = None
     """The plan that was chosen last; where it did not lead anywhere, something unseen is in the way."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
@@ -98,7 +108,7 @@ class Matcher(Policy):
         bands = appearance.describe(small)
         for i, situation in enumerate(situations):
             memory: Memory = situation.memory
-            band = appearance.Band(bands.colors[i : i + 1], bands.edges[i : i + 1], bands.histograms[i : i + 1])
+            band = bands.place(i)
             memory.profile = appearance.similarity(band, memory.goal)[0]
             memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
             memory.histogram = at_headings(appearance.histogram_similarity(band, memory.goal)[0])
@@ -106,7 +116,11 @@ class Matcher(Policy):
             assert observation.depth is not None
             if memory.planned is not None and FORWARD in memory.planned[:2]:
                 memory.map.note_blocked(observation.odometry)
-            memory.map.update(observation.depth[4::8, 4::8], observation.odometry)
+            memory.map.update(
+                observation.depth[1::2, 4::8],
+                observation.odometry,
+                appearance.histogram_similarity(band, memory.goal)[0],
+            )
             memory.places.append((observation.odometry, memory.similarity))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
@@ -119,14 +133,17 @@ class Matcher(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """Prior plus the gain in similarity that the imagined places promise."""
-        options = self.options
+        """Prior plus the gain in similarity that the imagined places promise, which are remembered."""
         scores = []
         for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
             memory: Memory = situation.memory
-            gains = [imagined_gain(memory, plan, future) for plan, future in zip(plans, futures, strict=True)]
-            weight = options.imagined * (1 + options.near * memory.gate)
-            scores.append(np.array([plan.prior + weight * gain for plan, gain in zip(plans, gains, strict=True)]))
+            odometry = situation.observation.odometry
+            gains = [
+                gain if (gain := imagined_gain(memory, odometry, plan, future)) is not None else recalled
+                for plan, future, recalled in zip(plans, futures, memory.recalled, strict=True)
+            ]
+            surprise = np.subtract(gains, memory.recalled)
+            scores.append(np.array([plan.prior for plan in plans]) + self._weight(memory) * surprise)
         return scores
 
     def revise(
@@ -136,24 +153,28 @@ class Matcher(Policy):
         situation.memory.planned, chosen = super().revise(situation, proposals, scores)
         return situation.memory.planned, chosen
 
+    def _weight(self, memory: Memory) -> float:
+        return self.options.imagined * (1 + self.options.near * memory.gate)
+
     def _propose(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         memory: Memory = situation.memory
-        priors, runs = self._judge_headings(memory, situation.observation.odometry)
+        odometry = situation.observation.odometry
+        priors, runs = self._judge_headings(memory, odometry)
+        recalled = recall(memory, odometry, runs)
+        priors = priors + self._weight(memory) * recalled
         order = [int(k) for k in np.argsort(-priors, kind="stable")]
-        chosen: list[int] = []
+        plans = {k: straight_run(k, horizon, int(runs[k] / STEP)) for k in order}
         apart = self.options.spread if memory.gate > 0.5 else 1
-        for k in order:
-            if len(chosen) < candidates and all(circular_distance(k, other) >= apart for other in chosen):
-                chosen.append(k)
-        chosen += [k for k in order if k not in chosen][: candidates - len(chosen)]
-        return [Proposal(straight_run(k, horizon, int(runs[k] / STEP)), prior=float(priors[k])) for k in chosen]
+        chosen = diverse(order, plans, apart, candidates)
+        memory.recalled = [float(recalled[k]) for k in chosen]
+        return [Proposal(plans[k], prior=float(priors[k])) for k in chosen]
 
     def _judge_headings(
         self, memory: Memory, odometry: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Prior of each heading and the metres that are free ahead; heading k is k left turns away."""
         options = self.options
-        distance = memory.map.frontier_distance()
+        distance = memory.map.distance_to_target(options.likeness, options.travel)
         runs, ends = memory.map.look_ahead(odometry, HEADINGS, options.reach)
         progress = np.clip(memory.map.at(distance, odometry[None, :2])[0] - memory.map.at(distance, ends), -1.5, 1.5)
         novelty = np.minimum(memory.map.distance_to_trail(ends), 1.0)
@@ -187,17 +208,61 @@ def straight_run(heading: int, horizon: int, free_steps: int) -> NDArray[np.int8
     return np.array(plan[:horizon], np.int8)
 
 
-def imagined_gain(memory: Memory, plan: Proposal, rollout: Rollout) -> float:
-    """How much better the best place of the plan looks than the present one, by what was imagined of it.
+def diverse(order: list[int], plans: dict[int, NDArray[np.int8]], apart: int, count: int) -> list[int]:
+    """The first `count` headings of `order` that are `apart` turns from each other, then any; no plan twice."""
+    chosen: list[int] = []
+    for least in (apart, 1):
+        for k in order:
+            if len(chosen) == count:
+                return chosen
+            same = any(np.array_equal(plans[k], plans[other]) for other in chosen)
+            if not same and all(circular_distance(k, other) >= least for other in chosen):
+                chosen.append(k)
+    return chosen
+
+
+def recall(memory: Memory, odometry: NDArray[np.float64], runs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """float64 [16]: best similarity that was imagined along each heading's run, over the present one; 0 if unknown."""
+    gains = np.zeros(HEADINGS)
+    if not memory.imagined:
+        return gains
+    points, values = np.stack([p for p, _ in memory.imagined]), np.array([v for _, v in memory.imagined])
+    for k in range(HEADINGS):
+        azimuth = odometry[2] + k * TURN
+        steps = np.arange(STEP, max(runs[k], STEP) + 1e-9, STEP)[:, None]
+        way = odometry[:2] + steps * np.array([np.cos(azimuth), np.sin(azimuth)])
+        distance = np.linalg.norm(way[:, None] - points, axis=2)
+        nearest = distance.argmin(1)
+        known = distance[np.arange(len(way)), nearest] < SAME_PLACE
+        if known.any():
+            gains[k] = values[nearest[known]].max() - memory.similarity
+    return gains
+
+
+def imagined_gain(memory: Memory, odometry: NDArray[np.float64], plan: Proposal, rollout: Rollout) -> float | None:
+    """How much better the best place of the plan looks than the present one; None where no new place was imagined.
 
     Panoramas are compared over all headings; the front views of a perspective model only with what is seen now in the
-    direction that the plan ends in. Frames of turning on the spot show no new place.
+    direction that the plan ends in. The places are remembered.
     """
-    new = ~rollout.real
-    places = rollout.frames[new] if new.any() else rollout.frames[-1:]
+    positions = positions_after(odometry, plan.actions)
+    new = ~rollout.real & (np.linalg.norm(positions - odometry[:2], axis=1) > 0)
+    if not new.any():
+        return None
     if rollout.view == "panorama":
-        return float(appearance.similarity(appearance.describe(places), memory.goal).max()) - memory.similarity
-    bands = np.stack([appearance.project_front(frame)[0] for frame in places])
-    ahead = appearance.similarity(appearance.describe(bands), memory.goal)[:, appearance.COLUMNS // 2]
-    turns = int((plan.actions == TURN_LEFT).sum() - (plan.actions == TURN_RIGHT).sum())
-    return float(ahead.max() - at_headings(memory.profile)[turns % HEADINGS])
+        values = appearance.similarity(appearance.describe(rollout.frames[new]), memory.goal).max(1)
+    else:
+        bands = np.stack([appearance.project_front(frame)[0] for frame in rollout.frames[new]])
+        ahead = appearance.similarity(appearance.describe(bands), memory.goal)[:, appearance.COLUMNS // 2]
+        turns = int((plan.actions == TURN_LEFT).sum() - (plan.actions == TURN_RIGHT).sum())
+        values = memory.similarity + ahead - at_headings(memory.profile)[turns % HEADINGS]
+    memory.imagined += [(p, float(v)) for p, v in zip(positions[new], values, strict=True)]
+    return float(values.max()) - memory.similarity
+
+
+def positions_after(odometry: NDArray[np.float64], actions: NDArray[np.int8]) -> NDArray[np.float64]:
+    """float64 [K, 2]: where each of the primitives ends if none is refused, in the frame of `odometry`."""
+    turns = (actions == TURN_LEFT).astype(float) - (actions == TURN_RIGHT)
+    azimuth = odometry[2] + TURN * np.cumsum(turns)
+    strides = np.where(actions == FORWARD, STEP, 0.0)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
+    return odometry[:2] + np.cumsum(strides, axis=0)

@@ -19,18 +19,28 @@ PANORAMA = (64, 128)
 ROWS = slice(16, 48)
 COLUMNS = 128
 WINDOW = 32
-BINS = (4, 8, 8)
+BINS = (5, 16, 16)
 """Of L, a, b."""
+LAYERS = 2
+"""The band's upper and lower half have histograms of their own: what is on the floor is not what is on the wall."""
 HISTOGRAM_WEIGHT = 2.0
 
 
 @dataclass(frozen=True)
 class Band:
-    """Features of N places: `maps` float32 [N, G, C, 32, W] (G groups of C channels), `histograms` [N, W, bins]."""
+    """Features of N places."""
 
     colors: NDArray[np.float32]
+    """[N, 3, 32, W]."""
     edges: NDArray[np.float32]
-    histograms: NDArray[np.float32]
+    """[N, 4, 32, W]."""
+    bins: NDArray[np.intp]
+    """[N, 32, W]: each pixel's histogram bin, by layer and Lab."""
+
+    def place(self, index: int) -> Band:
+        """One of the N places."""
+        one = slice(index, index + 1)
+        return Band(self.colors[one], self.edges[one], self.bins[one])
 
 
 @dataclass(frozen=True)
@@ -39,7 +49,10 @@ class GoalTemplate:
 
     colors: NDArray[np.float32]
     edges: NDArray[np.float32]
-    histogram: NDArray[np.float32]
+    bins: NDArray[np.intp]
+    """[all bins]: number of each bin among the goal's own, or one more than the last for bins it lacks."""
+    shares: NDArray[np.float32]
+    """[goal's own bins]: share of the goal's pixels; sums to one."""
     mask: NDArray[np.float32]
 
 
@@ -49,12 +62,14 @@ def goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
     features = describe(band[None])
     window = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
     weights = mask[:, window].astype(np.float32)
-    histogram = np.zeros(int(np.prod(BINS)), np.float32)
-    np.add.at(histogram, _bins(_lab(band[ROWS]))[:, window][weights > 0], 1.0)
+    own, counts = np.unique(features.bins[0][:, window][weights > 0], return_counts=True)
+    numbers = np.full(LAYERS * int(np.prod(BINS)), len(own), np.intp)
+    numbers[own] = np.arange(len(own))
     return GoalTemplate(
         colors=_normalised(features.colors[0][..., window], weights),
         edges=_normalised(features.edges[0][..., window], weights),
-        histogram=histogram / histogram.sum(),
+        bins=numbers,
+        shares=(counts / counts.sum()).astype(np.float32),
         mask=weights,
     )
 
@@ -66,7 +81,7 @@ def describe(panoramas: NDArray[np.uint8]) -> Band:
     return Band(
         colors=np.stack([_color_map(lab) for lab in labs]),
         edges=np.stack([_edge_map(lab) for lab in labs]),
-        histograms=np.stack([_column_histograms(lab) for lab in labs]),
+        bins=np.stack([_bins(lab) for lab in labs]),
     )
 
 
@@ -82,14 +97,18 @@ def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
 
 
 def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
-    """float32 [N, 128]: Bhattacharyya coefficient of the goal's and each window's Lab histogram."""
-    wrapped = np.concatenate(
-        [places.histograms[:, -WINDOW // 2 :], places.histograms, places.histograms[:, : WINDOW // 2]], 1
-    )
+    """float32 [N, 128]: Bhattacharyya coefficient of the goal's and each window's histogram over layers and Lab.
+
+    Only bins that the goal has count, so only those are summed.
+    """
+    numbers, own = goal.bins[places.bins], len(goal.shares)
+    count, rows, width = numbers.shape
+    flat = numbers + (own + 1) * np.arange(count * width).reshape(count, 1, width)
+    columns = np.bincount(flat.ravel(), minlength=count * width * (own + 1)).reshape(count, width, own + 1)[..., :own]
+    wrapped = np.concatenate([columns[:, -WINDOW // 2 :], columns, columns[:, : WINDOW // 2]], 1)
     sums = np.cumsum(np.pad(wrapped, ((0, 0), (1, 0), (0, 0))), axis=1)
-    windows = sums[:, WINDOW:] - sums[:, :-WINDOW]
-    windows = windows[:, :COLUMNS] / np.maximum(windows[:, :COLUMNS].sum(2, keepdims=True), 1e-9)
-    return np.sqrt(np.maximum(windows, 0)) @ np.sqrt(goal.histogram)
+    windows = (sums[:, WINDOW:] - sums[:, :-WINDOW])[:, :COLUMNS] / np.float32(WINDOW * rows)
+    return np.sqrt(windows, dtype=np.float32) @ np.sqrt(goal.shares)
 
 
 def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -149,18 +168,11 @@ def _blur(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 
 def _bins(lab: NDArray[np.float32]) -> NDArray[np.intp]:
-    """[H, W]: index of each pixel's Lab bin; chroma within 48 covers what rooms show."""
-    scaled = np.stack([lab[..., 0] / 100, lab[..., 1] / 96 + 0.5, lab[..., 2] / 96 + 0.5], -1)
+    """[H, W]: index of each pixel's bin; chroma within 40 covers what rooms show."""
+    scaled = np.stack([lab[..., 0] / 100, lab[..., 1] / 80 + 0.5, lab[..., 2] / 80 + 0.5], -1)
     cells = np.clip((scaled * BINS).astype(np.intp), 0, np.array(BINS) - 1)
-    return np.ravel_multi_index(tuple(np.moveaxis(cells, -1, 0)), BINS)
-
-
-def _column_histograms(lab: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[W, bins]: how many pixels of each column fall into each bin."""
-    bins = _bins(lab)
-    count = int(np.prod(BINS))
-    flat = bins + count * np.arange(bins.shape[1])
-    return np.bincount(flat.ravel(), minlength=count * bins.shape[1]).reshape(-1, count).astype(np.float32)
+    layer = np.arange(len(lab))[:, None] * LAYERS // len(lab)
+    return layer * int(np.prod(BINS)) + np.ravel_multi_index(tuple(np.moveaxis(cells, -1, 0)), BINS)
 
 
 def _normalised(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:

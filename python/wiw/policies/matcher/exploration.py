@@ -29,10 +29,13 @@ class ExplorationMap:
 
     seen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), bool))
     occupied: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.uint8))
+    likeness: NDArray[np.float32] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.float32))
+    """How much the views in the direction of each cell looked like the goal; the mean over the times it was seen."""
+    times: NDArray[np.float32] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.float32))
     trail: list[NDArray[np.float64]] = field(default_factory=list)
 
-    def update(self, depth: NDArray[np.float32], odometry: NDArray[np.float64]) -> None:
-        """Adds one panorama of distances float32 [H, W] seen from (x, y, azimuth)."""
+    def update(self, depth: NDArray[np.float32], odometry: NDArray[np.float64], likeness: NDArray[np.float32]) -> None:
+        """Adds one panorama of distances float32 [H, W] seen from (x, y, azimuth); `likeness` [W] of each column."""
         rays, height = _rays(depth.shape)
         azimuth = odometry[2] + rays["azimuth"]
         flat = depth * rays["cos_latitude"]
@@ -42,19 +45,29 @@ class ExplorationMap:
         x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
         ground = hit & (np.abs(floor_height) < 0.12)
         self.seen[cells(x[ground], y[ground])] = True
-        self._sweep(np.where(solid, flat, np.inf).min(0), azimuth, odometry)
+        self._sweep(np.where(solid, flat, np.inf).min(0), azimuth, odometry, likeness)
         rows, columns = cells(x[solid], y[solid])
         np.maximum.at(self.occupied, (rows, columns), 1)
         self.trail.append(np.array(odometry[:2]))
         here = cells(np.array([odometry[0]]), np.array([odometry[1]]))
         self.seen[here] = True
 
-    def _sweep(self, reach: NDArray[np.float64], azimuth: NDArray[np.float64], odometry: NDArray[np.float64]) -> None:
+    def _sweep(
+        self,
+        reach: NDArray[np.float64],
+        azimuth: NDArray[np.float64],
+        odometry: NDArray[np.float64],
+        likeness: NDArray[np.float32],
+    ) -> None:
         """Marks what lies in front of the nearest obstacle of each column as seen."""
         steps = np.arange(0.05, RANGE, CELL / 2)[:, None]
         inside = steps < np.minimum(reach, RANGE)[None] - CELL
         x, y = odometry[0] + steps * np.cos(azimuth), odometry[1] + steps * np.sin(azimuth)
-        self.seen[cells(x[inside], y[inside])] = True
+        here = cells(x[inside], y[inside])
+        self.seen[here] = True
+        self.times[here] += 1
+        values = np.broadcast_to(likeness, inside.shape)[inside]
+        self.likeness[here] += (values - self.likeness[here]) / self.times[here]
 
     def note_blocked(self, odometry: NDArray[np.float64]) -> None:
         """Marks what is just ahead as solid if the agent has not moved since the last update: its step was refused."""
@@ -88,18 +101,29 @@ class ExplorationMap:
         """Metres from points [N, 2] to the nearest place the agent has been."""
         return np.linalg.norm(points[:, None] - np.stack(self.trail)[None], axis=2).min(1)
 
-    def frontier_distance(self) -> NDArray[np.float64]:
-        """Metres from each free cell to the nearest frontier through free cells; FAR where there is none."""
+    def distance_to_target(self, likeness: float, travel: float) -> NDArray[np.float64]:
+        """Metres from each free cell to the frontier most worth going to; FAR everywhere where none can be reached.
+
+        A frontier is worth `likeness` times how much the views towards it look like the goal, less `travel` a metre.
+        """
         free = self.free()
+        here = np.zeros_like(free)
         row, column = cells(self.trail[-1][:1], self.trail[-1][1:])
-        free[row, column] = True
+        here[row, column] = free[row, column] = True
+        way = distance_field(free, here)
+        worth = np.where(self._frontier(free) & (way < FAR), likeness * self.likeness - travel * way, -np.inf)
+        best = np.unravel_index(int(np.argmax(worth)), worth.shape)
+        target = np.zeros_like(free)
+        target[best] = np.isfinite(worth[best])
+        return distance_field(free, target)
+
+    def _frontier(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Free cells beside unseen ones, in clusters of at least three."""
         unknown = ~self.seen & ~(self.occupied > 0)
         frontier = free & ndimage.binary_dilation(unknown, np.ones((3, 3)))
         labels, count = ndimage.label(frontier, np.ones((3, 3)))
-        if count:
-            sizes = ndimage.sum_labels(frontier, labels, np.arange(count + 1))
-            frontier &= sizes[labels] >= 3
-        return distance_field(free, frontier)
+        sizes = ndimage.sum_labels(frontier, labels, np.arange(count + 1))
+        return frontier & (sizes[labels] >= 3)
 
 
 def cells(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
