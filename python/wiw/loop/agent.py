@@ -31,6 +31,17 @@ class Query:
     """Fork of the environment; only looked at when the world model declares that it needs one."""
 
 
+@dataclass
+class _Life:
+    """What is kept of one live episode."""
+
+    proposer: Any
+    """Memory of the proposing policy; the reviser's too where one policy is both."""
+    reviser: Any
+    executed: list[int]
+    """Primitives of all decisions so far, as far as they were to be carried out."""
+
+
 class Agent:
     """A policy with or without a world model.
 
@@ -82,7 +93,7 @@ class Agent:
             )
         if self.depth > 1 and self.model is not None:
             self._check_depth(self.model)
-        self._memories: dict[tuple[int, int], tuple[Any, Any]] = {}
+        self._lives: dict[tuple[int, int], _Life] = {}
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -127,7 +138,7 @@ class Agent:
 
     def forget(self, key: Key) -> None:
         """Drops the memory of an episode that has ended."""
-        self._memories.pop((key.seed, key.episode), None)
+        self._lives.pop((key.seed, key.episode), None)
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest."""
@@ -179,23 +190,29 @@ class Agent:
         """Each episode as its proposer and as its reviser know it; the same object where one policy is both."""
         proposing, revising = [], []
         for query in queries:
-            name = (query.key.seed, query.key.episode)
-            if query.key.decision == 0 or name not in self._memories:
-                memory = self.policy.begin(query.goal, query.key)
-                same = self.revision is self.policy
-                self._memories[name] = (memory, memory if same else self.revision.begin(query.goal, query.key))
-            own, other = self._memories[name]
-            proposing.append(Situation(query.observation, query.goal, query.key, own))
-            revising.append(Situation(query.observation, query.goal, query.key, other))
+            life = self._life(query)
+            executed = tuple(life.executed)
+            proposing.append(Situation(query.observation, query.goal, query.key, life.proposer, executed))
+            revising.append(Situation(query.observation, query.goal, query.key, life.reviser, executed))
         return proposing, revising
+
+    def _life(self, query: Query) -> _Life:
+        name = (query.key.seed, query.key.episode)
+        if query.key.decision == 0 or name not in self._lives:
+            memory = self.policy.begin(query.goal, query.key)
+            same = self.revision is self.policy
+            self._lives[name] = _Life(memory, memory if same else self.revision.begin(query.goal, query.key), [])
+        return self._lives[name]
 
     def _decision(
         self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any
     ) -> Decision:
         actions, chosen = self.revision.revise(situation, proposals, scores)
+        execute = self._segment(len(actions))
+        self._life(query).executed += actions[:execute].tolist()
         return Decision(
             actions=actions,
-            execute=self._segment(len(actions)),
+            execute=execute,
             proposals=tuple(proposals),
             rollouts=None if rollouts is None else tuple(rollouts),
             scores=np.asarray(scores, np.float64),

@@ -74,10 +74,12 @@ class Beams:
         there = []
         for (e, c), panorama, front in zip(chosen, panoramas, fronts, strict=True):
             here = self._situations[e]
-            odometry = moved(here.observation.odometry, self.proposals[e][c].actions)
+            actions = self.proposals[e][c].actions
+            odometry = moved(here.observation.odometry, actions)
             seed = core.fold_key([here.key.seed, self._search.level, c])
             key = Key(seed, here.key.episode, here.key.decision)
-            there.append(Situation(Observation(panorama, front, odometry), here.goal, key, here.memory))
+            executed = (*here.executed, *actions.tolist())
+            there.append(Situation(Observation(panorama, front, odometry), here.goal, key, here.memory, executed))
         return there
 
 

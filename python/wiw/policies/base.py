@@ -36,6 +36,8 @@ class Situation:
     key: Key
     memory: Any
     """What `Policy.begin` returned for this episode; the policy may change it."""
+    executed: tuple[int, ...] = ()
+    """Primitives carried out since the episode began."""
 
 
 class Policy(ABC):

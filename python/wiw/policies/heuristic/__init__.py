@@ -10,7 +10,7 @@ import numpy as np
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.policies.base import Policy, Situation
-from wiw.types import Goal, Key, Proposal
+from wiw.types import Proposal
 
 INVERSE: dict[int, int] = {TURN_LEFT: TURN_RIGHT, TURN_RIGHT: TURN_LEFT}
 
@@ -26,10 +26,6 @@ class Heuristic(Policy):
     def __init__(self, max_turns: int = 4) -> None:
         self.max_turns = max_turns
 
-    def begin(self, goal: Goal, key: Key) -> list[int]:
-        """The primitives of the last plan proposed first, newest last: the rules look back over decisions."""
-        return []
-
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Independent draws, keyed by (seed, episode, decision, candidate); the first is what the base policy does."""
         return [
@@ -39,11 +35,11 @@ class Heuristic(Policy):
     def _plan(self, situation: Situation, candidate: int, horizon: int) -> Proposal:
         key = situation.key
         draws = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), horizon)
-        plan: list[int] = []
+        history = list(situation.executed)
         for draw in draws:
-            allowed = self.allowed(plan)
-            plan.append(allowed[int(draw * len(allowed))])
-        return Proposal(np.array(plan, np.int8))
+            allowed = self.allowed(history)
+            history.append(allowed[int(draw * len(allowed))])
+        return Proposal(np.array(history[len(situation.executed) :], np.int8))
 
     def allowed(self, history: Sequence[int]) -> list[int]:
         """Primitives that may follow `history`."""
