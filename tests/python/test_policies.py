@@ -76,7 +76,7 @@ def test_histogram_similarity_equals_its_slow_twin() -> None:
 
 def test_a_place_is_most_like_the_goal_that_was_seen_from_it() -> None:
     panorama = noise(576, 1024, 3)
-    image = wiw.panorama.to_perspective(panorama[None], 90.0, (480, 480), yaws=[0.0])[0, 0]
+    image = wiw.panorama.to_perspective(panorama, 90.0, (480, 480))
     goal = appearance.goal_template(image)
     here = appearance.similarity(appearance.describe(wiw.panorama.resize(panorama[None], (64, 128))), goal)[0]
     there = appearance.similarity(appearance.describe(noise(1, 64, 128, 3, seed=5)), goal)[0]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import panorama
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
@@ -262,7 +262,7 @@ def imagined_gain(memory: Memory, odometry: NDArray[np.float64], plan: Proposal,
 
 def positions_after(odometry: NDArray[np.float64], actions: NDArray[np.int8]) -> NDArray[np.float64]:
     """float64 [K, 2]: where each of the primitives ends if none is refused, in the frame of `odometry`."""
-    turns = (actions == TURN_LEFT).astype(float) - (actions == TURN_RIGHT)
-    azimuth = odometry[2] + TURN * np.cumsum(turns)
-    strides = np.where(actions == FORWARD, STEP, 0.0)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
-    return odometry[:2] + np.cumsum(strides, axis=0)
+    forward, left = to_trajectory(actions)[:, :2].T
+    x, y, azimuth = odometry
+    cos, sin = np.cos(azimuth), np.sin(azimuth)
+    return np.stack([x + cos * forward - sin * left, y + sin * forward + cos * left], 1)
