@@ -67,8 +67,8 @@ class Memory:
     histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
     imagined: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
     """Position in the start frame and similarity of every place that was imagined."""
-    recalled: list[float] = field(default_factory=list)
-    """Of each proposal, what was imagined of its places before: similarity gained over the present one."""
+    recalled: dict[bytes, float] = field(default_factory=dict)
+    """Of each plan proposed last, the similarity gained over the present one by what was imagined of it before."""
     planned: NDArray[np.int8] | None = None
     """The plan that was chosen last; where it did not lead anywhere, something unseen is in the way."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
@@ -133,17 +133,19 @@ class Matcher(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """Prior plus the gain in similarity that the imagined places promise, which are remembered."""
+        """Prior plus the gain in similarity that the imagined places promise, where it differs from what is recalled.
+
+        The imagined places are remembered, so that a heading keeps its promise while others are imagined.
+        """
         scores = []
         for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
             memory: Memory = situation.memory
             odometry = situation.observation.odometry
-            gains = [
-                gain if (gain := imagined_gain(memory, odometry, plan, future)) is not None else recalled
-                for plan, future, recalled in zip(plans, futures, memory.recalled, strict=True)
-            ]
-            surprise = np.subtract(gains, memory.recalled)
-            scores.append(np.array([plan.prior for plan in plans]) + self._weight(memory) * surprise)
+            surprises = []
+            for plan, future in zip(plans, futures, strict=True):
+                gain = imagined_gain(memory, odometry, plan, future)
+                surprises.append(0.0 if gain is None else gain - memory.recalled.get(plan.actions.tobytes(), 0.0))
+            scores.append(np.array([plan.prior for plan in plans]) + self._weight(memory) * np.array(surprises))
         return scores
 
     def revise(
@@ -166,7 +168,7 @@ class Matcher(Policy):
         plans = {k: straight_run(k, horizon, int(runs[k] / STEP)) for k in order}
         apart = self.options.spread if memory.gate > 0.5 else 1
         chosen = diverse(order, plans, apart, candidates)
-        memory.recalled = [float(recalled[k]) for k in chosen]
+        memory.recalled = {plans[k].tobytes(): float(recalled[k]) for k in chosen}
         return [Proposal(plans[k], prior=float(priors[k])) for k in chosen]
 
     def _judge_headings(
