@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from fakes import LineAgent, LineTask
 
+import wiw
 from wiw.errors import ArgumentError, ContractError, InfrastructureError, RegistryError, StoreError
 from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
 from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
@@ -109,6 +110,19 @@ def test_arguments_are_checked(tmp_path):
         arm_recipes(AgentRecipe("matcher"), ["warp", "warp"])
 
 
+def test_an_arm_may_have_a_policy_of_its_own():
+    made = arm_recipes(AgentRecipe("matcher", horizon=7), ["none", "heuristic+none", "climber+x/a+b.py:Mine"])
+    assert made == {
+        "none": AgentRecipe("matcher", horizon=7),
+        "heuristic": AgentRecipe("heuristic", horizon=7),
+        "climber+Mine": AgentRecipe("climber", "x/a+b.py:Mine", horizon=7),
+    }
+    ready = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])[
+        "heuristic+copy"
+    ].build()
+    assert type(ready.policy).__name__ == "Heuristic" and ready.candidates == 4 and ready.model is not None
+
+
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
     first = run(tmp_path / "run")
     with pytest.raises(StoreError, match="holds a run already"):
@@ -127,6 +141,7 @@ def test_evaluate_takes_one_agent(tmp_path):
 
 SCRIPT = """
 import sys
+import wiw
 from fakes import LineAgent, LineTask
 from wiw.evaluation.evaluate import run_arms
 if __name__ == "__main__":

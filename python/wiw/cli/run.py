@@ -46,7 +46,7 @@ def run(
 
       $ wiw run imagenav --world-model warp --episodes 50
       $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
-      $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle
+      $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
       $ wiw run imagenav --scenes house.glb --world-model warp
 
     Ctrl-C or SIGTERM stops a run without loss; `wiw resume` goes on with it.
@@ -56,7 +56,8 @@ def run(
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
         policy: Proposes plans; name or path.py:Class.
         revision: Scores imagined futures; the policy's own choice if not given.
-        arms: World models to run on the same episodes; --world-model joins them if it is not among them.
+        arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
+            them if it is not among them.
         scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         episodes: How many.
         seed: All randomness is a function of it.

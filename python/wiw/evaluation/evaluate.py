@@ -54,7 +54,8 @@ def evaluate(
         out: folder of the run; None means `runs/<task>-<time>`.
         workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
         progress: whether to show bars.
-        arms: world models to run on the same episodes with this agent's policies; None means the agent's own.
+        arms: world models to run on the same episodes with this agent's policies, or "policy+model" for one with
+            another built-in policy, such as "heuristic+none"; None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
         keep_images: how many episodes keep pictures for the report, spread evenly.
         resume: whether to go on with the run in `out` where it was stopped.

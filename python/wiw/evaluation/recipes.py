@@ -135,11 +135,34 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
     """
     if arms is None:
         return {_own_arm(agent): agent_recipe(agent)}
-    models = [str(name) for name in arms]
-    made = {AgentRecipe("", model).arm if model != "none" else "none": _with_model(agent, model) for model in models}
-    if not models or len(made) < len(models):
-        raise ArgumentError(f"arms: expected different world models, got {models}")
+    names = [_parts(str(name)) for name in arms]
+    made = {_arm_name(policy, model): _with_model(_with_policy(agent, policy), model) for policy, model in names}
+    if not names or len(made) < len(names):
+        raise ArgumentError(f"arms: expected different world models, got {[str(name) for name in arms]}")
     return made
+
+
+def _parts(name: str) -> tuple[str | None, str]:
+    """Policy (None: the agent's own) and world model of "oracle" or "heuristic+oracle"."""
+    from wiw.registry import POLICIES
+
+    policy, plus, model = name.partition("+")
+    return (policy, model) if plus and policy in POLICIES.names() else (None, name)
+
+
+def _arm_name(policy: str | None, model: str) -> str:
+    short = AgentRecipe("", None if model == "none" else model).arm
+    return short if policy is None else policy if model == "none" else f"{policy}+{short}"
+
+
+def _with_policy(agent: Any, policy: str | None) -> Any:
+    if policy is None:
+        return agent
+    if isinstance(agent, AgentRecipe):
+        return replace(agent, policy=policy)
+    from wiw.loop.agent import Agent
+
+    return Agent(policy, None, None, agent.candidates, agent.horizon, agent.execute, agent.depth, agent.width)
 
 
 def _own_arm(agent: Any) -> str:
