@@ -68,12 +68,22 @@ def task(two_rooms: str) -> ImageNav:
         lambda: wiw.Agent("matcher"),
         lambda: wiw.Agent("matcher", "copy"),
         lambda: wiw.Agent("matcher", "oracle"),
+        lambda: wiw.Agent("matcher", "oracle", candidates=2, horizon=3, depth=2, width=1),
         lambda: wiw.Agent("climber"),
         lambda: wiw.Agent("geometric"),
         lambda: wiw.Agent("heuristic", "oracle", candidates=4),
         lambda: wiw.Agent(Greedy(), Stamp(), candidates=4),
     ],
-    ids=["matcher", "matcher+copy", "matcher+oracle", "climber", "geometric", "heuristic+oracle", "greedy+stamp"],
+    ids=[
+        "matcher",
+        "matcher+copy",
+        "matcher+oracle",
+        "two levels",
+        "climber",
+        "geometric",
+        "heuristic+oracle",
+        "greedy+stamp",
+    ],
 )
 def test_results_do_not_depend_on_how_many_episodes_are_live(task: ImageNav, make) -> None:
     alone, together = run(task, make(), live=1), run(task, make(), live=3)

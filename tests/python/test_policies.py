@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -196,3 +198,21 @@ def test_the_matcher_without_imagination_ignores_the_world_models_weight() -> No
         plans.append([plan.actions.tolist() for plan in policy.propose([situation], 3, 5)[0]])
     assert plans[0] == plans[1]
     assert len(plans[0]) == 3
+
+
+def test_the_matcher_extends_plans_without_changing_what_it_knows_of_the_real_episode() -> None:
+    depth = corridor()[1].repeat(8, 1)[:576].repeat(2, 0)[:576]
+    goal = Goal("imagenav", image=noise(480, 480, 3, seed=2))
+    policy = Matcher()
+    memory = policy.begin(goal, Key(0, 0))
+    policy.observe(
+        [Situation(Observation(noise(576, 1024, 3), BLANK.front, np.zeros(3), depth), goal, Key(0, 0), memory)]
+    )
+    before = deepcopy(memory)
+    ahead = np.array([0.6, 0.0, 0.0])
+    there = Situation(Observation(noise(576, 1024, 3, seed=7), BLANK.front, ahead), goal, Key(0, 0), memory)
+    (plans,) = policy.extend([there], 3, 5)
+    assert len(plans) == 3
+    assert memory.similarity == before.similarity and memory.recalled == before.recalled
+    np.testing.assert_array_equal(memory.histogram, before.histogram)
+    np.testing.assert_array_equal(memory.map.seen, before.map.seen)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -104,28 +104,28 @@ class Matcher(Policy):
 
     def observe(self, situations: Sequence[Situation]) -> None:
         """Extends each map and measures how much the present place looks like the goal's."""
-        small = panorama.resize(np.stack([s.observation.panorama for s in situations]), appearance.PANORAMA)
-        bands = appearance.describe(small)
+        bands = _bands(situations)
         for i, situation in enumerate(situations):
             memory: Memory = situation.memory
-            band = bands.place(i)
-            memory.profile = appearance.similarity(band, memory.goal)[0]
-            memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
-            memory.histogram = at_headings(appearance.histogram_similarity(band, memory.goal)[0])
+            likeness = self._look(memory, bands.place(i))
             observation = situation.observation
             assert observation.depth is not None
             if memory.planned is not None and FORWARD in memory.planned[:2]:
                 memory.map.note_blocked(observation.odometry)
-            memory.map.update(
-                observation.depth[1::2, 4::8],
-                observation.odometry,
-                appearance.histogram_similarity(band, memory.goal)[0],
-            )
+            memory.map.update(observation.depth[1::2, 4::8], observation.odometry, likeness)
             memory.places.append((observation.odometry, memory.similarity))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """The best headings by what is really seen, as straight runs; spread out once the goal is near."""
         return [self._propose(situation, candidates, horizon) for situation in situations]
+
+    def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """As `propose`, from imagined places: by what is imagined there, on the map of what was really seen."""
+        bands = _bands(situations)
+        there = [replace(s, memory=replace(s.memory)) for s in situations]
+        for i, situation in enumerate(there):
+            self._look(situation.memory, bands.place(i))
+        return self.propose(there, candidates, horizon)
 
     def score(
         self,
@@ -154,6 +154,14 @@ class Matcher(Policy):
         """The best plan, remembered to notice whether it leads anywhere."""
         situation.memory.planned, chosen = super().revise(situation, proposals, scores)
         return situation.memory.planned, chosen
+
+    def _look(self, memory: Memory, band: appearance.Band) -> NDArray[np.float32]:
+        """Measures a place against the goal; float32 [128], the likeness of each column's view."""
+        likeness = appearance.histogram_similarity(band, memory.goal)[0]
+        memory.profile = appearance.similarity(band, memory.goal)[0]
+        memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
+        memory.histogram = at_headings(likeness)
+        return likeness
 
     def _weight(self, memory: Memory) -> float:
         return self.options.imagined * (1 + self.options.near * memory.gate)
@@ -188,6 +196,11 @@ class Matcher(Policy):
             - options.turn * turns
         )
         return prior - 2.0 * (runs < STEP), runs
+
+
+def _bands(situations: Sequence[Situation]) -> appearance.Band:
+    panoramas = np.stack([situation.observation.panorama for situation in situations])
+    return appearance.describe(panorama.resize(panoramas, appearance.PANORAMA))
 
 
 def at_headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
