@@ -47,8 +47,8 @@ def warp(
     """Show B images from T poses each.
 
     A mesh through the depth of every source is drawn from the new pose; each pixel takes its colour from the source in
-    one bilinear look-up. What the source did not see, or saw only from the other side, is a hole: its colour is a mean of
-    what lies around it, the farther the heavier; its depth is the background's beside it.
+    one bilinear look-up. What the source did not see, or saw only from the other side, is a hole: its colour is a mean
+    of what lies around it, the farther the heavier; its depth is the background's beside it.
 
     Args:
         color: uint8 [B, H, W, 3].

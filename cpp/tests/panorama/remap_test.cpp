@@ -84,6 +84,62 @@ TEST_CASE("every instruction set gives the same bytes, whatever the shift") {
   }
 }
 
+TEST_CASE("groups read the same as blocks one by one") {
+  const Size size{90, 160};
+  const std::size_t images = 3;
+  const auto bytes = noise<std::uint8_t>({static_cast<int>(images) * size.height, size.width}, 3, 7);
+  for (const double pitch : {0.0, 25.0, -60.0, 90.0}) {
+    for (const double hfov : {5.0, 60.0, 105.0, 140.0}) {
+      const PerspectiveView view{{45, 60}, radians(hfov), radians(pitch)};
+      BilinearTable table = bilinear_panorama_table(size, perspective_coordinates(size, view));
+      std::vector<std::vector<std::uint8_t>> fast, slow;
+      for (int pass = 0; pass < 2; ++pass) {
+        std::vector<std::vector<std::uint8_t>>& out = pass == 0 ? fast : slow;
+        std::vector<RemapTarget<std::uint8_t>> targets;
+        for (std::size_t image = 0; image < images; ++image) {
+          for (const int shift : {0, 1, 40, 77, 159}) {
+            out.emplace_back(3 * table.size() + 64, std::uint8_t{77});
+            targets.push_back({shift, nullptr, image});
+          }
+        }
+        for (std::size_t i = 0; i < targets.size(); ++i) targets[i].out = out[i].data();
+        remap(table, {bytes.data(), size, 3}, std::span<const RemapTarget<std::uint8_t>>(targets));
+        table.groups.clear();
+      }
+      CHECK(fast == slow);
+    }
+  }
+}
+
+TEST_CASE("groups know where their pixels read and stay inside the source") {
+  const Size size{40, 64};
+  std::vector<std::uint32_t> texel;
+  const auto append = [&](int row, int column) {
+    for (int i = 0; i < 16; ++i) texel.push_back(pack_halves(column + i / 2, row + i / 8));
+  };
+  append(10, 20);
+  append(36, 20);  // blocks of rows 36 and 37 end in row 38: three loaded rows from 37 on end with the image
+  append(37, 20);
+  for (int i = 0; i < 16; ++i) texel.push_back(pack_halves(20, 5 + 5 * (i % 8 / 4)));
+  for (int i = 0; i < 16; ++i) texel.push_back(pack_halves(20 + 2 * i, 5));
+  for (int i = 0; i < 16; ++i) texel.push_back(pack_halves(20, 5 + i % 4));
+  texel.push_back(0);
+  const std::vector<BlockGroup> groups = find_groups(texel, size);
+  REQUIRE(groups.size() == 6);
+  CHECK(groups[0].row[0] == 10);
+  CHECK(groups[0].row[1] == 11);
+  CHECK(groups[0].column[0] == 20);
+  CHECK(groups[0].column[1] == 24);
+  CHECK(groups[0].first == 20);
+  CHECK(groups[0].last == 27);
+  CHECK(groups[0].rows == 1);
+  CHECK(groups[1].rows == 0);  // the last row's load may pass its end
+  CHECK(groups[2].rows == 0);
+  CHECK(groups[3].rows == 0);  // six rows
+  CHECK(groups[4].rows == 0);  // fifteen columns a half
+  CHECK(groups[5].rows == 4);
+}
+
 TEST_CASE("one cached plan serves several yaws and panoramas at once") {
   const Size size{32, 64};
   const auto batch = noise<std::uint8_t>({3 * size.height, size.width}, 3, 5);

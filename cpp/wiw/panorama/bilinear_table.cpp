@@ -82,6 +82,7 @@ BilinearTable bilinear_panorama_table(const Size& panorama, const Coordinates& c
       append_regular(table, row, wrap(column, panorama.width), x - floor_x, y - floor_y);
     }
   }
+  table.groups = find_groups(table.texel, panorama);
   return table;
 }
 

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <vector>
 
+#include "wiw/panorama/block_groups.hpp"
 #include "wiw/panorama/projection.hpp"
 
 namespace wiw::panorama {
@@ -30,6 +31,7 @@ struct BilinearTable {
   std::vector<float> fraction_x;          // the same for float images
   std::vector<float> fraction_y;
   std::vector<IrregularPixel> irregular;
+  std::vector<BlockGroup> groups;  // may be missing: they only make it faster
 
   [[nodiscard]] std::size_t size() const { return texel.size(); }
 };

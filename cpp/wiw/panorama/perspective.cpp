@@ -14,6 +14,8 @@ namespace wiw::panorama {
 namespace {
 
 constexpr std::size_t kTablesKept = 16;
+// Panoramas that share the decoding of a table: more would fall out of the second-level cache.
+constexpr std::size_t kTogether = 2;
 // Yaws nearer to a whole column than this are that column: 1e-6 of a column is far below any weight's last bit.
 constexpr double kWholeColumn = 1e-6;
 
@@ -75,8 +77,8 @@ std::shared_ptr<PerspectivePlan::Tables> PerspectivePlan::tables_for(double extr
 }
 
 template <class T>
-void PerspectivePlan::apply_one(ImageView<const T> panorama, std::span<const Lookup> lookups,
-                                Interpolation interpolation, T* out) const {
+void PerspectivePlan::apply_together(ImageView<const T> panorama, std::size_t count, std::span<const Lookup> lookups,
+                                     Interpolation interpolation, T* out) const {
   const std::size_t stride = view_.size.pixels() * static_cast<std::size_t>(panorama.channels);
   // Neighbouring yaws that share tables are resampled together.
   for (std::size_t first = 0; first < lookups.size();) {
@@ -84,7 +86,9 @@ void PerspectivePlan::apply_one(ImageView<const T> panorama, std::span<const Loo
     std::vector<RemapTarget<T>> targets;
     std::size_t next = first;
     for (; next < lookups.size() && lookups[next].tables.get() == &tables; ++next) {
-      targets.push_back({lookups[next].shift, out + next * stride});
+      for (std::size_t image = 0; image < count; ++image) {
+        targets.push_back({lookups[next].shift, out + (image * lookups.size() + next) * stride, image});
+      }
     }
     first = next;
     if (interpolation == Interpolation::kNearest) {
@@ -109,7 +113,7 @@ void PerspectivePlan::apply(ImageView<const std::uint8_t> panorama, int shift, I
         std::to_string(shift));
   }
   const Lookup lookup{tables_for(0.0), shift};
-  apply_one<std::uint8_t>(panorama, {&lookup, 1}, Interpolation::kBilinear, out.data);
+  apply_together<std::uint8_t>(panorama, 1, {&lookup, 1}, Interpolation::kBilinear, out.data);
 }
 
 template <class T>
@@ -121,10 +125,13 @@ void PerspectivePlan::apply(const T* panoramas, std::size_t count, int channels,
   std::vector<Lookup> lookups;
   for (const double yaw : yaws) lookups.push_back(lookup(yaw));
   const auto texels = static_cast<std::size_t>(channels);
-  parallel_for(count, [&](std::size_t b) {
-    const ImageView<const T> panorama{panoramas + b * panorama_.pixels() * texels, panorama_, channels};
-    apply_one(panorama, std::span<const Lookup>(lookups), interpolation,
-              out + b * yaws.size() * view_.size.pixels() * texels);
+  const std::size_t together =
+      count >= kTogether * static_cast<std::size_t>(ThreadPool::shared().size()) ? kTogether : 1;
+  parallel_for((count + together - 1) / together, [&](std::size_t part) {
+    const std::size_t first = part * together;
+    const ImageView<const T> panorama{panoramas + first * panorama_.pixels() * texels, panorama_, channels};
+    apply_together(panorama, std::min(together, count - first), std::span<const Lookup>(lookups), interpolation,
+                   out + first * yaws.size() * view_.size.pixels() * texels);
   });
 }
 

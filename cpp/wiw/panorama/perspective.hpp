@@ -42,9 +42,10 @@ class PerspectivePlan {
   };
   [[nodiscard]] Lookup lookup(double yaw) const;
   [[nodiscard]] std::shared_ptr<Tables> tables_for(double extra_columns) const;
+  /// `count` panoramas, the first of which is given.
   template <class T>
-  void apply_one(ImageView<const T> panorama, std::span<const Lookup> lookups, Interpolation interpolation,
-                 T* out) const;
+  void apply_together(ImageView<const T> panorama, std::size_t count, std::span<const Lookup> lookups,
+                      Interpolation interpolation, T* out) const;
 
   Size panorama_;
   PerspectiveView view_;

@@ -24,6 +24,24 @@ RemapRunFunction run_function(Isa isa) {
   return remap_run_scalar;
 }
 
+/// Whether remap_groups_vbmi may be called.
+bool groups_run_on(Isa isa) {
+#if defined(__x86_64__)
+  static const bool supported = __builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512vnni");
+  return isa == Isa::kAvx512 && supported;
+#else
+  static_cast<void>(isa);
+  return false;
+#endif
+}
+
+/// The image that a target reads.
+template <class T>
+ImageView<const T> image_of(ImageView<const T> source, const RemapTarget<T>& target) {
+  source.data += target.image * source.size.pixels() * static_cast<std::size_t>(source.channels);
+  return source;
+}
+
 /// The four texels of a regular block; `below` is the distance to the lower row in texels.
 struct Block {
   std::ptrdiff_t first;
@@ -106,6 +124,21 @@ void check_source(const Table& table, const ImageView<const T>& source) {
                       " x " + std::to_string(source.size.width));
 }
 
+/// Resamples what the table's groups hold and returns how many pixels that is.
+std::size_t remap_groups(const BilinearTable& table, ImageView<const std::uint8_t> source,
+                         std::span<const RemapTarget<std::uint8_t>> targets, Isa isa) {
+#if defined(__x86_64__)
+  if (groups_run_on(isa) && !table.groups.empty()) {
+    std::vector<RemapStream> streams;
+    for (const auto& target : targets) streams.push_back({image_of(source, target).data, target.shift, target.out});
+    remap_groups_vbmi({source.size.width, table.texel.data(), table.fraction14.data(), table.groups.data(),
+                       table.groups.size(), streams.data(), streams.size()});
+    return table.groups.size() * kGroup;
+  }
+#endif
+  return 0;
+}
+
 }  // namespace
 
 void remap(const BilinearTable& table, ImageView<const std::uint8_t> source,
@@ -113,25 +146,27 @@ void remap(const BilinearTable& table, ImageView<const std::uint8_t> source,
   check_source(table, source);
   const bool regular_kernel = source.channels == 3 && source.size.height > 1;
   const RemapRunFunction run = run_function(isa);
-  for (std::size_t begin = 0; begin < table.size(); begin += kBlock) {
+  const std::size_t done = regular_kernel ? remap_groups(table, source, targets, isa) : 0;
+  for (std::size_t begin = done; begin < table.size(); begin += kBlock) {
     const std::size_t count = std::min(kBlock, table.size() - begin);
     for (const auto& target : targets) {
+      const ImageView<const std::uint8_t> image = image_of(source, target);
       if (regular_kernel) {
-        run({source.data, source.size.width, target.shift, table.texel.data() + begin, table.fraction14.data() + begin,
+        run({image.data, image.size.width, target.shift, table.texel.data() + begin, table.fraction14.data() + begin,
              target.out + 3 * begin, count});
       } else {
-        remap_range(table, source, target, begin, begin + count);
+        remap_range(table, image, target, begin, begin + count);
       }
     }
   }
-  for (const auto& target : targets) remap_irregular(table, source, target);
+  for (const auto& target : targets) remap_irregular(table, image_of(source, target), target);
 }
 
 void remap(const BilinearTable& table, ImageView<const float> source, std::span<const RemapTarget<float>> targets) {
   check_source(table, source);
   for (const auto& target : targets) {
-    remap_range(table, source, target, 0, table.size());
-    remap_irregular(table, source, target);
+    remap_range(table, image_of(source, target), target, 0, table.size());
+    remap_irregular(table, image_of(source, target), target);
   }
 }
 
@@ -148,9 +183,10 @@ void remap(const NearestTable& table, ImageView<const T> source, std::span<const
   check_source(table, source);
   const auto channels = static_cast<std::size_t>(source.channels);
   for (const auto& target : targets) {
+    const ImageView<const T> image = image_of(source, target);
     for (std::size_t i = 0; i < table.size(); ++i) {
       const auto texel = static_cast<std::size_t>(block_at(table.texel[i], target.shift, table.source).first);
-      const T* from = source.data + texel * channels;
+      const T* from = image.data + texel * channels;
       T* to = target.out + i * channels;
       for (std::size_t c = 0; c < channels; ++c) to[c] = from[c];
     }

@@ -9,14 +9,16 @@
 namespace wiw::panorama {
 
 /// One resampling of a source by a table: columns are moved by `shift` in [0, width), `out` holds the table's pixels.
+/// `image` counts images that follow the source in memory, each of its size and channels.
 template <class T>
 struct RemapTarget {
   int shift = 0;
   T* out = nullptr;
+  std::size_t image = 0;
 };
 
-/// Resamples one source image to several targets that share a table, walking them together so that the table is
-/// read from memory once. uint8 is rounded from 14-bit weights, float is blended in float32; results do not depend on
+/// Resamples images to several targets that share a table, walking them together so that the table is read from memory
+/// and decoded once. uint8 is rounded from 14-bit weights, float is blended in float32; results do not depend on
 /// the instruction set (uint8).
 void remap(const BilinearTable& table, ImageView<const std::uint8_t> source,
            std::span<const RemapTarget<std::uint8_t>> targets, Isa isa = active_isa());

@@ -6,6 +6,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "wiw/panorama/group.hpp"
+
 namespace wiw::panorama {
 
 /// A run of output pixels of a uint8, three-channel bilinear resampling; members as in BilinearTable. `shift` lies in
@@ -20,6 +22,28 @@ struct RemapRun {
   std::size_t count;
 };
 
+/// One image that is read and one that is written by a GroupRun; as in RemapRun.
+struct RemapStream {
+  const std::uint8_t* source;
+  std::int32_t shift;
+  std::uint8_t* out;
+};
+
+/// The first kGroup * group_count pixels of a table, for several images at once: what a group needs is worked out once
+/// for all of them. `groups` as made by find_groups.
+struct GroupRun {
+  std::int32_t source_width;
+  const std::uint32_t* texel;
+  const std::uint32_t* fraction14;
+  const BlockGroup* groups;
+  std::size_t group_count;
+  const RemapStream* streams;
+  std::size_t stream_count;
+};
+
+/// Needs AVX-512 VBMI and VNNI.
+void remap_groups_vbmi(const GroupRun& run);
+
 using RemapRunFunction = void (*)(const RemapRun&);
 void remap_run_avx2(const RemapRun& run);
 void remap_run_avx512(const RemapRun& run);
@@ -29,6 +53,7 @@ namespace {
 // The curved path of an output row through a panorama defeats the hardware prefetcher, but the next rows follow the
 // same path a little lower: fetch that many source rows ahead.
 constexpr std::ptrdiff_t kPrefetchRows = 6;
+constexpr std::ptrdiff_t kPrefetchGroupRows = 8;
 
 inline void remap_pixels_scalar(const RemapRun& run, std::size_t begin, std::size_t end) {
   for (std::size_t i = begin; i < end; ++i) {
