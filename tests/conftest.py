@@ -5,9 +5,15 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 ROOT = Path(__file__).parents[1]
+
+# The same commit always gets the same verdict; look for new counter-examples with --hypothesis-profile=explore.
+hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None)
+hypothesis.settings.register_profile("explore", max_examples=1000, deadline=None)
+hypothesis.settings.load_profile("fixed")
 
 COLORS = {
     "floor": (0.6, 0.5, 0.4),

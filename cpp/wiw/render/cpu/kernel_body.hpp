@@ -58,11 +58,15 @@ inline void start_rays(RayHit& rays, const View& view) {
   store(rays.ray.flags, Ints{});
 }
 
+/// Zero for components below 1e-15: Embree squares its approximate reciprocals, which overflows below about 5e-20, and
+/// such rays miss everything.
+inline Floats without_dust(Floats x) { return x * x > 1e-30f ? x : Floats{}; }
+
 /// Casts the packet through the scene's two parts; the second only replaces nearer hits. Returns the mask of hits.
 inline Ints cast(const KernelScene& scene, const Directions& d, Ints valid, RayHit& rays) {
-  store(rays.ray.dir_x, d.x);
-  store(rays.ray.dir_y, d.y);
-  store(rays.ray.dir_z, d.z);
+  store(rays.ray.dir_x, without_dust(d.x));
+  store(rays.ray.dir_y, without_dust(d.y));
+  store(rays.ray.dir_z, without_dust(d.z));
   store(rays.ray.tfar, Floats{} + __builtin_inff());
   store(rays.hit.geomID, Ints{} - 1);
   store(rays.hit.instID[0], Ints{} - 1);
