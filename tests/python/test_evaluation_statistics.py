@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
+import io
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rich.console import Console
 from scipy import stats
 
 from wiw.errors import ArgumentError
 from wiw.evaluation.intervals import agresti_min, clustered_bootstrap, student, wilson
 from wiw.evaluation.statistics import HEADLINES, compare, estimate_difference, estimate_mean, mcnemar
-from wiw.evaluation.summary import notes, summarise
+from wiw.evaluation.summary import notes, show_estimate, summarise
 
 SR, SPL, TRAJ = HEADLINES
 
@@ -160,3 +162,23 @@ def test_empty_run_has_no_numbers():
     assert summary["none"].pending == 3 and not summary["none"].estimates and summary.differences == ()
     with pytest.raises(KeyError, match="it has none"):
         summary["warp"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_terminal_table_keeps_every_number(width):
+    arms = ["none", "copy", "heuristic", "geometric"]
+    outcomes = [outcome(arm, i, float((i + len(arm)) % 3 == 0)) for arm in arms for i in range(120)]
+    summary = summarise(arms, outcomes, episodes=120, policies=["none", "heuristic", "geometric"])
+    with Console(width=width, file=io.StringIO(), record=True) as console:
+        console.print(summary)
+    shown = console.export_text()
+    assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
+    for difference in summary.differences:
+        assert f"{difference.wins}/{difference.losses}" in shown
+        assert show_estimate(difference.estimate, signed=True).split(" ", 1)[1] in shown
+
+
+def test_arms_say_what_they_are():
+    summary = summarise(["none", "geometric", "warp"], [], episodes=3, policies=["none", "geometric"])
+    roles = [line.role for line in summary.arms]
+    assert roles == ["the policy alone", "another policy, alone", "world model"]

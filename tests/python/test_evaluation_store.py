@@ -13,7 +13,8 @@ from wiw.evaluation.runlog import load_run
 from wiw.evaluation.store import RunStore
 from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation, Proposal, Rollout, Truth
 
-CONFIG = {"task": {"task": "line"}, "seed": 0, "episodes": 3, "arms": [{"name": "none"}, {"name": "warp"}]}
+ARMS = [{"name": "none", "agent": {"policy": "line"}}, {"name": "warp", "agent": {"policy": "line", "model": "warp"}}]
+CONFIG = {"task": {"task": "line"}, "seed": 0, "episodes": 3, "arms": ARMS}
 INFO = {"pictures": [0]}
 
 

@@ -65,15 +65,17 @@ class RunLog:
 
     def numbers(self) -> Summary:
         """Means, intervals and paired differences, without printing."""
-        return summarise(self.arms, self.store.outcomes(), len(self.store.episodes()), self.store.config["seed"])
+        config = self.store.config
+        policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
+        return summarise(self.arms, self.store.outcomes(), len(self.store.episodes()), config["seed"], policies)
 
     def summary(self) -> Summary:
         """Prints the table of arms and the paired differences, and returns them as numbers."""
         numbers = self.numbers()
         if not in_notebook():
-            from rich.console import Console
+            from wiw.evaluation.tables import print_summary
 
-            Console().print(numbers)
+            print_summary(numbers)
         return numbers
 
     def table(self) -> Records:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ ROLES = {
     "copy": "the floor, a world where nothing moves",
     "oracle": "the ceiling, the true future",
 }
-"""What the reference arms stand for; any other arm is a world model under test."""
+"""What the reference arms stand for; any other arm is a world model under test, or a policy without one."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Summary:
                 return difference
         raise KeyError(f"no difference of {metric} between '{arm}' and '{base}' in this run")
 
-    def __rich__(self) -> Any:
+    def __rich_console__(self, console: Any, options: Any) -> Any:
         from wiw.evaluation.tables import summary_tables
 
-        return summary_tables(self)
+        yield summary_tables(self, options.max_width)
 
     def _repr_html_(self) -> str:
         from wiw.evaluation.report import summary_html
@@ -67,7 +67,13 @@ class Summary:
         return summary_html(self)
 
 
-def summarise(arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]], episodes: int, seed: int = 0) -> Summary:
+def summarise(
+    arms: Sequence[str],
+    outcomes: Sequence[Mapping[str, Any]],
+    episodes: int,
+    seed: int = 0,
+    policies: Collection[str] = (),
+) -> Summary:
     """Numbers of a run.
 
     Args:
@@ -75,7 +81,9 @@ def summarise(arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]], episod
         outcomes: ended episodes with "arm", "episode", "scene", "status", "metrics".
         episodes: how many the run has.
         seed: of the bootstrap.
+        policies: arms that have no world model and differ from "none" by their policy.
     """
+    roles = dict.fromkeys(policies, "another policy, alone") | ROLES
     done: dict[str, dict[int, Mapping[str, Any]]] = {arm: {} for arm in arms}
     failed = dict.fromkeys(arms, 0)
     for outcome in outcomes:
@@ -83,7 +91,7 @@ def summarise(arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]], episod
             done[outcome["arm"]][outcome["episode"]] = outcome
         else:
             failed[outcome["arm"]] += 1
-    lines = tuple(_line(arm, done[arm], failed[arm], episodes, seed) for arm in arms)
+    lines = tuple(_line(arm, roles.get(arm, "world model"), done[arm], failed[arm], episodes, seed) for arm in arms)
     differences = tuple(
         difference
         for base in ("none", "copy")
@@ -100,7 +108,9 @@ def _headlines(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Head
     return [headline for headline in HEADLINES if ended and all(headline.metric in metrics for metrics in ended)]
 
 
-def _line(arm: str, done: Mapping[int, Mapping[str, Any]], failed: int, episodes: int, seed: int) -> ArmSummary:
+def _line(
+    arm: str, role: str, done: Mapping[int, Mapping[str, Any]], failed: int, episodes: int, seed: int
+) -> ArmSummary:
     scenes = [outcome["scene"] for outcome in done.values()]
     estimates = {
         headline.metric: estimate_mean(
@@ -108,7 +118,7 @@ def _line(arm: str, done: Mapping[int, Mapping[str, Any]], failed: int, episodes
         )
         for headline in _headlines({arm: done})
     }
-    return ArmSummary(arm, ROLES.get(arm, "world model"), len(done), failed, episodes - len(done) - failed, estimates)
+    return ArmSummary(arm, role, len(done), failed, episodes - len(done) - failed, estimates)
 
 
 def notes(summary: Summary) -> list[str]:

@@ -131,7 +131,7 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def _legend(axes: Axes) -> None:
-    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=6, loc="lower left", bbox_to_anchor=(0, 1))
+    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=4, loc="lower left", bbox_to_anchor=(0, 1))
 
 
 def _svg(figure: Figure, name: str) -> Markup:
