@@ -66,7 +66,8 @@ def test_list_names_everything_with_a_line(capsys):
 def test_run_prints_a_table_and_writes_a_report(tmp_path, capsys):
     assert run("--episodes", 4, "--out", tmp_path / "run", "--seed", 3) == 0
     shown = capsys.readouterr().out
-    assert "SR %" in shown and "none" in shown and str(tmp_path / "run" / "report.html") in shown
+    assert "SR %" in shown and "none" in shown and " s for scenes and episodes" in shown
+    assert str(tmp_path / "run" / "report.html") in shown
     log = load_run(tmp_path / "run")
     assert log.complete and log.store.config["seed"] == 3
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
@@ -154,6 +155,8 @@ def test_doctor_says_where_scenes_are_kept_and_how_big_they_are(monkeypatch, tmp
     monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
     found = {finding.name: finding for finding in examine()}["scene cache"]
     assert str(tmp_path / "cache" / "scenes") in found.detail and "0 files, 0 MB" in found.detail and not found.remedy
+    monkeypatch.setenv("WIW_CACHE_GB", "0.5")
+    assert "at most 0.5 GB" in {finding.name: finding for finding in examine()}["scene cache"].detail
     (tmp_path / "cache" / "scenes").mkdir(parents=True)
     (tmp_path / "cache" / "scenes" / "a.wiwscene").write_bytes(bytes(3 << 20))
     assert "1 files, 3 MB" in {finding.name: finding for finding in examine()}["scene cache"].detail

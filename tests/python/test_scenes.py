@@ -302,6 +302,98 @@ def test_generated_scenes_are_kept_by_identity(own_cache: Path) -> None:
     for identity in (["maker", 1, 7], ["maker", 1, 7], ["maker", 2, 7]):
         assert scenes.store.generated(identity, make).triangle_count == 2
     assert len(made) == 2
+    assert not list((own_cache / "scenes").glob("*.lock"))
+
+
+def flat() -> scenes.Scene:
+    return scenes.Scene.from_arrays([{"positions": SQUARE, "triangles": TWO}])
+
+
+MAKER = """
+import sys, time
+import wiw.scenes
+from pathlib import Path
+from wiw import _core
+make = _core.scene.apartment
+def slow(seed, split):
+    with Path(sys.argv[1]).open("a") as log:
+        log.write("made\\n")
+    time.sleep(0.3)
+    return wiw.scenes.Scene.from_arrays([{"positions": [[0, 0, 0], [1, 0, 0], [0, 1, 0]], "triangles": [[0, 1, 2]]}])
+_core.scene.apartment = slow
+print(wiw.scenes.open_scene("apartments:val/3").triangle_count)
+"""
+
+
+def test_an_apartment_is_made_once_for_all_processes(tmp_path: Path, own_cache: Path) -> None:
+    command = [sys.executable, "-c", MAKER, str(tmp_path / "log")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) for _ in range(3)]
+    assert [child.communicate(timeout=60)[0].strip() for child in children] == ["1", "1", "1"]
+    assert (tmp_path / "log").read_text() == "made\n"
+
+
+def test_an_apartment_is_kept_by_seed_split_and_build(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[tuple[int, str]] = []
+    monkeypatch.setattr(_core.scene, "apartment", lambda seed, split: made.append((seed, split)) or flat())
+    for _ in range(2):
+        for seed, split in ((1, "val"), (2, "val"), (1, "test")):
+            scenes.apartment(seed, split)
+    assert made == [(1, "val"), (2, "val"), (1, "test")]
+    monkeypatch.setattr(scenes.store, "build_digest", lambda: "another build")
+    scenes.apartment(1, "val")
+    scenes.apartment(1, "val", cache=False)
+    assert len(made) == 5
+
+
+def test_the_cache_forgets_what_was_not_used_for_longest(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes.store.generated(["size"], flat)
+    (first,) = (own_cache / "scenes").glob("*.wiwscene")
+    monkeypatch.setenv("WIW_CACHE_GB", str(3.5 * first.stat().st_size / 2**30))
+    made: list[int] = []
+
+    def ask(number: int) -> None:
+        scenes.store.generated([number], lambda: made.append(number) or flat())
+        time.sleep(0.02)
+
+    for number in (1, 2, 1, 3, 1, 4, 1):  # 2 goes when 4 comes
+        ask(number)
+    assert made == [1, 2, 3, 4]
+    assert len(list((own_cache / "scenes").glob("*.wiwscene"))) == 3
+    ask(2)
+    assert made == [1, 2, 3, 4, 2]
+    monkeypatch.setenv("WIW_CACHE_GB", "much")
+    with pytest.raises(ArgumentError, match=r"WIW_CACHE_GB.*much"):
+        ask(5)
+
+
+def test_a_scene_forgotten_by_the_cache_is_imported_again_without_a_word(
+    tmp_path: Path, own_cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mesh = square(tmp_path)
+    time.sleep(0.02)
+    scenes.load(mesh, isolate=False)
+    (file,) = (own_cache / "scenes").glob("*.wiwscene")
+    file.unlink()
+    assert scenes.load(mesh, isolate=False).triangle_count == 2 and file.exists()
+    assert not caplog.text
+
+
+def test_a_scene_that_cannot_be_kept_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def full(scene: scenes.Scene, path: Path) -> None:
+        raise FileError(f"{path}: cannot be written (is the disk full?)")
+
+    monkeypatch.setattr(_core.scene, "write_cache", full)
+    assert scenes.store.generated(["full"], flat).triangle_count == 2
+    assert "disk full" in caplog.text and "made again the next time" in caplog.text
+    monkeypatch.undo()
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "file"))
+    caplog.clear()
+    assert scenes.store.generated(["nowhere"], flat).triangle_count == 2
+    assert "not kept" in caplog.text
 
 
 def test_a_file_that_ends_the_importer_is_an_error_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -131,7 +131,7 @@ def _writable(name: str, folder: Path) -> Finding:
 
 def _cache() -> Finding:
     """The folder of imported and generated scenes: where it is, what it holds, whether it can grow."""
-    from wiw.scenes.store import folder
+    from wiw.scenes.store import folder, limit
 
     cache = folder()
     files = [path.stat() for path in cache.glob("*")] if cache.is_dir() else []
@@ -140,7 +140,9 @@ def _cache() -> Finding:
     remedy = "nearly full: delete the folder, or set WIW_CACHE to another" if free < 1 else ""
     if not os.access(there, os.W_OK):
         remedy = f"{there} is not writable: set WIW_CACHE to another folder"
-    return Finding("scene cache", f"{cache}, {len(files)} files, {used:.0f} MB, {free:.0f} GB free", remedy)
+    most = f"at most {limit() / 2**30:g} GB (WIW_CACHE_GB)"
+    detail = f"{cache}, {len(files)} files, {used:.0f} MB, {most}, {free:.0f} GB free"
+    return Finding("scene cache", detail, remedy)
 
 
 def _free_gigabytes(folder: Path) -> float:

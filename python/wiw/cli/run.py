@@ -139,8 +139,9 @@ def finish(log: Any, report: bool) -> int:
             file=sys.stderr,
         )
         print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)
+    print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
     if report:
-        print(f"\nreport  {log.report()}")
+        print(f"report  {log.report()}")
     print(f"run     {log.path}")
     return 1 if len(failed) == len(log.episodes) else 0
 

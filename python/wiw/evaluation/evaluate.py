@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -153,6 +154,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     if options.resume and options.out is not None and store_path(options.out).exists():
         store = RunStore.resume(options.out, config)
     else:
+        started = time.perf_counter()
+        episodes = built.episodes(options.episodes)
         folder = options.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
         info = {
             "platform": describe_platform(),
@@ -162,8 +165,9 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "live": options.live,
             "workers": options.workers,
             "command": sys.argv,
+            "preparation_seconds": time.perf_counter() - started,
         }
-        store = RunStore.create(folder, config, info, built.episodes(options.episodes))
+        store = RunStore.create(folder, config, info, episodes)
     return _finish(store, task, agents, options.workers, options.progress)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -88,12 +89,20 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
         return _core.scene.map_cache(Path(folder) / "scene")  # the mapping outlives the file
 
 
-def apartment(seed: int, split: str = "val") -> Scene:
+def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
     """A furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
 
-    `split` is "train", "val" or "test". Raises ArgumentError for any other.
+    `split` is "train", "val" or "test"; ArgumentError is raised for any other. With `cache` it is made once, in
+    seconds, and then mapped from disk like imported scenes, until the compiled core changes.
     """
-    return _core.scene.apartment(seed, split)
+
+    def make() -> Scene:
+        started = time.perf_counter()
+        scene = _core.scene.apartment(seed, split)
+        _log.info("apartment %s/%s made in %.1f s", split, seed, time.perf_counter() - started)
+        return scene
+
+    return store.generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
 
 
 SPLIT_SIZE = 1000

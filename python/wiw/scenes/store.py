@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imported scenes on disk, mapped instead of read again.
+"""Imported and generated scenes on disk, mapped instead of made again.
 
 A scene file is named by the content of everything it was made from: the files read, the options and the importer's
 version. Beside it a small manifest remembers, for one source and its options, which files were read and which were
 looked for in vain, so that an edited file or a texture that has turned up since makes the scene be built again. Files
-appear under their names whole, so any number of processes may use the folder at once.
+appear under their names whole, so any number of processes may use the folder at once. When the folder outgrows its
+limit, the scenes that were not used for longest go first; processes that have them mapped keep them.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
 import time
 import uuid
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from hashlib import blake2b
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from wiw import _core
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 
 _log = logging.getLogger("wiw.scenes")
 _CHUNK = 1 << 20
+LIMIT_GB = 8.0
+"""Most gigabytes that scenes may take; an apartment takes 15 MB. `$WIW_CACHE_GB` sets another limit."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,7 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
         draft.replace(scene)
     finally:
         draft.unlink(missing_ok=True)
+    _trim(scene)
     if all(entry["mtime_ns"] < started for entry in entries):  # else a file may have changed while it was read
         absent = [str(path) for path in dict.fromkeys(sources.absent)]
         _write(manifest, {"scene": scene.name, "read": entries, "absent": absent})
@@ -68,16 +75,104 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
 
 
 def generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
-    """A scene that is a function of `identity` (generator, its version, seed, ...) alone: mapped, or made and kept."""
+    """A scene that is a function of `identity` (generator, its version, seed, ...) alone: mapped, or made and kept.
+
+    Processes that ask for the same scene at the same time make it once. Where it cannot be kept, for want of room or
+    of permission, a warning says so and the scene is in memory only.
+    """
     path = folder() / f"{_key(list(identity))}.wiwscene"
-    if path.exists():
-        try:
-            return _core.scene.map_cache(path)
-        except FileError as error:
-            _log.warning("built again: %s", error)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _core.scene.write_cache(make(), path)
-    return _core.scene.map_cache(path)
+    with _turn(path):
+        known = _mapped(path)
+        return _kept(make(), path) if known is None else known
+
+
+@cache
+def build_digest() -> str:
+    """Digest of the compiled core, which names every version of the generators in it."""
+    return _digest(Path(_core.__file__))
+
+
+def limit() -> float:
+    """Most bytes that scenes may take on disk.
+
+    Raises:
+        ArgumentError: `$WIW_CACHE_GB` is not a number of gigabytes.
+    """
+    text = os.environ.get("WIW_CACHE_GB", str(LIMIT_GB))
+    try:
+        gigabytes = float(text)
+    except ValueError:
+        gigabytes = -1.0
+    if not gigabytes >= 0:
+        raise ArgumentError(f"WIW_CACHE_GB: expected a number of gigabytes, got '{text}'")
+    return gigabytes * 2**30
+
+
+def _kept(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
+    """The scene mapped from its new file; the scene itself where the file cannot be written."""
+    try:
+        _core.scene.write_cache(scene, path)
+        _trim(path)
+        return _core.scene.map_cache(path)
+    except (FileError, OSError) as error:
+        _log.warning("a generated scene is not kept and will be made again the next time: %s", error)
+        return scene
+
+
+@contextmanager
+def _turn(path: Path) -> Iterator[None]:
+    """Lets one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
+    name = path.with_suffix(".lock")
+    lock = _locked(name)
+    try:
+        yield
+    finally:
+        if lock is not None:
+            with suppress(OSError):
+                name.unlink()
+            lock.close()
+
+
+def _locked(name: Path) -> IO[str] | None:
+    try:
+        name.parent.mkdir(parents=True, exist_ok=True)
+        lock = name.open("w")
+    except OSError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+    except OSError:  # e.g. a network disk without locks
+        lock.close()
+        return None
+    return lock
+
+
+def _mapped(path: Path) -> _core.scene.Scene | None:
+    """The scene kept at `path`, marked as used now; None where there is none, or, with a warning, a damaged one."""
+    if not path.exists():
+        return None
+    try:
+        scene = _core.scene.map_cache(path)
+    except FileError as error:
+        _log.warning("built again: %s", error)
+        return None
+    with suppress(OSError):
+        os.utime(path)
+    return scene
+
+
+def _trim(newest: Path) -> None:
+    """Removes scenes, those unused for longest first, until the others fit the limit; never `newest`."""
+    scenes = []
+    for path in newest.parent.glob("*.wiwscene"):
+        with suppress(FileNotFoundError):  # another process trims as well
+            status = path.stat()
+            scenes.append((status.st_mtime_ns, status.st_size, path))
+    excess = sum(size for _, size, _ in scenes) - limit()
+    for _, size, path in sorted(scenes):
+        if excess > 0 and path != newest:
+            path.unlink(missing_ok=True)
+            excess -= size
 
 
 def _key(parts: list[Any]) -> str:
@@ -123,10 +218,10 @@ def _known(manifest: Path) -> _core.scene.Scene | None:
         facts = json.loads(manifest.read_text())
         if not all(map(_unchanged, facts["read"])) or any(Path(path).exists() for path in facts["absent"]):
             return None
-        return _core.scene.map_cache(manifest.with_name(facts["scene"]))
+        return _mapped(manifest.with_name(facts["scene"]))
     except FileNotFoundError:
         return None
-    except (FileError, OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         _log.warning("the scene cache is built again: %s", error)
         return None
 
