@@ -171,8 +171,9 @@ class Episode:
     goal_position: tuple[float, float, float]
     goal_yaw: float
     geodesic: float
-    """Shortest path from start to goal in metres."""
+    """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
+    """ImageNav reads "ideal_primitives", the least number of primitives, and "radius", the goal's own in metres."""
 
 
 @dataclass(frozen=True)

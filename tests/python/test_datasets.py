@@ -4,6 +4,7 @@ from __future__ import annotations
 import gzip
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 from wiw.datasets import episodes as files
 from wiw.datasets.habitat import heading_of, yaw_of
 from wiw.errors import FileError
+from wiw.evaluation.evaluate import evaluate, resume_run
+from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode
 
@@ -77,23 +80,88 @@ def test_habitat_episodes_run(two_rooms: str, tmp_path: Path) -> None:
     assert env.goal.image.std() > 1 and env.result()["shortest"] > 5
 
 
-def test_world_in_world_episodes_are_read(tmp_path: Path) -> None:
+def world_in_world_file(path: Path, scene: str = "a/b.glb", **more: Any) -> Path:
     item = {
         "datum_id": 1,
         "episode_id": 3,
-        "scene_relpath": "a/b.glb",
+        "scene_relpath": scene,
         "goal_image_relpath": "i.png",
-        "start_position": [0, 0, 0],
+        "start_position": [-2.0, 0, 0.5],
         "start_rotation": [1, 0, 0, 0],
-        "goal_position": [1, 0, 1],
+        "goal_position": [3.0, 0, 1.0],
         "goal_rotation": [0.0, 0, 1.0, 0],
         "goal_radius": 0.5,
+        "goal_rot_diff": 0.0,
+        **more,
     }
-    path = tmp_path / "e.json"
-    path.write_text(json.dumps({"version": 1, "data": [item]}))
-    episode = files.load(path, "/scenes")[0]
+    path.write_text(json.dumps({"version": 1, "num_items": 1, "meta": {}, "data": [item]}))
+    return path
+
+
+def test_world_in_world_episodes_are_read(tmp_path: Path) -> None:
+    episode = files.load(world_in_world_file(tmp_path / "e.json", step_to_goal=33), "/scenes")[0]
     assert episode.scene == "/scenes/a/b.glb" and abs(episode.goal_yaw) == pytest.approx(np.pi)
     assert np.isnan(episode.geodesic)
+    assert episode.info["ideal_primitives"] == 33 and episode.info["radius"] == 0.5
+    files.save(tmp_path / "own.json.gz", [episode], "imagenav")
+    again = files.load(tmp_path / "own.json.gz")[0]
+    assert np.isnan(again.geodesic) and again.info == episode.info
+
+
+FORMATS = {
+    "habitat": lambda path, scene: habitat_file(path.with_suffix(".json.gz"), scene),
+    "world-in-world": world_in_world_file,
+    "world-in-world with steps": lambda path, scene: world_in_world_file(path, scene, step_to_goal=33, goal_radius=9),
+}
+
+
+@pytest.mark.parametrize(
+    ("form", "preset", "shortest", "ideal"),
+    [
+        ("habitat", "paper", 5.5, None),
+        ("habitat", "official", 5.5, None),
+        ("world-in-world", "official", 5.1, None),
+        ("world-in-world with steps", "official", 5.1, 33),
+    ],
+)
+def test_episodes_of_other_systems_are_evaluated(
+    tmp_path: Path, two_rooms: str, form: str, preset: str, shortest: float, ideal: int | None
+) -> None:
+    path = FORMATS[form](tmp_path / "e.json", Path(two_rooms).name)
+    recipe = TaskRecipe(
+        "imagenav",
+        {"episode_file": str(path), "scene_folder": str(Path(two_rooms).parent), "preset": preset, "decisions": 2},
+    )
+    log = evaluate(recipe, AgentRecipe("heuristic"), 1, out=tmp_path / "run", progress=False)
+    (row,) = log.episodes
+    assert row["status"] == "done", row["error"]
+    assert row["geodesic"] == row["metrics"]["shortest"] == pytest.approx(shortest, abs=0.1)
+    assert row["metrics"]["success"] == (form == "world-in-world with steps")  # 9 m around the goal are both rooms
+    if ideal is not None:
+        assert row["metrics"]["spl"] == pytest.approx(min(1.0, ideal / max(ideal, row["metrics"]["actions"])))
+    assert log.report().read_text().count("m to go") == 1
+    assert resume_run(tmp_path / "run", progress=False).complete
+
+
+def test_the_files_radius_holds_unless_one_is_given(tmp_path: Path, two_rooms: str) -> None:
+    path = world_in_world_file(tmp_path / "e.json", Path(two_rooms).name, step_to_goal=33, goal_radius=9)
+    options = {"episode_file": path, "scene_folder": Path(two_rooms).parent}
+    for more, reached in (({}, True), ({"radius": 0.5}, False)):
+        env = ImageNav(**options, **more).environment()
+        env.begin(env.task.episode(0))
+        assert env.run([1]).terminated == reached
+
+
+def test_ideal_steps_of_the_file_are_what_spl_is_measured_against(tmp_path: Path, two_rooms: str) -> None:
+    found = []
+    for steps in (1, 2, 4):
+        path = world_in_world_file(tmp_path / "e.json", Path(two_rooms).name, step_to_goal=steps, goal_radius=9)
+        task = ImageNav(episode_file=path, scene_folder=Path(two_rooms).parent, preset="official")
+        env = task.environment()
+        env.begin(task.episode(0))
+        env.run([1, 2, 1, 2])
+        found.append(env.result()["spl"])
+    assert found == [0.25, 0.5, 1.0]
 
 
 @pytest.mark.parametrize(

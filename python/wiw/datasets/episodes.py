@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -18,15 +19,16 @@ VERSION = 1
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
-    """Writes an episode file; `about` (generator, seed, ...) goes into its header."""
+    """Writes an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header."""
     body = {
         "format": "wiw-episodes",
         "version": VERSION,
         "task": task,
         **about,
-        "episodes": [asdict(e) for e in episodes],
+        "episodes": [{**asdict(e), "geodesic": e.geodesic if math.isfinite(e.geodesic) else None} for e in episodes],
     }
-    Path(path).write_text(json.dumps(body, indent=1), encoding="utf-8")
+    text = json.dumps(body, indent=1, allow_nan=False).encode()
+    Path(path).write_bytes(gzip.compress(text, mtime=0) if str(path).endswith(".gz") else text)
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
@@ -76,4 +78,6 @@ def _episode(item: Any, where: str) -> Episode:
         if not isinstance(point, Sequence) or len(point) != 3:
             raise FileError(f"{where}: {name} must be [x, y, z] in metres, got {point!r}")
         values[name] = tuple(float(x) for x in point)
+    if values["geodesic"] is None:
+        values["geodesic"] = math.nan
     return Episode(**values)

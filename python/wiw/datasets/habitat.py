@@ -76,12 +76,16 @@ def is_world_in_world(body: Any) -> bool:
 
 
 def read_world_in_world(body: Mapping[str, Any], path: str, scenes: str | Path = "") -> list[Episode]:
-    """Episodes of the published ImageNav file (quaternions in order wxyz), scenes below the folder `scenes`."""
+    """Episodes of the published ImageNav file (quaternions in order wxyz), scenes below the folder `scenes`.
+
+    Each brings the radius of its goal and the number of primitives that its SPL is measured against.
+    """
     return [_world_in_world(item, f"{path}: item {i}", Path(scenes)) for i, item in enumerate(body["data"])]
 
 
 def _world_in_world(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
     try:
+        steps = item.get("step_to_goal")
         return Episode(
             episode_id=str(item["episode_id"]),
             scene=str(scenes / str(item["scene_relpath"])),
@@ -92,8 +96,8 @@ def _world_in_world(item: Mapping[str, Any], where: str, scenes: Path) -> Episod
             geodesic=float("nan"),
             info={
                 "source": "world-in-world",
-                "goal_radius": float(item["goal_radius"]),
-                "steps": item.get("step_to_goal"),
+                "radius": float(item["goal_radius"]),
+                **({} if steps is None else {"ideal_primitives": int(steps)}),
             },
         )
     except (KeyError, TypeError, ValueError) as error:

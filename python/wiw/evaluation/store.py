@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import fcntl
 import json
+import math
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -215,7 +216,10 @@ class RunStore:
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def write(self, row: DecisionRow | OutcomeRow) -> None:
-        """Writes one decision with its pictures, or one episode's end, as one transaction."""
+        """Writes one decision with its pictures, or one episode's end, as one transaction.
+
+        An episode whose file gave no length takes it from the first arm that has measured it ("shortest").
+        """
         with self._writing() as connection:
             if isinstance(row, DecisionRow):
                 key = {"arm": row.arm, "episode": row.episode, "decision": row.decision}
@@ -236,6 +240,12 @@ class RunStore:
                         "error": result.error,
                     },
                 )
+                shortest = result.metrics.get("shortest", math.nan)
+                if math.isfinite(shortest):
+                    connection.execute(
+                        "UPDATE episode SET geodesic = ? WHERE episode = ? AND geodesic IS NULL",
+                        (shortest, result.episode),
+                    )
 
     def write_agent(self, row: AgentRow) -> None:
         """Keeps what an arm's agent says of itself, as `info["built"][arm]`.
@@ -371,7 +381,7 @@ def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
         float(values["start_yaw"]),
         *map(float, values["goal_position"]),
         float(values["goal_yaw"]),
-        float(values["geodesic"]),
+        float(values["geodesic"]) if math.isfinite(values["geodesic"]) else None,
         to_json(values["info"]),
     )
 
@@ -384,6 +394,6 @@ def _episode(row: dict[str, Any]) -> Episode:
         row["start_yaw"],
         (row["goal_x"], row["goal_y"], row["goal_z"]),
         row["goal_yaw"],
-        row["geodesic"],
+        math.nan if row["geodesic"] is None else row["geodesic"],
         json.loads(row["info"]),
     )

@@ -123,6 +123,12 @@ class Story:
         """The scene's name without its folders."""
         return self.episode.scene if self.episode.scene.startswith("apartments:") else Path(self.episode.scene).name
 
+    @property
+    def way(self) -> str:
+        """E.g. " · 4.2 m to go"; nothing where no arm could measure it."""
+        length = self.episode.geodesic
+        return f" · {length:.1f} m to go" if np.isfinite(length) else ""
+
 
 def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
     """The episodes that keep pictures and have ended, and the scene maps by id as data URIs."""

@@ -133,8 +133,11 @@ def _plots(log: RunLog, summary: Summary) -> list[tuple[str, str, Markup]]:
             "Bars are 95 % intervals; dashed lines mark floor (copy) and ceiling (oracle).",
             plots.success_by_arm(summary),
         ),
-        ("Success by distance", "Do longer ways need the world model more?", plots.success_by_distance(done)),
     ]
+    ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
+    if any(ways.values()):
+        about = "Do longer ways need the world model more?"
+        found.append(("Success by distance", about, plots.success_by_distance(ways)))
     if budget:
         found.append(
             ("Decisions to success", "How soon the goal is reached.", plots.decisions_to_success(done, budget))

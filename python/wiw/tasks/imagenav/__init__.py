@@ -34,7 +34,8 @@ class ImageNavRules:
     execute: int
     """Primitives carried out per decision; negative: all but that many of the chosen plan, at least one."""
     radius: float
-    """Metres; the episode succeeds on entering this sphere around the goal's position."""
+    """Metres; the episode succeeds on entering this sphere around the goal's position. Where an episode file gives a
+    goal's radius, that one holds, unless the radius is given as an option of the task."""
     checked: Literal["primitive", "decision"]
     """Whether success is looked at after every primitive or only where a decision is due."""
     distance: Literal["euclidean", "geodesic"]
@@ -78,6 +79,7 @@ class ImageNav:
         self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
         self.episode_file = None if episode_file is None else str(episode_file)
         self.scene_folder = str(scene_folder)
+        self._one_radius = "radius" in rules
         self._episodes: list[Episode] = []
 
     @property
@@ -120,7 +122,7 @@ class ImageNav:
             ArgumentError: the episode file or the scenes hold fewer.
         """
         if not self._episodes and self.episode_file:
-            self._episodes = episode_file.load(self.episode_file, self.scene_folder)
+            self._episodes = self._of_file()
         scenes = [] if self.episode_file else resolve(self.scenes)
         whole_scene = len(scenes) == 1
         while len(self._episodes) < count and not self.episode_file:
@@ -151,9 +153,10 @@ class ImageNav:
             return True
         if self.rules.checked == "decision" and not trip.at_decision:
             return False
-        if trip.distance_to_goal() > self.rules.radius:  # no walk is shorter than the straight line
+        radius = trip.episode.info.get("radius", self.rules.radius)
+        if trip.distance_to_goal() > radius:  # no walk is shorter than the straight line
             return False
-        return self.rules.distance == "euclidean" or trip.geodesic_to_goal() <= self.rules.radius
+        return self.rules.distance == "euclidean" or trip.geodesic_to_goal() <= radius
 
     def result(self, trip: Trip) -> dict[str, float]:
         """Metrics of one finished episode; `spl` is its contribution, 0 to 1."""
@@ -170,6 +173,14 @@ class ImageNav:
             "distance_to_goal": trip.distance_to_goal(),
         }
 
+    def _of_file(self) -> list[Episode]:
+        """The file's episodes, under the task's radius where that was given as an option."""
+        assert self.episode_file is not None
+        loaded = episode_file.load(self.episode_file, self.scene_folder)
+        if not self._one_radius:
+            return loaded
+        return [replace(e, info={name: value for name, value in e.info.items() if name != "radius"}) for e in loaded]
+
     def _of_scene(self, scene: str, block: int) -> list[Episode]:
         """One block of episodes in one scene, numbered on from those before it."""
         made = generate(world(scene, self.backend), self.per_scene * (block + 1), self.seed)[self.per_scene * block :]
@@ -177,9 +188,12 @@ class ImageNav:
 
 
 def _shortest(trip: Trip) -> tuple[float, int]:
-    """Metres and primitives of an ideal run; measured where the episode file does not give them."""
+    """Metres and primitives of an ideal run, as the episode gives them; the one that it does not give is measured."""
     episode = trip.episode
-    if np.isfinite(episode.geodesic) and "ideal_primitives" in episode.info:
-        return episode.geodesic, int(episode.info["ideal_primitives"])
+    geodesic, ideal = episode.geodesic, episode.info.get("ideal_primitives")
+    if np.isfinite(geodesic) and ideal is not None:
+        return geodesic, int(ideal)
     path = np.asarray(trip.world.navmesh.shortest_path(episode.start_position, episode.goal_position), float)
-    return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()), ideal_primitives(path, episode.start_yaw)
+    if not np.isfinite(geodesic):
+        geodesic = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+    return geodesic, ideal_primitives(path, episode.start_yaw) if ideal is None else int(ideal)
