@@ -255,6 +255,51 @@ def test_the_cache_is_used_and_follows_its_sources(tmp_path: Path, own_cache: Pa
     assert not list((own_cache / "scenes").glob("*.tmp"))
 
 
+def write_textured(folder: Path, image: str) -> Path:
+    """A triangle that asks for a texture by name."""
+    folder.mkdir()
+    (folder / "m.mtl").write_text(f"newmtl a\nmap_Kd {image}\n")
+    (folder / "m.obj").write_text("mtllib m.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    return folder / "m.obj"
+
+
+def write_image(path: Path, size: int) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(cv2.imencode(".png", np.zeros((size, size, 3), np.uint8))[1].tobytes())
+
+
+def test_relative_folders_mean_those_of_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = write_textured(tmp_path / "mesh", "photo.png")
+    for size, name in enumerate(("a", "b"), start=1):
+        (tmp_path / name).mkdir()
+        write_image(tmp_path / name / "textures" / "photo.png", size)
+    time.sleep(0.02)
+    for size, name in enumerate(("a", "b"), start=1):
+        monkeypatch.chdir(tmp_path / name)
+        assert scenes.load(mesh, isolate=False, texture_folders=["textures"]).texture_bytes == 4 * size * size
+
+
+def test_a_relative_path_remembers_absolute_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mesh = write_textured(tmp_path / "mesh", "photo.png")
+    time.sleep(0.02)
+    monkeypatch.chdir(mesh.parent)
+    assert scenes.load("m.obj", isolate=False).texture_count == 0
+    write_image(mesh.parent / "photo.png", 2)
+    monkeypatch.chdir(tmp_path)
+    assert scenes.load(mesh, isolate=False).texture_count == 1
+
+
+def test_a_link_finds_the_textures_beside_it(tmp_path: Path) -> None:
+    mesh = write_textured(tmp_path / "mesh", "photo.png")
+    link = write_textured(tmp_path / "link", "photo.png")
+    link.unlink()
+    link.symlink_to(mesh)
+    write_image(link.parent / "photo.png", 2)
+    time.sleep(0.02)
+    assert scenes.load(mesh, isolate=False).texture_count == 0
+    assert scenes.load(link, isolate=False).texture_count == 1
+
+
 def test_a_damaged_cache_is_rebuilt_with_a_warning(
     tmp_path: Path, own_cache: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

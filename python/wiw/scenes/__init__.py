@@ -56,15 +56,15 @@ def load(
         FileError: naming file and cause: missing, damaged, unsupported or above the limits.
         ArgumentError: an option is out of its range.
     """
-    file = Path(path).expanduser()
+    file = Path(path).expanduser().absolute()  # the cache is shared by processes with other working folders
     if not file.is_file():
         raise FileError(f"{file}: no such file; expected a mesh or a Gazebo world")
     options = {
         "up": up,
         "ceiling": ceiling,
         "limits": limits or {},
-        "texture_folders": [str(Path(folder).expanduser()) for folder in texture_folders],
-        "model_folders": [str(Path(folder).expanduser()) for folder in model_folders],
+        "texture_folders": [str(Path(folder).expanduser().absolute()) for folder in texture_folders],
+        "model_folders": [str(Path(folder).expanduser().absolute()) for folder in model_folders],
     }
     scene = _load(file, options, cache, isolate)
     for warning in scene.warnings:

@@ -50,9 +50,10 @@ def folder() -> Path:
 def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sources]) -> _core.scene.Scene:
     """The scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
 
-    `build(path)` imports the scene and writes it to `path`.
+    `build(path)` imports the scene and writes it to `path`. Paths in `options` must be absolute. A link to a source
+    counts as another source: its textures are looked for beside the link.
     """
-    manifest = folder() / f"{_key([str(source.resolve()), options])}.json"
+    manifest = folder() / f"{_key([str(source.absolute()), options])}.json"
     known = _known(manifest)
     if known is not None:
         return known
@@ -62,14 +63,14 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
     try:
         sources = build(draft)
         entries = [_entry(path) for path in dict.fromkeys(sources.read)]
-        names = [os.path.relpath(entry["path"], source.parent) for entry in entries]
+        names = [os.path.relpath(entry["path"], source.absolute().parent) for entry in entries]
         scene = folder() / f"{_key([names, [entry['digest'] for entry in entries], options])}.wiwscene"
         draft.replace(scene)
     finally:
         draft.unlink(missing_ok=True)
     _trim(scene)
     if all(entry["mtime_ns"] < started for entry in entries):  # else a file may have changed while it was read
-        absent = [str(path) for path in dict.fromkeys(sources.absent)]
+        absent = [str(path.absolute()) for path in dict.fromkeys(sources.absent)]
         _write(manifest, {"scene": scene.name, "read": entries, "absent": absent})
     return _core.scene.map_cache(scene)
 
