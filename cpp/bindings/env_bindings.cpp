@@ -78,10 +78,10 @@ void bind_env(py::module_& module) {
 
   py::class_<NavigationEnv>(module, "NavigationEnv")
       .def(py::init([](std::shared_ptr<Renderer> renderer, std::shared_ptr<nav::NavMesh> navmesh,
-                       const NavigationConfig& config) {
-             return NavigationEnv({std::move(renderer), std::move(navmesh)}, config);
+                       std::shared_ptr<nav::Ground> ground, const NavigationConfig& config) {
+             return NavigationEnv({std::move(renderer), std::move(navmesh), std::move(ground)}, config);
            }),
-           py::arg("renderer"), py::arg("navmesh"), py::arg("config") = NavigationConfig{})
+           py::arg("renderer"), py::arg("navmesh"), py::arg("ground"), py::arg("config") = NavigationConfig{})
       .def("reset", &NavigationEnv::reset, py::arg("position"), py::arg("yaw"), py::arg("tolerance") = 0.3,
            "Puts the agent on the mesh at `position` (metres), heading `yaw` (radians, left positive).")
       .def(

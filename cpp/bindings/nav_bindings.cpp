@@ -10,6 +10,7 @@
 
 #include "arrays.hpp"
 #include "wiw/nav/distance_field.hpp"
+#include "wiw/nav/ground.hpp"
 #include "wiw/nav/nav_mesh.hpp"
 #include "wiw/nav/waypoints.hpp"
 
@@ -297,6 +298,28 @@ Lengths in metres, angles in degrees; the defaults are Habitat's. `region_min_si
   settings.def(py::self == py::self);
 }
 
+py::array_t<float> on_ground(const Ground& ground, const Array<float>& array) {
+  Points points = to_points(array, "points");
+  {
+    const py::gil_scoped_release release;
+    for (Eigen::Vector3f& point : points.values) {
+      point.y() = static_cast<float>(ground.height(point.cast<double>()));
+    }
+  }
+  return point_array(points, points.values);
+}
+
+void bind_ground(py::module_& module) {
+  py::class_<Ground, std::shared_ptr<Ground>>(module, "Ground", R"(Heights of the floor that is drawn.
+
+Recast rounds floors up by as much as a cell (0.2 m at Habitat's settings): points on a navigation mesh lie above the
+floor, by another amount in every scene. What stands or is seen from there has to be put down first.)")
+      .def(py::init<const Scene&>(), py::arg("scene"), py::call_guard<py::gil_scoped_release>())
+      .def("put_down", &on_ground, py::arg("points"),
+           "float32 [N, 3] (or [3]): points of a navigation mesh (metres) with the floor's height; the highest surface "
+           "from 0.45 m below to 0.1 m above counts. Points without any stay where they are.");
+}
+
 void bind_construction(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
   mesh.def_static("build", &NavMesh::build, py::arg("scene"), py::arg("settings") = NavMeshSettings{},
                   py::call_guard<py::gil_scoped_release>(),
@@ -377,6 +400,7 @@ void bind_queries(py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
 }
 
 void bind_fields(py::module_& module, py::class_<NavMesh, std::shared_ptr<NavMesh>>& mesh) {
+  bind_ground(module);
   py::class_<DistanceField>(module, "DistanceField",
                             "Exact distance to the nearest of fixed goals, made by NavMesh.distances_from.")
       .def(

@@ -12,6 +12,6 @@ A* finds, often a little too long, not symmetric, and infinite beyond 256 polygo
 search without that limit.
 """
 
-from wiw._core.nav import DistanceField, Island, NavMesh, NavMeshSettings, select_waypoints
+from wiw._core.nav import DistanceField, Ground, Island, NavMesh, NavMeshSettings, select_waypoints
 
-__all__ = ["DistanceField", "Island", "NavMesh", "NavMeshSettings", "select_waypoints"]
+__all__ = ["DistanceField", "Ground", "Island", "NavMesh", "NavMeshSettings", "select_waypoints"]

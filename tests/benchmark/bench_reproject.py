@@ -18,7 +18,7 @@ from harness import measure, report, spread
 from scipy import ndimage
 
 from wiw import panorama, reproject, scenes
-from wiw.nav import NavMesh
+from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
 
 SIZE = (576, 1024)
@@ -38,7 +38,7 @@ def hole_means(truth: np.ndarray, hole: np.ndarray) -> np.ndarray:
     return np.stack([ndimage.mean(truth[..., c], labels, of)[labels] for c in range(3)], -1)
 
 
-def free_poses(mesh: NavMesh, count: int, seed: int) -> list[np.ndarray]:
+def free_poses(mesh: NavMesh, ground: Ground, count: int, seed: int) -> list[np.ndarray]:
     """T_world_camera of places from which 1.6 m straight ahead is navigable all along."""
     rng = np.random.default_rng(seed)
     poses: list[np.ndarray] = []
@@ -48,7 +48,7 @@ def free_poses(mesh: NavMesh, count: int, seed: int) -> list[np.ndarray]:
         pose = start @ reproject.pose(yaw_deg=rng.uniform(-180, 180))
         path = np.stack([(pose @ reproject.pose(forward=0.2 * k))[:3, 3] for k in range(1, 9)])
         if np.all(mesh.is_navigable(path)):
-            pose[1, 3] += CAMERA_HEIGHT
+            pose[1, 3] = ground.put_down(point)[1] + CAMERA_HEIGHT
             poses.append(pose)
         if len(poses) == count:
             break
@@ -64,7 +64,7 @@ def main() -> None:
     for seed in range(APARTMENTS):
         scene = scenes.apartment(seed)
         renderer = Renderer(scene, "cpu")
-        for pose in free_poses(NavMesh.build(scene), POSES // APARTMENTS, seed):
+        for pose in free_poses(NavMesh.build(scene), Ground(scene), POSES // APARTMENTS, seed):
             seen = renderer.panorama(np.concatenate([pose[None], pose @ steps]), SIZE, outputs=("color", "depth"))
             color, depth = seen["color"], seen["depth"]
             shown = reproject.warp(color[:1], depth[:1], steps[None], outputs=("color", "hole"))

@@ -116,7 +116,15 @@ TEST_CASE("camera_poses_after is what stepping leads to, blocked steps included"
 TEST_CASE("the camera looks along the heading from 1 m above the floor") {
   const NavigationEnv env = env_at(1, 1, -kPi / 2);
   const Pose pose = env.T_world_camera();
-  CHECK((pose.translation() - env.position() - Vector3d(0, 1, 0)).norm() < 1e-12);
+  CHECK((pose.translation() - Vector3d(1, 1, 1)).norm() < 1e-6);  // the floor is at 0, the mesh 0.2 m above it
+  CHECK((env.position() - Vector3d(1, 0, 1)).norm() < 1e-6);
+  CHECK(world().navmesh->snap({1, 0, 1})->y() > 0.1f);
+  Pictures seen(env.config());
+  env.observe(seen.targets());
+  const Size size = env.config().panorama;
+  const double down = radians(90.0 - 90.0 / size.height);  // latitude of the lowest row's pixel centres
+  const std::size_t lowest = static_cast<std::size_t>(size.height - 1) * static_cast<std::size_t>(size.width);
+  CHECK(seen.depth[lowest] * std::sin(down) == doctest::Approx(1).epsilon(1e-4));
   CHECK((-pose.linear().col(2) - Vector3d(1, 0, 0)).norm() < 1e-12);
 }
 
@@ -136,6 +144,10 @@ TEST_CASE("starts off the mesh and worlds that lack a part are refused") {
   NavigationEnv env(world(), small_pictures());
   CHECK_THROWS_AS(env.reset({3, 0, 3}, 0), NavigationError);  // in the block
   CHECK_THROWS_AS(env.reset({50, 0, 50}, 0), NavigationError);
-  CHECK_THROWS_AS(NavigationEnv({nullptr, world().navmesh}, {}), ArgumentError);
-  CHECK_THROWS_AS(NavigationEnv({world().renderer, nullptr}, {}), ArgumentError);
+  CHECK_THROWS_AS(env.reset({1, 2, 1}, 0), NavigationError);  // no floor up there
+  CHECK_THROWS_AS(env.reset({1, 0, 1}, std::nan("")), ArgumentError);
+  CHECK_THROWS_AS(env.reset({1, 0, 1}, 0, std::nan("")), ArgumentError);
+  CHECK_THROWS_AS(NavigationEnv({nullptr, world().navmesh, world().ground}, {}), ArgumentError);
+  CHECK_THROWS_AS(NavigationEnv({world().renderer, nullptr, world().ground}, {}), ArgumentError);
+  CHECK_THROWS_AS(NavigationEnv({world().renderer, world().navmesh, nullptr}, {}), ArgumentError);
 }

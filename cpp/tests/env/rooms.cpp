@@ -20,7 +20,9 @@ World make_world(float shade) {
   add({2.5f, 0, 2}, {3.5f, 1.2f, 4}, {0.9f, 0.2f, shade});
   add({-0.1f, 0, 0}, {0, 2.5f, 4}, {shade, 0.7f, 0.2f});
   add({0, 0, -0.1f}, {6, 2.5f, 0}, {0.2f, shade, 0.8f});
-  return {make_renderer(builder.build(), Backend::kCpu), nav::NavMesh::from_triangles(soup.vertices, soup.triangles)};
+  const ScenePtr scene = builder.build();
+  return {make_renderer(scene, Backend::kCpu), nav::NavMesh::from_triangles(soup.vertices, soup.triangles),
+          std::make_shared<nav::Ground>(*scene)};
 }
 
 NavigationConfig small_pictures(Motion motion) {

@@ -9,6 +9,8 @@ namespace wiw {
 
 namespace {
 
+constexpr double kMaxLift = 0.5;  // metres that a floor and the mesh built on it may be apart
+
 double wrapped(double angle) { return std::remainder(angle, 2 * kPi); }
 
 std::string text_of(const Eigen::Vector3d& point) {
@@ -21,19 +23,25 @@ std::string text_of(const Eigen::Vector3d& point) {
 
 NavigationEnv::NavigationEnv(World world, const NavigationConfig& config) : world_(std::move(world)), config_(config) {
   config_.actions.check();
-  if (world_.renderer == nullptr || world_.navmesh == nullptr) {
-    throw ArgumentError("NavigationEnv: expected a renderer and a navigation mesh");
+  if (world_.renderer == nullptr || world_.navmesh == nullptr || world_.ground == nullptr) {
+    throw ArgumentError("NavigationEnv: expected a renderer, a navigation mesh and a ground");
   }
 }
 
 void NavigationEnv::reset(const Eigen::Vector3d& position, double yaw, double tolerance) {
+  if (!position.allFinite() || !std::isfinite(yaw) || !std::isfinite(tolerance)) {
+    throw ArgumentError("NavigationEnv.reset: expected finite numbers, got position " + text_of(position) + ", yaw " +
+                        std::to_string(yaw) + ", tolerance " + std::to_string(tolerance));
+  }
   const auto snapped = world_.navmesh->snap(position.cast<float>());
-  if (!snapped || (snapped->cast<double>() - position).norm() > tolerance) {
+  const Eigen::Vector3d away = snapped ? Eigen::Vector3d(snapped->cast<double>() - position) : Eigen::Vector3d::Zero();
+  if (!snapped || std::hypot(away.x(), away.z()) > tolerance || std::abs(away.y()) > kMaxLift) {
     throw NavigationError(
         "NavigationEnv.reset: " + text_of(position) + " is not on the navigation mesh (nearest point " +
         (snapped ? text_of(snapped->cast<double>()) : "none") + ", tolerance " + std::to_string(tolerance) + " m)");
   }
-  position_ = start_position_ = snapped->cast<double>();
+  stand_at(*snapped);
+  start_position_ = position_;
   start_yaw_ = yaw;
   turns_ = 0;
 }
@@ -46,14 +54,19 @@ bool NavigationEnv::step(Action action) {
   }
   if (action != Action::kForward) return false;
   const Eigen::Vector3d heading(-std::sin(yaw()), 0, -std::cos(yaw()));
-  const Eigen::Vector3d end = position_ + config_.actions.forward_m * heading;
-  const Eigen::Vector3d before = position_;
+  const Eigen::Vector3d end = on_mesh_ + config_.actions.forward_m * heading;
+  const Eigen::Vector3d before = on_mesh_;
   if (config_.motion == Motion::kSlide) {
-    position_ = world_.navmesh->try_step(position_.cast<float>(), end.cast<float>(), true).cast<double>();
+    stand_at(world_.navmesh->try_step(on_mesh_.cast<float>(), end.cast<float>(), true));
   } else if (world_.navmesh->is_navigable(end.cast<float>())) {
-    if (const auto snapped = world_.navmesh->snap(end.cast<float>())) position_ = snapped->cast<double>();
+    if (const auto snapped = world_.navmesh->snap(end.cast<float>())) stand_at(*snapped);
   }
-  return position_ != before;
+  return on_mesh_ != before;
+}
+
+void NavigationEnv::stand_at(const Eigen::Vector3f& on_mesh) {
+  on_mesh_ = position_ = on_mesh.cast<double>();
+  position_.y() = world_.ground->height(on_mesh_);
 }
 
 double NavigationEnv::yaw() const { return start_yaw_ + turns_ * config_.actions.turn_rad; }

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "wiw/action/action.hpp"
+#include "wiw/nav/ground.hpp"
 #include "wiw/nav/nav_mesh.hpp"
 #include "wiw/render/renderer.hpp"
 
@@ -20,7 +21,7 @@ enum class Motion {
 struct NavigationConfig {
   ActionSpace actions;
   Motion motion = Motion::kRefuse;
-  double camera_height = 1.0;  // metres above the floor
+  double camera_height = 1.0;  // metres above the floor that is drawn
   Size panorama{576, 1024};
   Size front{480, 480};
   double front_hfov = radians(90);
@@ -30,6 +31,7 @@ struct NavigationConfig {
 struct World {
   std::shared_ptr<Renderer> renderer;
   std::shared_ptr<const nav::NavMesh> navmesh;
+  std::shared_ptr<const nav::Ground> ground;
 };
 
 /// Where one observation is written; null members are not rendered.
@@ -46,12 +48,14 @@ class NavigationEnv {
  public:
   NavigationEnv(World world, const NavigationConfig& config);
 
-  /// Puts the agent on the mesh. Throws NavigationError when `position` is more than `tolerance` metres away from it.
+  /// Puts the agent on the mesh. Throws NavigationError when `position` is more than `tolerance` metres beside it or
+  /// more than kMaxLift above or below, ArgumentError when a number is not finite.
   void reset(const Eigen::Vector3d& position, double yaw, double tolerance = 0.3);
 
   /// Carries out one primitive; true if the pose changed. kNull and kStop change nothing.
   bool step(Action action);
 
+  /// Where the agent stands, on the floor.
   [[nodiscard]] const Eigen::Vector3d& position() const { return position_; }
   [[nodiscard]] double yaw() const;
   [[nodiscard]] Pose T_world_camera() const;
@@ -69,9 +73,12 @@ class NavigationEnv {
   [[nodiscard]] const NavigationConfig& config() const { return config_; }
 
  private:
+  void stand_at(const Eigen::Vector3f& on_mesh);
+
   World world_;
   NavigationConfig config_;
-  Eigen::Vector3d position_ = Eigen::Vector3d::Zero();
+  Eigen::Vector3d on_mesh_ = Eigen::Vector3d::Zero();   // the point that walks: Recast's heights, above the floor
+  Eigen::Vector3d position_ = Eigen::Vector3d::Zero();  // the same on the floor
   Eigen::Vector3d start_position_ = Eigen::Vector3d::Zero();
   double start_yaw_ = 0;
   int turns_ = 0;  // left positive, since reset

@@ -44,7 +44,7 @@ def generate(world: World, count: int, seed: int, rules: EpisodeRules = EpisodeR
 
 def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episode:
     key = core.fold_key([seed, index, 0x1A6E])
-    points = world.navmesh.sample(2 * rules.attempts, key)
+    points = world.ground.put_down(world.navmesh.sample(2 * rules.attempts, key))
     draws = core.uniform(core.fold_key([key, 1]), 5 * rules.attempts).reshape(-1, 5)
     for start, goal, draw in zip(points[::2], points[1::2], draws, strict=True):
         geodesic = float(world.navmesh.geodesic_distance(start, goal))

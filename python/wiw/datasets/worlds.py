@@ -7,7 +7,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 from typing import Literal
 
-from wiw.nav import NavMesh
+from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
 from wiw.scenes import Scene, open_scene
 
@@ -23,6 +23,8 @@ class World:
     scene: Scene
     renderer: Renderer
     navmesh: NavMesh
+    ground: Ground
+    """Heights of the floor; the mesh lies up to 0.2 m above it."""
 
 
 _worlds: OrderedDict[tuple[str, str], World] = OrderedDict()
@@ -35,7 +37,7 @@ def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
         _worlds.move_to_end(key)
         return _worlds[key]
     loaded = open_scene(scene)
-    made = World(scene, loaded, Renderer(loaded, backend=backend), NavMesh.build(loaded))
+    made = World(scene, loaded, Renderer(loaded, backend=backend), NavMesh.build(loaded), Ground(loaded))
     _worlds[key] = made
     while len(_worlds) > CAPACITY:
         _worlds.popitem(last=False)

@@ -42,6 +42,8 @@ class Trip:
 
     episode: Episode
     world: World
+    goal_position: NDArray[np.float64]
+    """On the floor, as the positions are."""
     positions: list[NDArray[np.float64]]
     """After each primitive, beginning with the start."""
     decisions: int = 0
@@ -58,16 +60,17 @@ class Trip:
 
     @property
     def travelled(self) -> float:
-        """Metres walked."""
-        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum()) if self.actions else 0.0
+        """Metres walked, measured horizontally as shortest paths are."""
+        steps = np.diff(self.positions, axis=0).reshape(-1, 3)
+        return float(np.hypot(steps[:, 0], steps[:, 2]).sum())
 
     def distance_to_goal(self) -> float:
         """Straight-line metres from the agent to the goal's position."""
-        return float(np.linalg.norm(self.positions[-1] - np.asarray(self.episode.goal_position)))
+        return float(np.linalg.norm(self.positions[-1] - self.goal_position))
 
     def geodesic_to_goal(self) -> float:
         """Metres of the shortest walk to the goal; inf when it cannot be reached."""
-        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.episode.goal_position))
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.goal_position))
 
     def truth(self, yaw: float) -> Truth:
         """Where the agent truly is, heading `yaw` radians."""
@@ -89,9 +92,10 @@ def start(task: NavigationTask, episode: Episode) -> tuple[Any, Trip, Goal]:
     """The simulator at the start of an episode, its record, and what the agent is asked to reach."""
     place = world(episode.scene, task.backend)
     config = _env.NavigationConfig(motion=_env.Motion.__members__[task.motion])
-    core = _env.NavigationEnv(place.renderer.core, place.navmesh, config)
+    core = _env.NavigationEnv(place.renderer.core, place.navmesh, place.ground, config)
     core.reset(np.asarray(episode.start_position), episode.start_yaw)
-    return core, Trip(episode, place, [core.position]), task.goal(place, episode)
+    goal_position = place.ground.put_down(episode.goal_position).astype(np.float64)
+    return core, Trip(episode, place, goal_position, [core.position]), task.goal(place, episode)
 
 
 def outputs(depth: bool) -> list[str]:

@@ -28,7 +28,7 @@ def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") 
     """One row a scene: seen from above, then `views` panoramas from places far apart.
 
     Args:
-        worlds: loaded scenes with "name", "scene", "renderer" and "navmesh".
+        worlds: loaded scenes with "name", "scene", "renderer", "navmesh" and "ground".
         views: panoramas of each.
         backend: of the renderer that draws from above.
     """
@@ -43,7 +43,7 @@ def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") 
 
 
 def _row(world: Any, views: int, backend: str) -> Image.Image:
-    places = _spread(world.navmesh, views)
+    places = _spread(world, views)
     pictures = [_from_above(world, float(places[0][1]), backend)] + [_panorama(world, place) for place in places]
     row = Image.new("RGB", (sum(p.width + GAP for p in pictures) - GAP, CAPTION + HEIGHT), PAPER)
     ImageDraw.Draw(row).text((0, 2), short_name(world.name), INK, ImageFont.load_default(16))
@@ -54,9 +54,9 @@ def _row(world: Any, views: int, backend: str) -> Image.Image:
     return row
 
 
-def _spread(navmesh: Any, count: int) -> NDArray[np.float64]:
+def _spread(world: Any, count: int) -> NDArray[np.float64]:
     """Places on the largest island, the first amid the others, each next one as far from those before as can be."""
-    points = np.asarray(navmesh.sample(256, 1), np.float64)
+    points = np.asarray(world.ground.put_down(world.navmesh.sample(256, 1)), np.float64)
     chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
     while len(chosen) < max(1, count):
         nearest = np.min([np.linalg.norm(points - points[i], axis=1) for i in chosen], axis=0)

@@ -143,7 +143,7 @@ class ImageNav:
 
     def goal(self, place: World, episode: Episode) -> Goal:
         """The goal image: front view at the goal's pose."""
-        pose = camera_pose(np.asarray(episode.goal_position), episode.goal_yaw)
+        pose = camera_pose(place.ground.put_down(episode.goal_position), episode.goal_yaw)
         image = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("color",))["color"][0]
         return Goal(self.name, image=image)
 
@@ -193,7 +193,6 @@ def _shortest(trip: Trip) -> tuple[float, int]:
     geodesic, ideal = episode.geodesic, episode.info.get("ideal_primitives")
     if np.isfinite(geodesic) and ideal is not None:
         return geodesic, int(ideal)
-    path = np.asarray(trip.world.navmesh.shortest_path(episode.start_position, episode.goal_position), float)
-    if not np.isfinite(geodesic):
-        geodesic = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    return geodesic, ideal_primitives(path, episode.start_yaw) if ideal is None else int(ideal)
+    path, length = trip.world.navmesh.shortest_path(episode.start_position, episode.goal_position, return_length=True)
+    primitives = ideal_primitives(np.asarray(path, float), episode.start_yaw) if ideal is None else int(ideal)
+    return geodesic if np.isfinite(geodesic) else length, primitives

@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/nav/ground.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <numeric>
+#include <optional>
+
+namespace wiw::nav {
+
+namespace {
+
+constexpr double kBelow = 0.45, kAbove = 0.1;  // metres
+constexpr float kLeastUpright = 0.3f;          // |y| of a unit normal: slopes of up to 72 degrees
+constexpr double kMostCells = 4e6;
+
+/// Height of the triangle's plane at (x, z) where that lies in the triangle, edges included.
+std::optional<double> height_at(const Eigen::Matrix3f& corners, double x, double z) {
+  const Eigen::Vector2d a(corners(0, 0), corners(2, 0)), p(x, z);
+  const Eigen::Vector2d u = Eigen::Vector2d(corners(0, 1), corners(2, 1)) - a;
+  const Eigen::Vector2d v = Eigen::Vector2d(corners(0, 2), corners(2, 2)) - a;
+  const auto cross = [](const Eigen::Vector2d& s, const Eigen::Vector2d& t) { return s.x() * t.y() - s.y() * t.x(); };
+  const double area = cross(u, v);
+  const double s = cross(p - a, v) / area, t = cross(u, p - a) / area;
+  constexpr double kMargin = 1e-6;  // so that no seam lets the agent fall through
+  if (!(s >= -kMargin && t >= -kMargin && s + t <= 1 + kMargin)) return std::nullopt;
+  return corners(1, 0) + s * (corners(1, 1) - corners(1, 0)) + t * (corners(1, 2) - corners(1, 0));
+}
+
+bool level(const Eigen::Matrix3f& corners) {
+  const Eigen::Vector3f normal = (corners.col(1) - corners.col(0)).cross(corners.col(2) - corners.col(0));
+  return std::abs(normal.y()) > kLeastUpright * normal.norm();  // false for a triangle without area
+}
+
+}  // namespace
+
+Ground::Ground(const TriangleSoup& soup) {
+  Eigen::AlignedBox2f box;
+  for (const auto& triangle : soup.triangles) {
+    Triangle corners;
+    for (int k = 0; k < 3; ++k) corners.col(k) = soup.vertices[triangle[k]];
+    if (!level(corners)) continue;
+    triangles_.push_back(corners);
+    for (int k = 0; k < 3; ++k) box.extend(Eigen::Vector2f(corners(0, k), corners(2, k)));
+  }
+  if (triangles_.empty()) return;
+  origin_ = box.min();
+  const Eigen::Vector2d size = box.sizes().cast<double>();
+  cell_ = std::max(cell_, std::sqrt(size.x() * size.y() / kMostCells));
+  cells_ = (size / cell_).array().floor().cast<int>() + 1;
+
+  // Counting sort: first how many triangles touch each cell, then where they go.
+  first_.assign(static_cast<std::size_t>(cells_.prod()) + 1, 0);
+  const auto for_cells = [this](const Triangle& corners, auto&& visit) {
+    const Eigen::Vector3f low = corners.rowwise().minCoeff(), high = corners.rowwise().maxCoeff();
+    const Eigen::Vector2i from = cell_of(low.x(), low.z()), to = cell_of(high.x(), high.z());
+    for (int row = from.y(); row <= to.y(); ++row) {
+      for (int column = from.x(); column <= to.x(); ++column) visit(slot(column, row));
+    }
+  };
+  for (const Triangle& corners : triangles_) for_cells(corners, [this](std::size_t cell) { ++first_[cell + 1]; });
+  std::partial_sum(first_.begin(), first_.end(), first_.begin());
+  entries_.resize(first_.back());
+  std::vector<std::uint32_t> next(first_.begin(), first_.end() - 1);
+  for (std::uint32_t i = 0; i < triangles_.size(); ++i) {
+    for_cells(triangles_[i], [&](std::size_t cell) { entries_[next[cell]++] = i; });
+  }
+}
+
+double Ground::height(const Eigen::Vector3d& point) const {
+  if (triangles_.empty()) return point.y();
+  const Eigen::Vector2i cell = cell_of(point.x(), point.z());
+  const std::size_t at = slot(cell.x(), cell.y());
+  std::optional<double> best;
+  for (std::uint32_t i = first_[at]; i < first_[at + 1]; ++i) {
+    const auto height = height_at(triangles_[entries_[i]], point.x(), point.z());
+    if (!height || *height < point.y() - kBelow || *height > point.y() + kAbove) continue;
+    best = std::max(*height, best.value_or(*height));
+  }
+  return best.value_or(point.y());
+}
+
+Eigen::Vector2i Ground::cell_of(double x, double z) const {
+  const Eigen::Vector2d offset = (Eigen::Vector2d(x, z) - origin_.cast<double>()) / cell_;
+  const Eigen::Array2d last = (cells_.array() - 1).cast<double>();
+  return offset.array().floor().max(0.0).min(last).cast<int>();
+}
+
+std::size_t Ground::slot(int column, int row) const {
+  return static_cast<std::size_t>(row) * static_cast<std::size_t>(cells_.x()) + static_cast<std::size_t>(column);
+}
+
+}  // namespace wiw::nav
