@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <DetourNavMesh.h>
 #include <doctest/doctest.h>
 #include <unistd.h>
 
@@ -36,6 +37,14 @@ void write_all(const std::string& path, const Bytes& bytes) {
       .write(bytes.data(), static_cast<std::streamsize>(bytes.size()));
 }
 
+std::shared_ptr<NavMesh> two_blocks() {
+  test::Soup soup;
+  soup.floor(0, 0, 6, 5);
+  soup.block(2, 1, 3, 4);
+  soup.block(4, 0, 4.5f, 3);
+  return NavMesh::from_triangles(soup.vertices, soup.triangles);
+}
+
 /// Replaces a few bytes or words with small, huge, negative or random values, or cuts the file short.
 Bytes damage(Bytes bytes, Rng& rng) {
   if (rng.chance(0.1)) bytes.resize(rng.below(static_cast<std::uint32_t>(bytes.size())));
@@ -48,6 +57,67 @@ Bytes damage(Bytes bytes, Rng& rng) {
   }
   return bytes;
 }
+
+/// An array of the tile: its count in the tile's header, and the bytes of one element.
+struct Array {
+  int dtMeshHeader::* count;
+  std::size_t size;
+};
+const std::vector<Array> kArrays{
+    {&dtMeshHeader::vertCount, 3 * sizeof(float)},       {&dtMeshHeader::polyCount, sizeof(dtPoly)},
+    {&dtMeshHeader::maxLinkCount, sizeof(dtLink)},       {&dtMeshHeader::detailMeshCount, sizeof(dtPolyDetail)},
+    {&dtMeshHeader::detailVertCount, 3 * sizeof(float)}, {&dtMeshHeader::detailTriCount, 4},
+    {&dtMeshHeader::bvNodeCount, sizeof(dtBVNode)},      {&dtMeshHeader::offMeshConCount, sizeof(dtOffMeshConnection)}};
+
+/// A file of version 1 as its parts, so that an array can change its length and everything behind it moves.
+class TileFile {
+ public:
+  explicit TileFile(const Bytes& file) : front_(file.begin(), file.begin() + kTileAt) {
+    std::memcpy(&header, file.data() + kTileAt, sizeof header);
+    auto at = file.begin() + kTileAt + sizeof(dtMeshHeader);
+    for (const Array& array : kArrays) {
+      const auto bytes = static_cast<std::ptrdiff_t>(static_cast<std::size_t>(header.*array.count) * array.size);
+      arrays_.emplace_back(at, at + bytes);
+      at += bytes;
+    }
+    REQUIRE(at == file.end());
+  }
+
+  /// Cuts an array, or appends zeros to it.
+  void resize(std::size_t array, int count) {
+    header.*kArrays[array].count = count;
+    arrays_[array].resize(static_cast<std::size_t>(count) * kArrays[array].size);
+  }
+
+  [[nodiscard]] Bytes bytes() const {
+    Bytes tile(sizeof header);
+    std::memcpy(tile.data(), &header, sizeof header);
+    for (const Bytes& array : arrays_) tile.insert(tile.end(), array.begin(), array.end());
+    Bytes file = front_;
+    const auto size = static_cast<std::int32_t>(tile.size());
+    std::memcpy(file.data() + kTileAt - sizeof size, &size, sizeof size);
+    file.insert(file.end(), tile.begin(), tile.end());
+    return file;
+  }
+
+  /// Sides that two polygons share.
+  [[nodiscard]] int shared_sides() const {
+    int sides = 0;
+    for (std::size_t at = 0; at < arrays_[1].size(); at += sizeof(dtPoly)) {
+      dtPoly polygon;
+      std::memcpy(&polygon, arrays_[1].data() + at, sizeof polygon);
+      for (int k = 0; k < polygon.vertCount; ++k) sides += polygon.neis[k] != 0;
+    }
+    return sides;
+  }
+
+  dtMeshHeader header{};
+
+ private:
+  static constexpr std::ptrdiff_t kTileAt = 48;  // behind the header of the file and the tile's reference and size
+  Bytes front_;
+  std::vector<Bytes> arrays_;
+};
 
 /// Asks everything that follows indices of the file.
 void use(const NavMesh& mesh) {
@@ -65,12 +135,8 @@ void use(const NavMesh& mesh) {
 }  // namespace
 
 TEST_CASE("a damaged file is refused with its name, or what is left of it can be used safely") {
-  test::Soup soup;
-  soup.floor(0, 0, 6, 5);
-  soup.block(2, 1, 3, 4);
-  soup.block(4, 0, 4.5f, 3);
   const std::string path = scratch_file("fuzz.navmesh");
-  const auto good = NavMesh::from_triangles(soup.vertices, soup.triangles);
+  const auto good = two_blocks();
   Rng rng(20);
   int refused = 0;
   for (const int version : {1, 2}) {
@@ -87,6 +153,47 @@ TEST_CASE("a damaged file is refused with its name, or what is left of it can be
     }
   }
   CHECK(refused > 500);
+  std::filesystem::remove(path);
+}
+
+TEST_CASE("a file whose counts and length agree on too much or too little is refused, or can be used safely") {
+  const std::string path = scratch_file("counts.navmesh");
+  two_blocks()->save(path, 1);
+  const TileFile good(read_all(path));
+  const auto usable = [&](const TileFile& file) {
+    write_all(path, file.bytes());
+    try {
+      use(*NavMesh::load(path));
+      return true;
+    } catch (const FileError& error) {
+      CHECK(std::string(error.what()).starts_with(path));
+      return false;
+    }
+  };
+  REQUIRE(usable(good));
+  int refused = 0;
+  for (std::size_t array = 0; array < kArrays.size(); ++array) {
+    const int count = good.header.*kArrays[array].count;
+    for (const int wrong : {0, 1, count / 2, count - 1, count + 1, 2 * count + 7}) {
+      if (wrong < 0) continue;
+      TileFile file = good;
+      file.resize(array, wrong);
+      refused += !usable(file);
+      file.resize(1, wrong);  // polygons and their height detail, which must be as many
+      file.resize(3, wrong);
+      refused += !usable(file);
+    }
+  }
+  CHECK(refused > 60);
+
+  const int needed = good.shared_sides();
+  REQUIRE(needed > 4);
+  for (const int links : {0, 1, needed - 1, needed, needed + 1}) {
+    TileFile file = good;
+    file.resize(2, links);
+    CAPTURE(links);
+    CHECK(usable(file) == (links >= needed));
+  }
   std::filesystem::remove(path);
 }
 

@@ -3,6 +3,7 @@
 
 #include <DetourNavMesh.h>
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <vector>
@@ -101,6 +102,18 @@ std::string check_polygon(const Tile& tile, const dtPoly& polygon) {
   return "";
 }
 
+// Detour makes a link for each side with a neighbour and takes them from the room the tile sets aside, whose last one
+// it marks without asking whether there is one.
+std::string check_links(const Tile& tile) {
+  int sides = 0;
+  for (const dtPoly& polygon : tile.polygons) {
+    for (int k = 0; k < polygon.vertCount; ++k) sides += polygon.neis[k] != 0;
+  }
+  if (tile.header.maxLinkCount >= std::max(1, sides)) return "";
+  return "expected room for at least " + std::to_string(std::max(1, sides)) +
+         " links, one for each side that two polygons share, got " + std::to_string(tile.header.maxLinkCount);
+}
+
 std::string check_detail(const Tile& tile, const dtPolyDetail& detail, int corners) {
   const auto vertices = static_cast<std::uint64_t>(detail.vertBase) + detail.vertCount;
   const auto triangles = static_cast<std::uint64_t>(detail.triBase) + detail.triCount;
@@ -153,6 +166,7 @@ std::string find_tile_fault(std::span<const std::uint8_t> bytes) {
     if (fault.empty()) fault = check_detail(tile, tile.details[i], tile.polygons[i].vertCount);
     if (!fault.empty()) return "polygon " + std::to_string(i) + ": " + fault;
   }
+  if (std::string fault = check_links(tile); !fault.empty()) return fault;
   return check_tree(tile);
 }
 
