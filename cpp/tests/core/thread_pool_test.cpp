@@ -2,12 +2,53 @@
 #include "wiw/core/thread_pool.hpp"
 
 #include <doctest/doctest.h>
+#include <sys/resource.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 #include <atomic>
+#include <fstream>
 #include <stdexcept>
 #include <thread>
 
 using namespace wiw;
+
+// The sanitisers' own memory for each thread does not stand a limit.
+#if !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
+namespace {
+
+/// Leaves this process room for a few more stacks of threads.
+rlimit limit_memory() {
+  std::size_t pages = 0;
+  std::ifstream("/proc/self/statm") >> pages;
+  rlimit before{};
+  getrlimit(RLIMIT_AS, &before);
+  rlimit stack{};
+  getrlimit(RLIMIT_STACK, &stack);
+  const rlim_t each = stack.rlim_cur == RLIM_INFINITY ? rlim_t{2} << 20 : stack.rlim_cur;
+  const rlimit tight{pages * static_cast<rlim_t>(sysconf(_SC_PAGESIZE)) + 6 * each + each / 2, before.rlim_max};
+  setrlimit(RLIMIT_AS, &tight);
+  return before;
+}
+
+}  // namespace
+
+TEST_CASE("where the machine refuses threads, those that started do the work") {
+  const pid_t child = fork();
+  if (child == 0) {
+    const rlimit before = limit_memory();
+    ThreadPool pool(400);
+    setrlimit(RLIMIT_AS, &before);
+    std::atomic<int> visits{0};
+    pool.parallel_for(1000, [&](std::size_t) { ++visits; });
+    _exit(pool.size() > 1 && pool.size() < 20 && visits == 1000 ? 0 : 1);
+  }
+  int status = 0;
+  waitpid(child, &status, 0);
+  CHECK(WIFEXITED(status));
+  CHECK(WEXITSTATUS(status) == 0);
+}
+#endif
 
 TEST_CASE("every index is visited exactly once, from any number of threads") {
   for (const int threads : {1, 2, 4}) {

@@ -55,7 +55,11 @@ struct ThreadPool::Job {
 ThreadPool::ThreadPool(int threads) {
   if (threads < 1) throw ArgumentError("ThreadPool: expected at least 1 thread, got " + std::to_string(threads));
   workers_.reserve(static_cast<std::size_t>(threads) - 1);
-  for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { work(); });
+  try {
+    for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { work(); });
+  } catch (const std::exception&) {  // std::system_error or std::bad_alloc
+    // The machine refuses more threads (a limit on processes or memory): those that started share the work.
+  }
 }
 
 ThreadPool::~ThreadPool() {

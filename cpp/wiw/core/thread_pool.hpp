@@ -14,7 +14,7 @@ namespace wiw {
 /// shared, spinning at a barrier costs more than the work. The caller takes part in the work.
 class ThreadPool {
  public:
-  /// `threads` counts the caller; 1 runs everything inline.
+  /// `threads` counts the caller; 1 runs everything inline. The pool is smaller where the machine refuses that many.
   explicit ThreadPool(int threads);
   ~ThreadPool();
   ThreadPool(const ThreadPool&) = delete;
