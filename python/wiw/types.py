@@ -88,7 +88,8 @@ class Control:
     """float64 [K, 4, 4]: T_start_camera after each action; start is the camera of frame 0."""
     text: str = ""
     ids: NDArray[np.generic] | None = None
-    """[K] or [K + 1] ids or vectors in the model's own vocabulary, null token in front where it needs one."""
+    """[K] or [K + 1] ids or vectors in the model's own vocabulary (else primitive ids), null token in front where it
+    needs one; None unless the model reads actions."""
     length: int = 0
     """Actions that are the agent's own; the rest is padding."""
     shared: int = 0
@@ -142,7 +143,7 @@ class Decision:
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time by stage: propose, platform, world_model, revise."""
     calls: Mapping[str, int] = field(default_factory=dict)
-    """Counts: rows and frames asked of the world model."""
+    """Counts: rows and frames asked of the world model for this episode."""
     note: str = ""
 
 

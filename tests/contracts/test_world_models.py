@@ -96,8 +96,10 @@ def test_a_stranger_adds_a_model_in_one_file(strangers_package: Path, two_rooms:
     brightness = rollouts[0][0].frames.mean((1, 2, 3))
     assert brightness[0] > brightness[2]
     task = ImageNav(scenes=two_rooms, decisions=2)
-    log = wiw.evaluate(task.environment(), wiw.Agent("matcher", "fog"), episodes=2, progress=False)
-    assert len(log.episodes) == 2
+    out = strangers_package / "run"
+    log = wiw.evaluate(task.environment(), wiw.Agent("matcher", "fog"), episodes=2, progress=False, out=out)
+    assert [episode["status"] for episode in log.episodes] == ["done", "done"]
+    assert all(decision["calls"]["rows"] > 0 for decision in log.decisions)
 
 
 def test_or_names_a_class_in_a_file(tmp_path: Path, two_rooms: str) -> None:

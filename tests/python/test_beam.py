@@ -230,6 +230,5 @@ def test_what_cannot_be_searched_deeper_says_so() -> None:
         with pytest.raises(ArgumentError, match="depth and width >= 1"):
             wiw.Agent(Wanderer(), "copy", **wrong)
     assert wiw.Agent(Wanderer(), depth=2).decide_batch([query(0, 9)])[0].rollouts is None  # nothing is imagined
-    short = wiw.Agent(Wanderer(), model_of(frames=3, needs=("depth",)), None, 3, 4, depth=2)
     with pytest.raises(ArgumentError, match="needs depth"):
-        short.decide_batch([query(0, 9)])
+        wiw.Agent(Wanderer(), model_of(frames=3, needs=("depth",)), None, 3, 4, depth=2)

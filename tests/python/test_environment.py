@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,9 +11,11 @@ from gymnasium.utils.env_checker import check_env
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.datasets import episodes as episode_files
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
 from wiw.envs.trip import PRIMITIVES
 from wiw.errors import ArgumentError
+from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode
 
 
@@ -203,3 +206,49 @@ def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
         records.append([np.concatenate([np.ravel(x[0]) for x in seen]), seen[0][1:]])
     np.testing.assert_array_equal(records[0][0], records[1][0])
     assert records[0][1] == records[1][1]
+
+
+def test_every_step_names_the_next_decision(two_rooms: str) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=3)
+    _, info = env.reset(options={"episode": 2})
+    keys = [info["key"]]
+    for _ in range(3):
+        keys.append(env.step(1)[-1]["key"])
+    assert [(key.episode, key.decision) for key in keys] == [(2, 0), (2, 1), (2, 2), (2, 3)]
+
+
+def test_a_loop_by_hand_is_the_loop_of_evaluate(two_rooms: str, tmp_path: Path) -> None:
+    env = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=4)
+    agent = wiw.Agent("matcher", "copy")
+    observation, info = env.reset(options={"episode": 0})
+    key, executed, over = info["key"], [], False
+    while not over:
+        decision = agent.decide(observation, env.unwrapped.goal, key=key)
+        segment = env.unwrapped.run(decision.actions[: decision.execute])
+        executed.append(segment.executed.tolist())
+        observation, key, over = segment.observation, segment.key, segment.terminated or segment.truncated
+    log = wiw.evaluate(env, wiw.Agent("matcher", "copy"), episodes=1, out=tmp_path / "run", progress=False)
+    assert [row["executed"] for row in log.decisions] == executed
+
+
+def test_episodes_are_counted_round(two_rooms: str, tmp_path: Path) -> None:
+    task = ImageNav(scenes=two_rooms)
+    file = tmp_path / "three.json"
+    episode_files.save(file, task.episodes(3), "imagenav")
+    env = wiw.make("ImageNav-v0", episode_file=file)
+    assert env.unwrapped.task.size == 3 and task.size is None
+    episodes = [env.reset(seed=seed)[1]["key"].episode for seed in range(8)]
+    assert set(episodes) <= {0, 1, 2} and len(set(episodes)) > 1
+    env.reset(options={"episode": 2})
+    assert env.reset()[1]["key"].episode == 0
+    with pytest.raises(ArgumentError, match="at least 0"):
+        env.reset(options={"episode": -1})
+
+
+def test_the_number_of_decisions_does_not_shrink_with_a_longer_horizon(two_rooms: str) -> None:
+    task = ImageNav(scenes=two_rooms, decisions=4)
+    env = task.environment()
+    env.begin(task.episode(0))
+    for decision in range(4):
+        segment = env.run([int(TURN_LEFT)] * 9)
+        assert len(segment.executed) == 9 and segment.truncated == (decision == 3)

@@ -117,9 +117,9 @@ def test_an_arm_may_have_a_policy_of_its_own():
         "heuristic": AgentRecipe("heuristic", horizon=7),
         "climber+Mine": AgentRecipe("climber", "x/a+b.py:Mine", horizon=7),
     }
-    ready = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])[
-        "heuristic+copy"
-    ].build()
+    ready = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])["heuristic+copy"].build(
+        {}
+    )
     assert type(ready.policy).__name__ == "Heuristic" and ready.candidates == 4 and ready.model is not None
 
 
@@ -255,3 +255,21 @@ def test_an_unknown_part_is_named_before_a_run_begins(tmp_path):
     for wrong in ("candidates", "horizon", "depth", "width"):
         with pytest.raises(ArgumentError, match=f"{wrong} of at least 1"):
             AgentRecipe("heuristic", **{wrong: 0})
+
+
+def test_rules_of_the_task_reach_an_agent_in_memory(two_rooms, tmp_path):
+    log = wiw.evaluate(
+        "imagenav", wiw.Agent("heuristic"), 1, out=tmp_path / "run", progress=False, scenes=two_rooms, decisions=1,
+        candidates=2, horizon=9, execute=7,
+    )  # fmt: skip
+    row = log.decisions[0]
+    assert len(row["executed"]) == 7 and len(row["proposals"]) <= 2
+    assert "execute" not in log.store.config["arms"][0]["agent"]
+    assert log.store.info["built"][log.arms[0]]["horizon"] == 9
+
+
+def test_a_run_that_begins_with_the_same_failure_stops_and_says_so(tmp_path):
+    task = LineTask(broken=frozenset(f"{i:04d}" for i in range(12)))
+    with pytest.raises(InfrastructureError, match=r"first 5 episodes of arm .* failed alike.*no such scene"):
+        run_arms(task, {"a": LineAgent()}, episodes=12, out=tmp_path / "run", progress=False)
+    assert len(wiw.load_run(tmp_path / "run").episodes) == 5

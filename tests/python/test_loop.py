@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import wiw
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw._core import core
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
@@ -24,6 +25,9 @@ class Recorder:
 
     def episode(self, result) -> None:
         self.results[result.episode] = result
+
+    def again(self, episodes) -> None:
+        self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
 
 class Stamp(wiw.WorldModel):
@@ -146,6 +150,124 @@ def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) 
     states = {i: r.status for i, r in recorder.results.items()}
     assert states == {0: "failed", 1: "done", 2: "done"}
     assert "server is gone" in recorder.results[0].error and not recorder.results[0].metrics
+
+
+@pytest.mark.parametrize("live", [1, 2, 4])
+def test_what_fails_does_not_depend_on_what_else_is_live(task: ImageNav, live: int) -> None:
+    class Picky(Stamp):
+        """Cannot stand the third decision of episode 1."""
+
+        def rollout(self, observations, controls, seeds):
+            bad = {core.fold_key([0, 1, 2, c]) for c in range(4)}
+            if bad & set(seeds.tolist()):
+                raise RuntimeError("not this one")
+            return super().rollout(observations, controls, seeds)
+
+    recorder = run(task, wiw.Agent(Greedy(), Picky()), count=4, live=live)
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done", 3: "done"}
+    assert "not this one" in recorder.results[1].error
+    clean = run(task, wiw.Agent(Greedy(), Stamp()), count=4, live=1)
+    for (episode, index), record in recorder.decisions.items():
+        np.testing.assert_array_equal(record.executed, clean.decisions[episode, index].executed)
+    for episode in (0, 2, 3):
+        assert recorder.results[episode].metrics == clean.results[episode].metrics
+    assert max(index for episode, index in recorder.decisions if episode == 1) == 1
+
+
+class Careless(Greedy):
+    """Answers with whatever it was made with."""
+
+    def __init__(self, proposals=None, scores=None, plan=None) -> None:
+        self.proposed, self.scored, self.plan = proposals, scores, plan
+
+    def propose(self, situations, candidates, horizon):
+        good = super().propose(situations, candidates, horizon)
+        return good if self.proposed is None else self.proposed
+
+    def score(self, situations, proposals, rollouts):
+        good = super().score(situations, proposals, rollouts)
+        return good if self.scored is None else self.scored
+
+    def revise(self, situation, proposals, scores):
+        return super().revise(situation, proposals, scores) if self.plan is None else (self.plan, None)
+
+
+@pytest.mark.parametrize(
+    ("careless", "said"),
+    [
+        (Careless([]), "each of 1 episodes"),
+        (Careless([[]]), "1 to 3 plans"),
+        (Careless([[Proposal([FORWARD])] * 4]), "1 to 3 plans for an episode, got 4"),
+        (Careless([[Proposal([FORWARD] * 6)]]), "1 to 5 primitives"),
+        (Careless([[Proposal([])]]), "1 to 5 primitives"),
+        (Careless([[Proposal([7])]]), r"got \[7\]"),
+        (Careless([[[FORWARD]]]), "wiw.types.Proposal"),
+        (Careless(scores=[np.array([1.0])]), "3 finite numbers"),
+        (Careless(scores=[np.array([1.0, np.nan, 0.0])]), "finite"),
+        (Careless(scores=[]), "each of 1 episodes"),
+        (Careless(plan=[]), "1 to 5 primitives"),
+        (Careless(plan=[FORWARD] * 9), "1 to 5 primitives"),
+    ],
+)
+def test_policies_are_held_to_their_contract(task: ImageNav, careless: Careless, said: str) -> None:
+    with pytest.raises(ContractError, match=said):
+        run(task, wiw.Agent(careless, Stamp()), count=1)
+
+
+def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
+    def model(**declared):
+        return type("Odd", (Stamp,), {"accepts": wiw.accepts(**{"control": "trajectory", **declared})})()
+
+    for declared, said in [
+        ({"needs": ("history",)}, "needs history"),
+        ({"needs": ("depth", "semantic")}, "needs semantic"),
+        ({"needs": ("simulator",)}, "oracle alone"),
+        ({"space": "pose7"}, "discrete primitives"),
+        ({"needs": ("depth",), "frames": 4}, "have up to 5"),
+    ]:
+        with pytest.raises(ArgumentError, match=said):
+            wiw.Agent(Greedy(), model(**declared))
+    wiw.Agent(Greedy(), model(needs=("depth",), frames=4), horizon=3)
+    with pytest.raises(ArgumentError, match="size"):
+        wiw.accepts(control="image", size=(480,))
+    with pytest.raises(ArgumentError, match="TextTemplate"):
+        wiw.accepts(control="text", template="prompt.txt")
+
+
+def test_a_model_gets_its_own_words_and_numbers(task: ImageNav) -> None:
+    class Talker(Stamp):
+        accepts = wiw.accepts(control="text", template=TextTemplate(prompt="Walk: {actions}!"))
+
+        def rollout(self, observations, controls, seeds):
+            assert all(control.text.startswith("Walk: ") and control.ids is None for control in controls)
+            return super().rollout(observations, controls, seeds)
+
+    class Numbers(Stamp):
+        accepts = wiw.accepts(control="action", null_first=True)
+
+        def rollout(self, observations, controls, seeds):
+            assert all(control.ids.tolist() == [0, *control.actions.tolist()] for control in controls)
+            return super().rollout(observations, controls, seeds)
+
+    for model in (Talker(), Numbers()):
+        assert run(task, wiw.Agent(Greedy(), model), count=1).results[0].status == "done"
+
+
+def test_costs_are_each_episodes_own(task: ImageNav) -> None:
+    def costs(live):
+        recorder = run(task, wiw.Agent(Greedy(), Stamp()), count=3, live=live)
+        return {name: record.decision.calls for name, record in recorder.decisions.items()}
+
+    assert costs(1) == costs(3) and costs(1)[0, 0]["rows"] == 2  # two begin with turns
+
+
+def test_a_task_settles_what_an_agent_leaves_open() -> None:
+    agent = wiw.Agent(Greedy(), Stamp(), candidates=2)
+    settled = agent.settled({"candidates": 4, "horizon": 7, "execute": -2})
+    assert (settled.candidates, settled.horizon, settled.execute) == (2, 7, -2)
+    own = wiw.Agent(Greedy(), horizon=9).settled({"candidates": 4, "horizon": 5, "execute": 3})
+    assert (own.candidates, own.horizon, own.execute) == (4, 9, 7)
+    assert agent.but(model=None).model is None and agent.but(model=None).candidates == 2
 
 
 def test_a_broken_contract_is_raised_with_what_was_expected(task: ImageNav) -> None:

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, observation_space, outputs, start
+from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, drawn, known, observation_space, outputs, start
 from wiw.errors import ArgumentError
 from wiw.types import Episode, Goal, Key, Observation, Truth
 
@@ -25,6 +25,8 @@ class Segment:
     path: NDArray[np.float64]
     terminated: bool
     truncated: bool
+    key: Key
+    """Of the next decision."""
 
 
 class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
@@ -48,27 +50,35 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         self._goal: Goal | None = None
         self._observation: Observation | None = None
         self._next = 0
+        self._key = Key(task.seed, 0)
 
     # -- gymnasium -----------------------------------------------------------------------------------------------------
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random."""
+        """Starts an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random.
+
+        `info["key"]` names the decision that is due, for `agent.decide`; every step gives the next one.
+        """
         super().reset(seed=seed)
         index = (options or {}).get("episode")
         if index is None:
-            index = int(self.np_random.integers(64)) if seed is not None else self._next
+            index = drawn(self.task, self.np_random) if seed is not None else self._next
+        index = known(self.task, int(index))
         observation = self.begin(self.task.episode(index))
         self._next = index + 1
-        return observation.as_dict(), {"key": Key(self.task.seed, index)}
+        self._key = Key(self.task.seed, index)
+        return observation.as_dict(), {"key": self._key}
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Carries out one primitive: 0 forward, 1 turn left, 2 turn right, 3 stop."""
         if not self.action_space.contains(action):
             raise ArgumentError(f"step: expected an action from 0 to {len(PRIMITIVES) - 1}, got {action!r}")
         segment = self._carry_out([PRIMITIVES[action]])
-        info = {"result": self.result()} if segment.terminated or segment.truncated else {}
+        info: dict[str, Any] = {"key": segment.key}
+        if segment.terminated or segment.truncated:
+            info["result"] = self.result()
         return segment.observation.as_dict(), float(self.trip.success), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
@@ -83,7 +93,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         return self._observe()
 
     def run(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
-        """Carries out one decision: primitives until they, the budget or the episode end; observes once, at the end."""
+        """Carries out one decision's primitives, as far as the episode goes on; observes once, at the end."""
         self.trip.decisions += 1
         return self._carry_out(actions)
 
@@ -95,10 +105,12 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
             self._core.step(int(action))
             executed.append(int(action))
             done = trip.note(self.task, int(action), self._core.position, at_decision=i + 1 == len(actions))
-            if done or trip.actions >= self.task.budget:
+            if done:
                 break
         path = np.stack(trip.positions[first:])
-        return Segment(self._observe(), np.array(executed, np.int8), path, done, trip.spent(self.task) and not done)
+        self._key = self._key.at(self._key.decision + 1)
+        over = trip.spent(self.task) and not done
+        return Segment(self._observe(), np.array(executed, np.int8), path, done, over, self._key)
 
     @property
     def goal(self) -> Goal:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wiw._core import env as _env
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.worlds import World, world
+from wiw.errors import ArgumentError
 from wiw.types import Episode, Goal, Truth
 
 PRIMITIVES = (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)
@@ -30,6 +31,8 @@ class NavigationTask(Protocol):
     def motion(self) -> str: ...
     @property
     def budget(self) -> int: ...
+    @property
+    def size(self) -> int | None: ...
     def episode(self, index: int) -> Episode: ...
     def goal(self, world: World, episode: Episode) -> Goal: ...
     def succeeded(self, trip: Trip) -> bool: ...
@@ -84,8 +87,24 @@ class Trip:
         return self.success or self.stopped
 
     def spent(self, task: NavigationTask) -> bool:
-        """Whether the budget of primitives or of decisions is used up."""
-        return self.actions >= task.budget or self.decisions >= task.rules.decisions
+        """Whether the decisions are used up, or the primitives where they are given one by one, without decisions."""
+        return self.decisions >= task.rules.decisions if self.decisions else self.actions >= task.budget
+
+
+def drawn(task: NavigationTask, random: np.random.Generator) -> int:
+    """A random episode's number; among the first 64 where there is no end of them."""
+    return int(random.integers(task.size or 64))
+
+
+def known(task: NavigationTask, index: int) -> int:
+    """The number of an episode, counted round where the last one is passed.
+
+    Raises:
+        ArgumentError: a negative number.
+    """
+    if index < 0:
+        raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+    return index % task.size if task.size else index
 
 
 def start(task: NavigationTask, episode: Episode) -> tuple[Any, Trip, Goal]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import env as _env
 from wiw.action import NULL
-from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, observation_space, outputs, start
+from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, drawn, known, observation_space, outputs, start
 from wiw.errors import ArgumentError
 from wiw.types import Goal, Key, Truth
 
@@ -56,10 +56,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         super().reset(seed=seed)
         indices = (options or {}).get("episode")
         if indices is None:
-            first = int(self.np_random.integers(64)) if seed is not None else self._next
+            first = drawn(self.task, self.np_random) if seed is not None else self._next
             indices = range(first, first + self.num_envs)
         if len(indices) != self.num_envs:
             raise ArgumentError(f"reset: expected {self.num_envs} episodes, got {len(indices)}")
+        indices = [known(self.task, int(index)) for index in indices]
         started = [start(self.task, self.task.episode(int(index))) for index in indices]
         self._core = _env.VectorEnv([core for core, _, _ in started])
         self._trips, self._goals = [trip for _, trip, _ in started], [goal for _, _, goal in started]
@@ -125,9 +126,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
 
     def _start_over(self, place: int) -> dict[str, Any]:
         """Puts the next episode in a place; what its info says."""
-        index = self._next
+        index = known(self.task, self._next)
         self._core[place], self._trips[place], self._goals[place] = start(self.task, self.task.episode(index))
-        self._next += 1
+        self._next = index + 1
         return self._named(index)
 
     def _named(self, index: int) -> dict[str, Any]:

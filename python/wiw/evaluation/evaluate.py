@@ -12,16 +12,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ArgumentError, Error, StoreError
+from wiw.errors import ArgumentError, Error, InfrastructureError, StoreError
 from wiw.evaluation.platform import describe_platform
 from wiw.evaluation.progress import Tracker, make_board
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
-from wiw.evaluation.rows import AgentRow, DecisionRow
+from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore, store_path
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
-from wiw.types import Episode
+from wiw.types import Episode, EpisodeResult
 
 
 def evaluate(
@@ -224,12 +224,18 @@ def _budget(store: RunStore) -> int:
     return int(store.config["task"].get("decisions", 20))
 
 
+HOPELESS = 5
+"""Failures by the same exception at the beginning of an arm that stop a run."""
+
+
 class _Desk:
     """Writes rows to the store and tells the bars."""
 
     def __init__(self, store: RunStore, tracker: Tracker) -> None:
         self._store, self._tracker = store, tracker
         self._known: set[str] = set()
+        self._first_errors: dict[str, list[str] | None] = {}
+        """By arm: last lines of its failures; None once an episode has gone through."""
 
     def write(self, row: Row) -> None:
         if isinstance(row, AgentRow):
@@ -237,14 +243,32 @@ class _Desk:
                 self._store.write_agent(row)
             self._known.add(row.arm)
             return
+        if isinstance(row, AgainRow):
+            self.discard(row.arm, row.episodes)
+            return
         self._store.write(row)
         if isinstance(row, DecisionRow):
             self._tracker.decision(row.arm, row.episode)
         else:
             self._tracker.episode(row.arm, row.result)
+            self._watch(row.arm, row.result)
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         episodes = list(episodes)
         self._store.discard(arm, episodes)
         for episode in episodes:
             self._tracker.forget(arm, episode)
+
+    def _watch(self, arm: str, result: EpisodeResult) -> None:
+        """Stops a run whose arm begins with nothing but the same failure: a mistake in the set-up, not bad luck."""
+        if result.status == "done":
+            self._first_errors[arm] = None
+        errors = self._first_errors.setdefault(arm, [])
+        if errors is None:
+            return
+        errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
+        if len(errors) == HOPELESS and len({error.partition(":")[0] for error in errors}) == 1:  # the same exception
+            raise InfrastructureError(
+                f"the first {HOPELESS} episodes of arm '{arm}' all failed alike, so the run was stopped: {errors[0]}. "
+                "Mend the cause, then `wiw resume --retry-failed`; the tracebacks are in the run store"
+            )

@@ -10,6 +10,9 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 
+NUMBERS = ("candidates", "horizon", "execute", "depth", "width")
+"""Of an agent; where it leaves one open, the task's own is taken."""
+
 
 @dataclass(frozen=True)
 class TaskRecipe:
@@ -47,7 +50,7 @@ class AgentRecipe:
     width: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("candidates", "horizon", "depth", "width"):
+        for name in (name for name in NUMBERS if name != "execute"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
@@ -56,10 +59,7 @@ class AgentRecipe:
         """The agent; what is None is taken from the task's defaults (M, L and the executed primitives)."""
         from wiw.loop.agent import Agent
 
-        given = {name: value for name, value in asdict(self).items() if value is not None}
-        if "horizon" in given and defaults.get("execute", 0) > 0:  # that number belongs to the task's horizon
-            defaults = {name: value for name, value in defaults.items() if name != "execute"}
-        return Agent(**{**defaults, **given})
+        return Agent(**{name: value for name, value in asdict(self).items() if value is not None}).settled(defaults)
 
     def with_model(self, model: str) -> AgentRecipe:
         """The same agent with another world model."""
@@ -106,6 +106,20 @@ class Ready:
         """Nothing: an object in memory cannot be written down."""
 
 
+@dataclass(frozen=True)
+class ReadyAgent(Ready):
+    """A `wiw.Agent` in memory; what it leaves open is the task's."""
+
+    def build(self, defaults: Mapping[str, Any]) -> Any:
+        """The agent with the task's numbers where it has none of its own."""
+        return self.thing.settled(defaults)
+
+    def describe(self) -> dict[str, Any]:
+        """What the agent says of itself, less the numbers that it leaves open."""
+        said, given = self.thing.describe(), self.thing.given
+        return {name: value for name, value in said.items() if name not in NUMBERS or name in given}
+
+
 def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskRecipe | Ready:
     """A recipe of a task by name and options, of a task, or of a gymnasium environment's task.
 
@@ -124,7 +138,9 @@ def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskReci
 
 def agent_recipe(agent: Any) -> AgentRecipe | Ready:
     """A recipe of an agent."""
-    return agent if isinstance(agent, AgentRecipe) else Ready(agent)
+    from wiw.loop.agent import Agent
+
+    return agent if isinstance(agent, AgentRecipe) else ReadyAgent(agent) if isinstance(agent, Agent) else Ready(agent)
 
 
 def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
@@ -160,9 +176,7 @@ def _with_policy(agent: Any, policy: str | None) -> Any:
         return agent
     if isinstance(agent, AgentRecipe):
         return replace(agent, policy=policy)
-    from wiw.loop.agent import Agent
-
-    return Agent(policy, None, None, agent.candidates, agent.horizon, agent.execute, agent.depth, agent.width)
+    return agent.but(policy=policy, model=None, revision=None)
 
 
 def _own_arm(agent: Any) -> str:
@@ -172,24 +186,10 @@ def _own_arm(agent: Any) -> str:
     return "none" if model is None else type(model).__name__.lower()
 
 
-def _with_model(agent: Any, model: str) -> AgentRecipe | Ready:
+def _with_model(agent: Any, model: str) -> AgentRecipe | ReadyAgent:
     if isinstance(agent, AgentRecipe):
         return agent.with_model(model)
-    from wiw.loop.agent import Agent
-
-    own_reviser = agent.revision is agent.policy  # what a policy revises with may depend on there being a world model
-    return Ready(
-        Agent(
-            agent.policy,
-            None if model == "none" else model,
-            None if own_reviser else agent.revision,
-            agent.candidates,
-            agent.horizon,
-            agent.execute,
-            agent.depth,
-            agent.width,
-        )
-    )
+    return ReadyAgent(agent.but(model=None if model == "none" else model))
 
 
 def absolute(model: str) -> str:

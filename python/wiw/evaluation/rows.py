@@ -42,6 +42,14 @@ class OutcomeRow:
 
 
 @dataclass(frozen=True)
+class AgainRow:
+    """These episodes of an arm begin anew; their rows so far do not count."""
+
+    arm: str
+    episodes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class AgentRow:
     """What an arm's agent said of itself when it was built."""
 

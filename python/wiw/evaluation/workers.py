@@ -12,7 +12,7 @@ import os
 import pickle
 import signal
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -20,10 +20,10 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError
-from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, decision_row
+from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, OutcomeRow, decision_row
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
-Row = AgentRow | DecisionRow | OutcomeRow
+Row = AgainRow | AgentRow | DecisionRow | OutcomeRow
 
 
 class Desk(Protocol):
@@ -73,6 +73,10 @@ class RowSink:
     def episode(self, result: EpisodeResult) -> None:
         """One episode has ended."""
         self._send(OutcomeRow(self._job.arm, result))
+
+    def again(self, episodes: Sequence[int]) -> None:
+        """These episodes begin anew."""
+        self._send(AgainRow(self._job.arm, tuple(episodes)))
 
 
 class Runner:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
+from wiw.loop.contract import check_model, check_proposals, checked_plan, checked_scores
 from wiw.loop.imagine import Imagination, imagine
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
@@ -49,18 +50,20 @@ class Agent:
         policy: base and proposal policy (name or instance).
         model: world model (name or instance); None runs the same loop with imagination left out.
         revision: policy that scores imagined futures; None means the policy itself, or its default reviser.
-        candidates: plans per decision (M); None means the task's default, 3.
-        horizon: primitives per plan (L); None means the task's default, 5.
-        execute: primitives carried out before the next decision; None means L - 2, as in the paper's ImageNav. A
-            negative number leaves that many of the plan's first `horizon` undone, but carries out at least one.
+        candidates: plans per decision (M); None means the number of the task that the agent is evaluated on, else 3.
+        horizon: primitives per plan (L); None means the task's own number, else 5.
+        execute: primitives carried out before the next decision; None means the task's own number, or L - 2, as in the
+            paper's ImageNav, where `horizon` is given. A negative number leaves that many of the plan's first `horizon`
+            undone, but carries out at least one.
         depth: levels of the beam search. At 1, the paper's, the proposals are what is chosen from; each further level
             extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
             Without a model nothing is imagined, and there is one level.
         width: plans of an episode that are kept and extended; None means `candidates`.
 
     Raises:
-        ArgumentError: a number out of range; with depth > 1, a model that shows no panorama or a policy that needs
-            depth, which no imagined place has, and does not say how to extend.
+        ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
+            that shows no panorama or a policy that needs depth, which no imagined place has, and does not say how to
+            extend.
     """
 
     def __init__(
@@ -74,8 +77,12 @@ class Agent:
         depth: int = 1,
         width: int | None = None,
     ) -> None:
+        numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
+        self.given = {name: value for name, value in numbers.items() if value is not None}
+        """The numbers that were not left to the task."""
         self.policy: Policy = POLICIES.make(policy)
         self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model)
+        self._given_revision = revision
         self.revision: Policy = self._reviser(revision)
         self.candidates = 3 if candidates is None else candidates
         self.horizon = 5 if horizon is None else horizon
@@ -91,8 +98,10 @@ class Agent:
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
             )
-        if self.depth > 1 and self.model is not None:
-            self._check_depth(self.model)
+        if self.model is not None:
+            check_model(self.model, self.horizon * self.depth)
+            if self.depth > 1:
+                self._check_depth(self.model)
         self._lives: dict[tuple[int, int], _Life] = {}
 
     @property
@@ -116,9 +125,10 @@ class Agent:
             if self.revision is not self.policy:
                 self.revision.observe(revising)
             proposals = self.policy.propose(proposing, self.candidates, self.horizon)
+            check_proposals(self.policy, proposals, len(queries), self.candidates, self.horizon)
         if self.model is None:
             rollouts: list[list[Rollout] | None] = [None] * len(queries)
-            calls: dict[str, int] = {}
+            calls: list[dict[str, int]] = [{} for _ in queries]
             scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
         else:
             beams = Beams(proposing, proposals, self.width, self.depth)
@@ -127,18 +137,27 @@ class Agent:
                 with clock("propose"):
                     beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
                 imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
-            proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], dict(beams.calls)
+            proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], [dict(calls) for calls in beams.calls]
         seconds = clock.share(len(queries))
         return [
-            self._decision(query, situation, plans, rollout, score, seconds, calls)
-            for query, situation, plans, rollout, score in zip(
-                queries, revising, proposals, rollouts, scores, strict=True
+            self._decision(query, situation, plans, rollout, score, seconds, cost)
+            for query, situation, plans, rollout, score, cost in zip(
+                queries, revising, proposals, rollouts, scores, calls, strict=True
             )
         ]
 
     def forget(self, key: Key) -> None:
         """Drops the memory of an episode that has ended."""
         self._lives.pop((key.seed, key.episode), None)
+
+    def but(self, **changes: Any) -> Agent:
+        """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
+        parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
+        return Agent(**{**parts, **self.given, **changes})
+
+    def settled(self, defaults: Mapping[str, int]) -> Agent:
+        """The same agent with a task's numbers where it was given none."""
+        return self.but(**settled_numbers(self.given, defaults))
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest."""
@@ -158,9 +177,10 @@ class Agent:
     ) -> tuple[Imagination, list[NDArray[np.float64]]]:
         """Imagines and scores the plans of one level."""
         imagined = imagine(model, queries, beams.proposals, beams.origins, self.revision.frames, clock)
-        beams.calls.update(imagined.calls)
+        beams.spend(imagined.calls)
         with clock("revise"):
-            return imagined, self.revision.score(revising, beams.proposals, imagined.rollouts)
+            scores = self.revision.score(revising, beams.proposals, imagined.rollouts)
+            return imagined, checked_scores(self.revision, scores, beams.proposals)
 
     def _check_depth(self, model: WorldModel) -> None:
         if model.accepts.view != "panorama":
@@ -208,6 +228,7 @@ class Agent:
         self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any
     ) -> Decision:
         actions, chosen = self.revision.revise(situation, proposals, scores)
+        actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
         self._life(query).executed += actions[:execute].tolist()
         return Decision(
@@ -229,3 +250,10 @@ class Agent:
         if self.execute > 0:
             return min(self.execute, length)
         return max(1, min(length, self.horizon) + self.execute)
+
+
+def settled_numbers(given: Mapping[str, int], defaults: Mapping[str, int]) -> dict[str, int]:
+    """A task's numbers where none is given; the primitives carried out belong to the horizon they were chosen for."""
+    if "horizon" in given and defaults.get("execute", 0) > 0:
+        defaults = {name: value for name, value in defaults.items() if name != "execute"}
+    return {**defaults, **given}

@@ -10,7 +10,7 @@ imagined once.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core, planner
 from wiw.action import STOP, to_trajectory
+from wiw.loop.contract import check_proposals
 from wiw.loop.imagine import Imagination
 from wiw.policies.base import Policy, Situation
 from wiw.types import Key, Observation, Proposal
@@ -35,8 +36,8 @@ class Beams:
         self.proposals = [list(plans) for plans in proposals]
         self.origins = [list(range(len(plans))) for plans in proposals]
         """First-level proposal that each plan began as; it lends its seed, so that a plan keeps its future."""
-        self.calls: Counter[str] = Counter()
-        """What all levels so far have cost."""
+        self.calls: list[Counter[str]] = [Counter() for _ in proposals]
+        """What all levels so far have cost each episode."""
         self._situations = situations
         self._search = planner.BeamSearch(width, depth)
         self._search.ask([[plan.actions for plan in plans] for plans in proposals])
@@ -45,6 +46,11 @@ class Beams:
     def level(self) -> int:
         """The present level, from 1."""
         return int(self._search.level) + 1
+
+    def spend(self, calls: Sequence[Mapping[str, int]]) -> None:
+        """Adds what a level has cost each episode."""
+        for total, more in zip(self.calls, calls, strict=True):
+            total.update(more)
 
     def extend(
         self, policy: Policy, imagined: Imagination, scores: Sequence[Any], candidates: int, horizon: int
@@ -56,6 +62,7 @@ class Beams:
         kept = [[int(c) for c in order] for order in self._search.tell(scores)]
         going = [(e, c) for e, order in enumerate(kept) for c in order if STOP not in self.proposals[e][c].actions]
         more = policy.extend(self._at_ends(imagined, going), candidates, horizon) if going else []
+        check_proposals(policy, [plans for plans in more if plans], sum(map(bool, more)), candidates, horizon)
         found = dict(zip(going, more, strict=True))
         pairs = [[(c, p) for c in order for p in found.get((e, c)) or [NOTHING]] for e, order in enumerate(kept)]
         plans = self._search.ask(

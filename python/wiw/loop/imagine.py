@@ -26,8 +26,8 @@ class Imagination:
 
     rollouts: list[list[Rollout]]
     """[episode][candidate]."""
-    calls: dict[str, int]
-    """What the batch cost: rows asked and frames imagined, over all live episodes."""
+    calls: list[dict[str, int]]
+    """What the batch cost each episode: rows asked and frames imagined."""
     queries: Sequence[Any]
     batch: Any
     answers: list[NDArray[np.uint8]]
@@ -74,7 +74,7 @@ def imagine(
         view = "front" if kind == "perspective" else frames.view
         size = frames.size if view == frames.view else (384, 384)
         shown = batch.views(panoramas, answers, _maker(view, size), kind)
-        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch), queries, batch, answers)
+        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch, len(queries)), queries, batch, answers)
 
 
 def _spec(accepts: Accepts) -> Any:
@@ -119,11 +119,7 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         depth = None if whole.depth is None else whole.depth[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
         return Conditioning(whole.image[rows], depth=depth, simulators=simulators)
-    if accepts.needs:
-        raise ArgumentError(
-            f"a plan is longer than the world model's {accepts.frames} frames, and one that needs "
-            f"{', '.join(accepts.needs)} cannot go on from an imagined frame; shorten the horizon or search less deep"
-        )
+    assert not accepts.needs  # check_model: an imagined frame has neither depth nor a simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 
@@ -139,7 +135,7 @@ def _controls(accepts: Accepts, part: Any) -> list[Control]:
             actions=actions,
             trajectory=trajectory,
             viewpoints=viewpoints,
-            text=action.to_text(actions[:length]) if accepts.control == "text" else "",
+            text=action.to_text(actions[:length], accepts.template) if accepts.control == "text" else "",
             ids=_ids(accepts, actions),
             length=int(length),
             shared=int(shared),
@@ -151,9 +147,10 @@ def _controls(accepts: Accepts, part: Any) -> list[Control]:
 
 
 def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
-    if accepts.vocabulary is None:
+    if accepts.control != "action":
         return None
-    return action.to_controls(action.with_null(actions) if accepts.null_first else actions, accepts.vocabulary)
+    primitives = action.with_null(actions) if accepts.null_first else actions
+    return primitives if accepts.vocabulary is None else action.to_controls(primitives, accepts.vocabulary)
 
 
 def _seeds(batch: Any, queries: Sequence[Any], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
@@ -177,6 +174,8 @@ def _unpack(
     ]
 
 
-def _cost(batch: Any) -> dict[str, int]:
-    """Rows asked of the world model and frames that no other row answers."""
-    return {"rows": int(batch.rows), "frames": int((batch.row_length - batch.row_shared).sum())}
+def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:
+    """Rows asked of the world model for each episode and frames of them that no other row answers."""
+    rows = np.bincount(batch.row_episode, minlength=episodes)
+    frames = np.bincount(batch.row_episode, batch.row_length - batch.row_shared, minlength=episodes)
+    return [{"rows": int(r), "frames": int(f)} for r, f in zip(rows, frames, strict=True)]

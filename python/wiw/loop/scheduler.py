@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from wiw.errors import ContractError
+from wiw.errors import ArgumentError, ContractError
 from wiw.loop.agent import Agent, Query
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
 
@@ -23,6 +23,9 @@ class Sink(Protocol):
 
     def episode(self, result: EpisodeResult) -> None:
         """One episode has ended, or its infrastructure has failed."""
+
+    def again(self, episodes: Sequence[int]) -> None:
+        """These episodes begin anew; what was reported of them does not count."""
 
 
 @dataclass
@@ -60,16 +63,19 @@ def run_episodes(
 ) -> None:
     """Runs (index, episode) pairs to their ends, at most `live` at a time.
 
-    An exception in an episode or a batch is infrastructure: the episodes it hits are reported as failed and the rest go
-    on. A broken contract would hit every episode alike, so it is raised.
+    An exception in an episode is infrastructure: the episode is reported as failed and the rest go on. One in a batch
+    may be due to any of its episodes, so each of them is run again by itself, after the others: what fails does not
+    depend on what else was live. A broken contract or a wrong argument would hit every episode alike, so it is raised.
     """
-    waiting, trials = deque(episodes), list[Trial]()
+    waiting, trials, suspects = deque(episodes), list[Trial](), deque[tuple[int, Episode]]()
     envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
     try:
-        while waiting or trials:
+        while waiting or trials or suspects:
             while waiting and envs:
                 _start(waiting.popleft(), envs, trials, seed, sink)
-            _advance(agent, trials, sink)
+            if not trials and not waiting and suspects:
+                _start(suspects.popleft(), envs, trials, seed, sink)
+            suspects += _advance(agent, trials, sink)
             for trial in [trial for trial in trials if trial.done]:
                 trials.remove(trial)
                 envs.append(trial.env)
@@ -92,19 +98,22 @@ def _start(item: tuple[int, Episode], envs: list[Any], trials: list[Trial], seed
     trials.append(Trial(index, episode, env, Key(seed, index), observation, begin))
 
 
-def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> None:
-    """One decision for every live episode."""
+def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, Episode]]:
+    """One decision for every live episode; returns those that have to be run again, one at a time."""
     if not trials:
-        return
+        return []
     try:
         decisions = agent.decide_batch([trial.query(agent) for trial in trials])
-    except ContractError:
+    except (ArgumentError, ContractError):
         raise
     except Exception as error:
         for trial in trials:
             trial.done = True
-            sink.episode(_failed(trial.index, trial.episode, trial.begin, error))
-        return
+        if len(trials) > 1:
+            sink.again([trial.index for trial in trials])
+            return [(trial.index, trial.episode) for trial in trials]
+        sink.episode(_failed(trials[0].index, trials[0].episode, trials[0].begin, error))
+        return []
     for trial, decision in zip(trials, decisions, strict=True):
         try:
             sink.decision(trial.carry_out(decision))
@@ -113,6 +122,7 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> None:
         except Exception as error:
             trial.done = True
             sink.episode(_failed(trial.index, trial.episode, trial.begin, error))
+    return []
 
 
 def _finished(trial: Trial) -> EpisodeResult:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.types import Conditioning, Control, ControlKind, View
 
@@ -33,7 +34,7 @@ class Accepts:
     best_batch: int
     vocabulary: dict[int, Any] | None
     null_first: bool
-    template: str | None
+    template: TextTemplate | None
 
 
 def accepts(
@@ -48,7 +49,7 @@ def accepts(
     best_batch: int = 8,
     vocabulary: dict[int, Any] | None = None,
     null_first: bool = False,
-    template: str | None = None,
+    template: TextTemplate | None = None,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
@@ -57,13 +58,13 @@ def accepts(
         view: "perspective" (HFOV 90 front view) or "panorama" (equirectangular).
         size: (height, width) of its input and output; default 480x480 or 576x1024.
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
-        space: "discrete" primitives or "pose7" poses.
-        needs: any of "depth", "semantic", "history"; "simulator" is for `oracle` alone.
+        space: "discrete" primitives or "pose7" poses; an agent says so where it cannot give them.
+        needs: any of "depth", "semantic", "history", likewise; "simulator" is for `oracle` alone.
         causal: frame k depends on controls 1..k only, so shared prefixes are imagined once.
         best_batch: rows per call at which the model is most efficient.
-        vocabulary: primitive id to the model's own id or vector, for control "action".
+        vocabulary: primitive id to the model's own id or vector, for control "action"; default: primitive ids.
         null_first: the model wants a null token for frame 0 in front of the actions.
-        template: path of a text template, for control "text".
+        template: words of the prompt, for control "text"; see `wiw.action.TextTemplate`.
 
     Raises:
         ArgumentError: a value is not one of the above.
@@ -74,10 +75,15 @@ def accepts(
     _check("space", space, ("discrete", "pose7"))
     for need in needs:
         _check("needs", need, NEEDS)
+    if len(size) != 2 or min(size) < 1:
+        raise ArgumentError(f"accepts: expected size (height, width) in pixels, got {size}")
     if frames < 0 or frames == 1:
         raise ArgumentError(f"accepts: frames counts the observation too: expected 0 (any) or at least 2, got {frames}")
     if best_batch < 1:
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
+    if template is not None and not isinstance(template, TextTemplate):
+        raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
+    size = (int(size[0]), int(size[1]))
     return Accepts(
         control, space, view, size, frames, tuple(needs), causal, best_batch, vocabulary, null_first, template
     )

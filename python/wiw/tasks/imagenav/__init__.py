@@ -94,6 +94,15 @@ class ImageNav:
         return rules.decisions * (rules.execute if rules.execute > 0 else max(1, rules.horizon + rules.execute))
 
     @property
+    def size(self) -> int | None:
+        """How many episodes there are; None where a single scene gives as many as are asked for."""
+        if self.episode_file:
+            self._episodes = self._episodes or self._of_file()
+            return len(self._episodes)
+        scenes = resolve(self.scenes)
+        return None if len(scenes) == 1 else len(scenes) * self.per_scene
+
+    @property
     def defaults(self) -> dict[str, int]:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the loop holds policies and world models to; `checked_rollout` does the same for frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.errors import ArgumentError, ContractError
+from wiw.types import Proposal
+from wiw.world_models.base import WorldModel
+from wiw.world_models.oracle import Oracle
+
+PRIMITIVES = frozenset(map(int, (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)))
+GIVEN = ("depth", "simulator")
+"""What the loop can give a world model beyond the image."""
+
+
+def check_model(model: WorldModel, longest: int) -> None:
+    """Refuses a world model that asks for what it would not be given; plans have up to `longest` primitives.
+
+    Raises:
+        ArgumentError: poses instead of primitives, needs that nobody meets, the simulator for another than `Oracle`, or
+            too few frames for a model that cannot go on from an imagined one.
+    """
+    accepts, name = model.accepts, type(model).__name__
+    if accepts.space != "discrete":
+        raise ArgumentError(f"{name} takes space='{accepts.space}', but this agent plans in discrete primitives")
+    if missing := [need for need in accepts.needs if need not in GIVEN]:
+        raise ArgumentError(f"{name} needs {', '.join(missing)}, but a model can be given {', '.join(GIVEN)}")
+    if "simulator" in accepts.needs and not isinstance(model, Oracle):
+        raise ArgumentError(
+            f"{name} needs the simulator, which is handed to the oracle alone: it knows where the agent truly is. "
+            "Declare what the model sees of the world instead (needs=('depth',)), or derive it from wiw's Oracle"
+        )
+    if accepts.needs and accepts.frames and longest > accepts.frames - 1:
+        raise ArgumentError(
+            f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(accepts.needs)}, which an "
+            f"imagined frame does not have, but plans have up to {longest}; lower horizon or depth, or raise frames"
+        )
+
+
+def check_proposals(policy: Any, proposals: Any, episodes: int, most: int, horizon: int) -> None:
+    """Holds `propose` and `extend` to at most `most` plans of 1 to `horizon` primitives for each episode.
+
+    Raises:
+        ContractError: another count, length or primitive.
+    """
+    name = f"{type(policy).__name__}.propose"
+    if not isinstance(proposals, Sequence) or len(proposals) != episodes:
+        raise ContractError(f"{name}: expected a list of proposals for each of {episodes} episodes, got {proposals!r}")
+    for plans in proposals:
+        if not 1 <= len(plans) <= most:
+            raise ContractError(f"{name}: expected 1 to {most} plans for an episode, got {len(plans)}")
+        for plan in plans:
+            if not isinstance(plan, Proposal):
+                raise ContractError(f"{name}: expected wiw.types.Proposal, got {type(plan).__name__}")
+            _check_plan(name, plan.actions, horizon)
+
+
+def checked_plan(policy: Any, actions: Any, longest: int) -> NDArray[np.int8]:
+    """The plan that `revise` decided for, int8 [K].
+
+    Raises:
+        ContractError: no primitives, more than `longest`, or unknown ones.
+    """
+    plan = np.asarray(actions)
+    _check_plan(f"{type(policy).__name__}.revise", plan, longest)
+    return plan.astype(np.int8)
+
+
+def _check_plan(name: str, actions: NDArray[Any], horizon: int) -> None:
+    if actions.ndim != 1 or not 1 <= len(actions) <= horizon:
+        raise ContractError(f"{name}: expected plans of 1 to {horizon} primitives, got shape {actions.shape}")
+    if unknown := set(actions.tolist()) - PRIMITIVES:
+        raise ContractError(f"{name}: expected primitives among {sorted(PRIMITIVES)}, got {sorted(unknown)}")
+
+
+def checked_scores(policy: Any, scores: Any, proposals: Sequence[Sequence[Proposal]]) -> list[NDArray[np.float64]]:
+    """One finite number for each plan of each episode, as float64.
+
+    Raises:
+        ContractError: another count, or NaN.
+    """
+    name = f"{type(policy).__name__}.score"
+    if not isinstance(scores, Sequence) or len(scores) != len(proposals):
+        raise ContractError(f"{name}: expected scores for each of {len(proposals)} episodes, got {scores!r}")
+    found = [np.asarray(row, np.float64) for row in scores]
+    for row, plans in zip(found, proposals, strict=True):
+        if row.shape != (len(plans),) or not np.isfinite(row).all():
+            raise ContractError(f"{name}: expected {len(plans)} finite numbers, one a plan, got {row.tolist()}")
+    return found
