@@ -28,7 +28,7 @@ points = st.tuples(finite, finite, finite)
         st.builds(
             Episode,
             st.text(max_size=8),
-            st.text(max_size=20),
+            st.sampled_from(["apartments:val/3", "/scenes/a.glb", "/a b/\u00e9.world"]),
             points,
             finite,
             points,
@@ -43,6 +43,20 @@ def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, episo
     path = tmp_path_factory.mktemp("episodes") / "e.json"
     files.save(path, episodes, "imagenav", seed=1)
     assert files.load(path) == episodes
+
+
+def test_scenes_are_found_from_the_file_or_from_the_folder_given(tmp_path: Path, two_rooms: str) -> None:
+    near, far = tmp_path / "scans" / "a.glb", "/elsewhere/b.glb"
+    episodes = [
+        Episode(str(i), str(scene), (0, 0, 0), 0, (1, 0, 0), 0, 1)
+        for i, scene in enumerate((near, far, "apartments:val/3"))
+    ]
+    path = tmp_path / "e.json"
+    files.save(path, episodes, "imagenav")
+    (tmp_path / "moved").mkdir()
+    moved = path.rename(tmp_path / "moved" / "e.json")
+    assert [e.scene for e in files.load(moved)] == [str(tmp_path / "moved/scans/a.glb"), far, "apartments:val/3"]
+    assert [e.scene for e in files.load(moved, "/s")] == ["/s/scans/a.glb", far, "apartments:val/3"]
 
 
 @given(st.floats(-np.pi + 1e-6, np.pi - 1e-6))

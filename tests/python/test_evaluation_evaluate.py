@@ -12,7 +12,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
-from wiw.errors import ArgumentError, ContractError, InfrastructureError, RegistryError, StoreError
+from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
 from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
 from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
 from wiw.evaluation.runlog import load_run
@@ -134,6 +134,12 @@ def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
         resume_run(tmp_path / "run")
 
 
+def test_a_run_whose_creation_was_cut_off_is_begun_again(reference, tmp_path):
+    (tmp_path / "run").mkdir()
+    sqlite3.connect(store_path(tmp_path / "run")).execute("PRAGMA journal_mode = WAL")
+    assert facts(run(tmp_path / "run", resume=True)) == facts(reference)
+
+
 def test_evaluate_takes_one_agent(tmp_path):
     log = evaluate(LineTask(), LineAgent(1.0), episodes=3, out=tmp_path / "run", progress=False)
     assert log.arms == ["none"] and log.numbers()["none"].estimates["success"].value == 100.0
@@ -246,6 +252,44 @@ def test_a_run_is_not_resumed_with_an_agent_that_has_changed(tmp_path, two_rooms
     monkeypatch.setattr(sys, "modules", {k: v for k, v in sys.modules.items() if not k.startswith("wiw_user_first")})
     with pytest.raises(StoreError, match="steps"):
         resume_run(tmp_path / "run", progress=False)
+
+
+def test_a_run_is_resumed_from_another_folder(tmp_path, two_rooms, monkeypatch):
+    scene = Path(two_rooms)
+    monkeypatch.chdir(scene.parent)
+    options = {"scenes": scene.name, "decisions": 1, "preset": "mine.yaml"}
+    (scene.parent / "mine.yaml").write_text("base: paper\n")
+    evaluate(TaskRecipe("imagenav", options), AgentRecipe("heuristic"), 2, out=tmp_path / "run", progress=False)
+    with sqlite3.connect(store_path(tmp_path / "run")) as store:
+        store.execute("DELETE FROM outcome WHERE episode = 1")
+    monkeypatch.chdir(tmp_path)
+    log = resume_run(tmp_path / "run", progress=False)
+    assert [row["status"] for row in log.episodes] == ["done", "done"]
+
+
+def test_a_run_whose_scenes_are_gone_is_not_resumed(tmp_path, two_rooms):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name in ("two_rooms.obj", "two_rooms.mtl"):
+        (folder / name).write_bytes(Path(two_rooms).with_name(name).read_bytes())
+    task = TaskRecipe("imagenav", {"scenes": folder / "two_rooms.obj", "decisions": 1})
+    agent = AgentRecipe("heuristic")
+    evaluate(task, agent, 2, out=tmp_path / "run", progress=False)
+    with sqlite3.connect(store_path(tmp_path / "run")) as store:
+        store.execute("DELETE FROM outcome WHERE episode = 1")
+    folder.rename(tmp_path / "away")
+    for resume in (
+        lambda: resume_run(tmp_path / "run", progress=False),
+        lambda: evaluate(task, agent, 2, out=tmp_path / "run", resume=True, progress=False),
+    ):
+        with pytest.raises(FileError, match=r"two_rooms\.obj: no such file"):
+            resume()
+    assert [row["episode"] for row in load_run(tmp_path / "run").episodes] == [0]
+    (tmp_path / "away").rename(folder)
+    assert resume_run(tmp_path / "run", progress=False).complete
+    with pytest.raises(FileError, match="no such file"):
+        evaluate("imagenav", agent, 1, out=tmp_path / "b", progress=False, scenes=tmp_path / "none.obj")
+    assert not (tmp_path / "b").exists()
 
 
 def test_an_unknown_part_is_named_before_a_run_begins(tmp_path):

@@ -77,7 +77,7 @@ def run(
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
 
-    options = {"scenes": scenes, "seed": seed, "preset": _preset(preset), "backend": backend}
+    options = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
     recipe = TaskRecipe(task, options if motion is None else {**options, "motion": motion})
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
@@ -144,11 +144,6 @@ def finish(log: Any, report: bool) -> int:
         print(f"report  {log.report()}")
     print(f"run     {log.path}")
     return 1 if len(failed) == len(log.episodes) else 0
-
-
-def _preset(preset: str) -> str:
-    """A preset's file by its absolute path, so that it means the same in any folder; a name as it is."""
-    return str(Path(preset).expanduser().resolve()) if preset.endswith((".yaml", ".yml")) else preset
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:

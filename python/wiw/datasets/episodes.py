@@ -7,12 +7,13 @@ import gzip
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
 from wiw.datasets import habitat
 from wiw.errors import FileError
+from wiw.scenes import absolute, is_generated
 from wiw.types import Episode
 
 VERSION = 1
@@ -20,35 +21,48 @@ VERSION = 1
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
     """Writes an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header."""
-    body = {
-        "format": "wiw-episodes",
-        "version": VERSION,
-        "task": task,
-        **about,
-        "episodes": [{**asdict(e), "geodesic": e.geodesic if math.isfinite(e.geodesic) else None} for e in episodes],
-    }
+    folder = Path(path).absolute().parent
+    items = [_item(episode, folder) for episode in episodes]
+    body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": items}
     text = json.dumps(body, indent=1, allow_nan=False).encode()
     Path(path).write_bytes(gzip.compress(text, mtime=0) if str(path).endswith(".gz") else text)
+
+
+def _item(episode: Episode, folder: Path) -> dict[str, Any]:
+    """An episode as JSON; the scene's path relative to the file's folder where it lies in there."""
+    scene = Path(episode.scene)
+    name = str(scene.relative_to(folder)) if scene.is_relative_to(folder) else episode.scene
+    geodesic = episode.geodesic if math.isfinite(episode.geodesic) else None
+    return {**asdict(episode), "scene": name, "geodesic": geodesic}
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
     """Reads an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
 
-    `scenes` is the folder that scene paths of the foreign formats are relative to. Lengths that a file does not give
-    are NaN until the task has measured them.
+    `scenes` is the folder that scene paths are relative to; if not given, the folder of a file that `save` wrote, and
+    the present one for the other formats. Lengths that a file does not give are NaN until the task has measured them.
 
     Raises:
         FileError: missing, not JSON, of another format or version, or an episode lacks a field; names the file.
     """
     body = read_json(path)
-    if habitat.is_habitat(body) and body.get("format") != "wiw-episodes":
-        return habitat.read_habitat(body, str(path), scenes)
+    own = isinstance(body, Mapping) and body.get("format") == "wiw-episodes"
+    folder = Path(scenes) if scenes or not own else Path(path).parent
+    read = _own(body, path) if own else _foreign(body, path)
+    return [replace(e, scene=absolute(e.scene if is_generated(e.scene) else folder / e.scene)) for e in read]
+
+
+def _foreign(body: Any, path: str | Path) -> list[Episode]:
+    if habitat.is_habitat(body):
+        return habitat.read_habitat(body, str(path))
     if habitat.is_world_in_world(body):
-        return habitat.read_world_in_world(body, str(path), scenes)
-    if not isinstance(body, Mapping) or body.get("format") != "wiw-episodes":
-        raise FileError(
-            f"{path}: expected an episode file of wiw ('format': 'wiw-episodes'), habitat-lab or World-in-World"
-        )
+        return habitat.read_world_in_world(body, str(path))
+    raise FileError(
+        f"{path}: expected an episode file of wiw ('format': 'wiw-episodes'), habitat-lab or World-in-World"
+    )
+
+
+def _own(body: Mapping[str, Any], path: str | Path) -> list[Episode]:
     if body.get("version") != VERSION:
         raise FileError(f"{path}: version {body.get('version')}, this release reads version {VERSION}")
     return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(body.get("episodes", []))]

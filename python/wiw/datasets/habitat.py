@@ -7,7 +7,6 @@ Positions are metres, Y up, in all of them; the order of a quaternion is part of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -39,16 +38,16 @@ def is_habitat(body: Any) -> bool:
     return isinstance(body, Mapping) and bool(body.get("episodes")) and "start_rotation" in body["episodes"][0]
 
 
-def read_habitat(body: Mapping[str, Any], path: str, scenes: str | Path = "") -> list[Episode]:
-    """Episodes of habitat-lab (`start_rotation` in order xyzw), scenes looked up below the folder `scenes`.
+def read_habitat(body: Mapping[str, Any], path: str) -> list[Episode]:
+    """Episodes of habitat-lab (`start_rotation` in order xyzw); scenes are relative to its scene folder.
 
     Habitat derives an ImageNav goal's heading from a hash that differs between processes. Here it is the heading of
     `goals[0].rotation` where the file has one, else a function of the episode's id.
     """
-    return [_habitat(item, f"{path}: episode {i}", Path(scenes)) for i, item in enumerate(body["episodes"])]
+    return [_habitat(item, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
 
 
-def _habitat(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
+def _habitat(item: Mapping[str, Any], where: str) -> Episode:
     try:
         goal = item["goals"][0]
         name = str(item["episode_id"])
@@ -56,7 +55,7 @@ def _habitat(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
         yaw = yaw_of(rotation, "xyzw", where) if rotation is not None else heading_of(name)
         return Episode(
             episode_id=name,
-            scene=str(scenes / str(item["scene_id"]).removeprefix("data/scene_datasets/")),
+            scene=str(item["scene_id"]).removeprefix("data/scene_datasets/"),
             start_position=_point(item["start_position"]),
             start_yaw=yaw_of(item["start_rotation"], "xyzw", where),
             goal_position=_point(goal["position"]),
@@ -75,20 +74,20 @@ def is_world_in_world(body: Any) -> bool:
     return isinstance(body, Mapping) and bool(body.get("data")) and "goal_image_relpath" in body["data"][0]
 
 
-def read_world_in_world(body: Mapping[str, Any], path: str, scenes: str | Path = "") -> list[Episode]:
-    """Episodes of the published ImageNav file (quaternions in order wxyz), scenes below the folder `scenes`.
+def read_world_in_world(body: Mapping[str, Any], path: str) -> list[Episode]:
+    """Episodes of the published ImageNav file (quaternions in order wxyz); scenes are relative to its scene folder.
 
     Each brings the radius of its goal and the number of primitives that its SPL is measured against.
     """
-    return [_world_in_world(item, f"{path}: item {i}", Path(scenes)) for i, item in enumerate(body["data"])]
+    return [_world_in_world(item, f"{path}: item {i}") for i, item in enumerate(body["data"])]
 
 
-def _world_in_world(item: Mapping[str, Any], where: str, scenes: Path) -> Episode:
+def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
     try:
         steps = item.get("step_to_goal")
         return Episode(
             episode_id=str(item["episode_id"]),
-            scene=str(scenes / str(item["scene_relpath"])),
+            scene=str(item["scene_relpath"]),
             start_position=_point(item["start_position"]),
             start_yaw=yaw_of(item["start_rotation"], "wxyz", where),
             goal_position=_point(item["goal_position"]),

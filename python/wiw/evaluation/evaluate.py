@@ -19,7 +19,7 @@ from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_re
 from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
-from wiw.evaluation.store import RunStore, store_path
+from wiw.evaluation.store import RunStore
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
 
@@ -104,6 +104,7 @@ def resume_run(
     Raises:
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
             its preset's file has changed.
+        FileError: the scene of an episode that is left is not there; nothing is recorded.
     """
     store = RunStore.resume(run)
     info = store.info
@@ -115,10 +116,12 @@ def resume_run(
         )
     task = TaskRecipe(**info["task"])
     try:
-        store.require_task(task.build().describe())
+        built = task.build()
+        store.require_task(built.describe())
     except Error:
         store.close()
         raise
+    _require_left(built, store, info["agents"], retry_failed)
     agents = {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
     return _finish(store, task, agents, workers or info["workers"], progress, retry_failed=retry_failed)
 
@@ -151,11 +154,13 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
         "episodes": options.episodes,
         "arms": [{"name": arm, "agent": recipe.describe()} for arm, recipe in agents.items()],
     }
-    if options.resume and options.out is not None and store_path(options.out).exists():
+    if options.resume and options.out is not None and RunStore.begun(options.out):
         store = RunStore.resume(options.out, config)
+        _require_left(built, store, agents)
     else:
         started = time.perf_counter()
         episodes = built.episodes(options.episodes)
+        _require(built, episodes)
         folder = options.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
         info = {
             "platform": describe_platform(),
@@ -169,6 +174,22 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
         }
         store = RunStore.create(folder, config, info, episodes)
     return _finish(store, task, agents, options.workers, options.progress)
+
+
+def _require(task: Any, episodes: Iterable[Episode]) -> None:
+    """Asks a task that can tell whether all that its episodes need is there, before anything is run."""
+    if hasattr(task, "require"):
+        task.require(episodes)
+
+
+def _require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
+    """The same for the episodes that a run has left."""
+    episodes = store.episodes()
+    try:
+        _require(task, [episodes[index] for arm in arms for index in store.pending(arm, retry_failed)])
+    except Error:
+        store.close()
+        raise
 
 
 def _spread(episodes: int, count: int) -> list[int]:

@@ -28,8 +28,11 @@ class TaskRecipe:
         return TASKS.make(self.name, **self.options)
 
     def to_json(self) -> dict[str, Any]:
-        """For the run store; `TaskRecipe(**...)` is the way back."""
-        return {"name": self.name, "options": dict(self.options)}
+        """For the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
+        from wiw.registry import TASKS
+
+        portable = getattr(TASKS.find(self.name), "portable", dict)
+        return {"name": absolute(self.name), "options": portable(self.options)}
 
 
 @dataclass(frozen=True)

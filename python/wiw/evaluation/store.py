@@ -54,7 +54,7 @@ class RunStore:
             StoreError: a run is already there, or the folder cannot be written.
         """
         path = store_path(run)
-        if path.exists() and not _blank(path):
+        if cls.begun(run):
             raise StoreError(
                 f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
@@ -81,6 +81,12 @@ class RunStore:
                 [_episode_values(index, episode) for index, episode in enumerate(episodes)],
             )
         return store
+
+    @staticmethod
+    def begun(run: str | Path) -> bool:
+        """Whether a run is there, rather than nothing or a creation that was cut off."""
+        path = store_path(run)
+        return path.exists() and not _blank(path)
 
     @classmethod
     def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:

@@ -10,7 +10,7 @@ import logging
 import re
 import time
 from collections.abc import Sequence
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -21,7 +21,7 @@ from wiw.scenes import isolated, store
 
 Scene = _core.scene.Scene
 
-__all__ = ["Scene", "apartment", "load", "open_scene", "resolve"]
+__all__ = ["Scene", "absolute", "apartment", "is_generated", "load", "open_scene", "resolve"]
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -109,7 +109,18 @@ SPLIT_SIZE = 1000
 """Apartments that a spec without a number stands for."""
 
 
-def resolve(spec: str) -> list[str]:
+def is_generated(spec: str) -> bool:
+    """Whether a scene spec names generated apartments rather than a file."""
+    return spec.startswith("apartments:")
+
+
+def absolute(spec: str | PathLike[str]) -> str:
+    """The spec with its path, if it is one, made absolute, so that it means the same in any folder."""
+    spec = fspath(spec)
+    return spec if is_generated(spec) else str(Path(spec).expanduser().absolute())
+
+
+def resolve(spec: str | PathLike[str]) -> list[str]:
     """The single scenes that a scene spec names, in order, none of them loaded.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, each named
@@ -119,7 +130,8 @@ def resolve(spec: str) -> list[str]:
         ArgumentError: the split or the count is not one.
         FileError: there is no such file.
     """
-    if not spec.startswith("apartments"):
+    spec = fspath(spec)
+    if not is_generated(spec):
         if not Path(spec).expanduser().is_file():
             raise FileError(
                 f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]"
@@ -138,7 +150,7 @@ def resolve(spec: str) -> list[str]:
 
 def open_scene(name: str) -> Scene:
     """Loads one scene of `resolve`."""
-    if name.startswith("apartments:"):
+    if is_generated(name):
         split, _, index = name.removeprefix("apartments:").partition("/")
         return apartment(int(index), split)
     return load(name)

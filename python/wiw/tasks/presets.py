@@ -32,6 +32,12 @@ def about(task: str, preset: str) -> str:
     return str(_read(FOLDER / preset / f"{task}.yaml").get("about", ""))
 
 
+def absolute(preset: str | Path) -> str:
+    """The preset with its path, if it is one, made absolute, so that it means the same in any folder."""
+    path = Path(preset).expanduser()
+    return str(path.resolve()) if path.suffix in (".yaml", ".yml") else str(preset)
+
+
 def rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mapping[str, Any]) -> Rules:
     """The rules of a preset, by name or by the path of a YAML file, with `overrides` on top.
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from wiw.envs.navigation import NavigationEnv
 from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
 from wiw.errors import ArgumentError
-from wiw.scenes import resolve
+from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
 from wiw.types import Episode, Goal
 
@@ -56,7 +57,8 @@ class ImageNav:
         seed: seed of the generated episodes and of the run.
         preset: "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
-        scene_folder: folder that scene paths in a foreign episode file are relative to.
+        scene_folder: folder that scene paths in an episode file are relative to; if not given, the folder of a file of
+            wiw, else the present one.
         per_scene: generated episodes a scene.
         backend: renderer, "auto", "cpu" or "gpu".
     """
@@ -66,7 +68,7 @@ class ImageNav:
 
     def __init__(
         self,
-        scenes: str = "apartments:val",
+        scenes: str | Path = "apartments:val",
         seed: int = 0,
         preset: str | Path = presets.DEFAULT,
         episode_file: str | Path | None = None,
@@ -76,11 +78,25 @@ class ImageNav:
         **rules: Any,
     ) -> None:
         self.rules = presets.rules(ImageNavRules, self.name, preset, rules)
-        self.scenes, self.seed, self.backend, self.per_scene = scenes, seed, backend, per_scene
-        self.episode_file = None if episode_file is None else str(episode_file)
-        self.scene_folder = str(scene_folder)
+        self.scenes, self.seed, self.backend, self.per_scene = absolute(scenes), seed, backend, per_scene
+        self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
+        self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""
         self._one_radius = "radius" in rules
         self._episodes: list[Episode] = []
+
+    @staticmethod
+    def portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """The same options, with paths that mean the same in any folder."""
+        ways: dict[str, Callable[[Any], str]] = {
+            "scenes": absolute,
+            "preset": presets.absolute,
+            "episode_file": lambda path: str(Path(path).expanduser().absolute()),
+            "scene_folder": lambda path: str(Path(path).expanduser().absolute()),
+        }
+        return {
+            name: ways[name](value) if name in ways and value not in (None, "") else value
+            for name, value in options.items()
+        }
 
     @property
     def motion(self) -> str:
@@ -145,6 +161,15 @@ class ImageNav:
                 "name more scenes (apartments:val:N) or raise per_scene"
             )
         return self._episodes[:count]
+
+    def require(self, episodes: Iterable[Episode]) -> None:
+        """Finds out whether the scenes of episodes are there, without loading any.
+
+        Raises:
+            FileError: one is not; names it.
+        """
+        for scene in dict.fromkeys(episode.scene for episode in episodes):
+            resolve(scene)
 
     def episode(self, index: int) -> Episode:
         """Episode `index` of the task."""
