@@ -6,6 +6,7 @@ import sqlite3
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -82,6 +83,19 @@ def test_an_episode_that_kills_two_workers_is_recorded_as_failed(tmp_path):
     assert log.complete and log.numbers()["warp"].done == 7
 
 
+@dataclass
+class Doomed(LineTask):
+    """A task that ends every process it is sent to, as a broken extension module may."""
+
+    def __setstate__(self, state):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_workers_that_die_while_they_start_stop_the_run(tmp_path):
+    with pytest.raises(InfrastructureError, match=r"could not start.*SIGKILL"):
+        run(tmp_path / "run", workers=2, task=Doomed())
+
+
 class Sloppy(LineAgent):
     """An agent whose world model broke its contract."""
 
@@ -106,6 +120,9 @@ def test_what_cannot_be_pickled_is_refused_with_advice(tmp_path):
 def test_arguments_are_checked(tmp_path):
     with pytest.raises(ArgumentError, match="episodes of at least 1, got 0"):
         run(tmp_path / "run", episodes=0)
+    for workers in (0, -1):
+        with pytest.raises(ArgumentError, match=f"workers of at least 1, got {workers}"):
+            resume_run(tmp_path / "run", workers=workers)
     with pytest.raises(ArgumentError, match="different world models"):
         arm_recipes(AgentRecipe("matcher"), ["warp", "warp"])
 

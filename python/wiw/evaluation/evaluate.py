@@ -102,10 +102,13 @@ def resume_run(
         retry_failed: whether to run episodes again whose infrastructure failed.
 
     Raises:
+        ArgumentError: fewer than one worker.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
             its preset's file has changed.
         FileError: the scene of an episode that is left is not there; nothing is recorded.
     """
+    if workers is not None:
+        _at_least("workers", workers, 1)
     store = RunStore.resume(run)
     info = store.info
     if info["task"] is None or None in info["agents"].values():
@@ -141,8 +144,12 @@ class _Options:
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
-            if getattr(self, name) < least:
-                raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {getattr(self, name)}")
+            _at_least(name, getattr(self, name), least)
+
+
+def _at_least(name: str, value: int, least: int) -> None:
+    if value < least:
+        raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
 
 
 def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:

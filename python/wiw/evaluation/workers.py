@@ -195,15 +195,19 @@ class _Crew:
             self._bury(worker)
 
     def _bury(self, worker: _Worker) -> None:
-        """Runs again what a dead worker left, or records it as failed."""
+        """Runs again what a dead worker left, or records it as failed.
+
+        Raises:
+            InfrastructureError: the worker died before it asked for a job, as any other in its place would.
+        """
         self._workers.remove(worker)
         worker.pipe.close()
         worker.process.join()
         cause = _cause_of_death(worker.process.exitcode)
-        if not worker.ready and worker.process.exitcode >= 0:
+        if not worker.ready:
             raise InfrastructureError(
-                f"a worker process could not start ({cause}); a script that evaluates with workers "
-                "must do so under `if __name__ == '__main__':`"
+                f"a worker process could not start ({cause}): the task could not be built there; a script that "
+                "evaluates with workers must do so under `if __name__ == '__main__':`"
             )
         if worker.job is None:
             return
