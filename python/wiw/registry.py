@@ -15,7 +15,12 @@ import importlib
 import importlib.util
 import inspect
 import sys
+import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from hashlib import blake2b
+from importlib.machinery import SourceFileLoader
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -33,6 +38,8 @@ class Registry:
     """Entry-point group."""
     built_in: dict[str, str]
     """Name to `module:attribute`."""
+    base: str = ""
+    """`module:class` that things of this kind derive from, if they have to."""
 
     def names(self) -> list[str]:
         """All registered names, built-in ones first."""
@@ -42,15 +49,16 @@ class Registry:
         """The class or factory behind a name or path.
 
         Raises:
-            RegistryError: unknown name, missing file, module or attribute; the message says which names exist.
+            RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
+                cause); a class of another kind.
         """
         if name in self.built_in:
-            return self._load(name, self.built_in[name])
+            return self._load(name, partial(_attribute, self.built_in[name]))
         plugins = self._plugins()
         if name in plugins:
-            return plugins[name].load()
+            return self._load(name, plugins[name].load)
         if ":" in name:
-            return self._load(name, name)
+            return self._load(name, partial(_attribute, name))
         near = difflib.get_close_matches(name, self.names(), n=3)
         hint = f" Did you mean {' or '.join(near)}?" if near else ""
         raise RegistryError(
@@ -68,41 +76,75 @@ class Registry:
         if not callable(factory) or (not inspect.isclass(factory) and not inspect.isfunction(factory)):
             if options:
                 raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
-            return factory
+            return self._checked(what, factory)
         try:
             inspect.signature(factory).bind(**options)
         except TypeError as error:
             raise RegistryError(f"{self.kind} '{what}': {error}; it takes {inspect.signature(factory)}") from None
-        return factory(**options)
+        return self._checked(what, factory(**options))
 
     def _plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)}
 
-    def _load(self, name: str, path: str) -> Any:
-        module_name, _, attribute = path.rpartition(":")
+    def _load(self, name: str, load: Callable[[], Any]) -> Any:
         try:
-            module = (
-                _import_file(Path(module_name)) if module_name.endswith(".py") else importlib.import_module(module_name)
-            )
-            return getattr(module, attribute)
-        except (FileNotFoundError, ModuleNotFoundError, AttributeError) as error:
-            raise RegistryError(f"{self.kind} '{name}' cannot be loaded: {error}") from error
+            found = load()
+        except Exception as error:
+            raise RegistryError(
+                f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
+            ) from error
+        return self._checked(name, found) if inspect.isclass(found) else found
+
+    def _checked(self, name: Any, thing: Any) -> Any:
+        """The class or instance, if it is of this kind; None stands for "without"."""
+        if not self.base or thing is None:
+            return thing
+        module, _, attribute = self.base.partition(":")
+        base = getattr(importlib.import_module(module), attribute)
+        if issubclass(thing, base) if inspect.isclass(thing) else isinstance(thing, base):
+            return thing
+        raise RegistryError(f"'{name}' is no {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}")
+
+
+def _attribute(path: str) -> Any:
+    """What `path.py:Name` or `package.module:Name` names."""
+    module_name, _, attribute = path.rpartition(":")
+    file = module_name.endswith(".py")
+    return getattr(_import_file(Path(module_name)) if file else importlib.import_module(module_name), attribute)
 
 
 def _import_file(path: Path) -> Any:
-    """The module in a Python file, under a name of its own so that worker processes can load it again."""
+    """The module in a Python file, as the file is now: once edited, it is imported anew.
+
+    Its folder is put first on the path, as for a script, so that it finds the modules beside it.
+    """
     path = path.expanduser().resolve()
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
-    name = f"wiw_user_{path.stem}_{abs(hash(path)):x}"
+    status = path.stat()
+    identity = f"{path} {status.st_mtime_ns} {status.st_size}".encode()
+    name = f"wiw_user_{path.stem}_{blake2b(identity, digest_size=8).hexdigest()}"
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
+    loader = SourceFileLoader(name, str(path))
+    module = importlib.util.module_from_spec(importlib.util.spec_from_loader(name, loader))  # type: ignore[arg-type]
     sys.modules[name] = module
-    spec.loader.exec_module(module)
+    try:  # from the source itself: bytecode on disk tells edits of the same length in the same second not apart
+        exec(loader.source_to_code(path.read_bytes(), str(path)), module.__dict__)
+    except BaseException:
+        del sys.modules[name]
+        raise
     return module
+
+
+def _where(error: BaseException) -> str:
+    """E.g. " (model.py, line 3)": where an import was left, since the message alone may not tell."""
+    if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) or error.__traceback__ is None:
+        return ""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    return f" ({Path(frame.filename).name}, line {frame.lineno})"
 
 
 WORLD_MODELS = Registry(
@@ -114,6 +156,7 @@ WORLD_MODELS = Registry(
         "warp": "wiw.world_models.warp:Warp",
         "oracle": "wiw.world_models.oracle:Oracle",
     },
+    "wiw.world_models.base:WorldModel",
 )
 POLICIES = Registry(
     "policy",
@@ -124,6 +167,7 @@ POLICIES = Registry(
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
     },
+    "wiw.policies.base:Policy",
 )
 TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"})
 METRICS = Registry(
@@ -197,4 +241,9 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
 
 
 def _task(task_id: str, options: dict[str, Any]) -> Any:
-    return TASKS.make(task_id.removesuffix("-v0").lower(), **options)
+    return TASKS.make(task_name(task_id), **options)
+
+
+def task_name(task_id: str) -> str:
+    """The registered name behind a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths as they are."""
+    return task_id if ":" in task_id or task_id in TASKS.names() else task_id.removesuffix("-v0").lower()

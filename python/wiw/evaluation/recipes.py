@@ -130,7 +130,9 @@ def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskReci
         ArgumentError: options for a task that is already made.
     """
     if isinstance(task, str):
-        return TaskRecipe(task.removesuffix("-v0").lower() if task.endswith("-v0") else task, dict(options or {}))
+        from wiw.registry import task_name
+
+        return TaskRecipe(task_name(task), dict(options or {}))
     if options:
         raise ArgumentError(f"the task is made already and cannot take {', '.join(options)}; give them to wiw.make")
     if isinstance(task, TaskRecipe):

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How things are found by `path.py:Class` and `package.module:Class`."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+import wiw
+from wiw.errors import RegistryError
+from wiw.registry import POLICIES, TASKS, WORLD_MODELS, Registry
+
+MODEL = """
+import numpy as np
+import wiw
+
+
+class Mine(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", causal=True)
+    steps = {steps}
+
+    def rollout(self, observations, controls, seeds):
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [*sys.path])
+
+
+def test_a_file_that_was_mended_is_imported_again(tmp_path: Path) -> None:
+    file = tmp_path / "model.py"
+    file.write_text("import numpy\nraise OSError('no weights')\n")
+    for _ in range(2):
+        with pytest.raises(RegistryError, match=r"OSError: no weights \(model\.py, line 2\)") as caught:
+            WORLD_MODELS.find(f"{file}:Mine")
+        assert isinstance(caught.value.__cause__, OSError)
+    file.write_text(MODEL.format(steps=1))
+    assert WORLD_MODELS.make(f"{file}:Mine").steps == 1
+
+
+@pytest.mark.parametrize("broken", ["class Mine(:\n", "import nothing_of_this_name\n", "1 / 0\n", "x = 1\n"])
+def test_whatever_an_import_raises_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str) -> None:
+    file = tmp_path / "broken_model.py"
+    file.write_text(broken)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in (f"{file}:Mine", "broken_model:Mine"):
+        with pytest.raises(RegistryError, match=r"world model .* cannot be loaded") as caught:
+            WORLD_MODELS.find(name)
+        assert caught.value.__cause__ is not None
+
+
+def test_an_edited_file_gives_the_new_class_and_an_untouched_one_the_same(tmp_path: Path) -> None:
+    file = tmp_path / "model.py"
+    file.write_text(MODEL.format(steps=1))
+    first = WORLD_MODELS.find(f"{file}:Mine")
+    assert WORLD_MODELS.find(f"{file}:Mine") is first
+    for steps in (2, 3, 4):
+        file.write_text(MODEL.format(steps=steps))
+        assert WORLD_MODELS.find(f"{file}:Mine").steps == steps
+    assert first.steps == 1
+
+
+def test_a_file_finds_the_modules_beside_it(tmp_path: Path) -> None:
+    (tmp_path / "helper_beside_the_model.py").write_text("STEPS = 7\n")
+    (tmp_path / "model.py").write_text(MODEL.format(steps="__import__('helper_beside_the_model').STEPS"))
+    assert WORLD_MODELS.find(f"{tmp_path / 'model.py'}:Mine").steps == 7
+
+
+def test_a_files_module_has_the_same_name_in_every_process(tmp_path: Path) -> None:
+    (tmp_path / "model.py").write_text(MODEL.format(steps=1))
+    code = f"import wiw.registry as r; print(r.WORLD_MODELS.find({str(tmp_path / 'model.py')!r} + ':Mine').__module__)"
+    names = set()
+    for seed in ("1", "2"):
+        environment = {**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)}
+        names.add(subprocess.check_output([sys.executable, "-c", code], env=environment, text=True).strip())
+    assert len(names) == 1
+
+
+def test_plugins_are_loaded_by_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = {
+        "floor": EntryPoint("floor", "wiw.world_models.copy:Copy", "wiw.world_models"),
+        "gone": EntryPoint("gone", "no_such_package:Model", "wiw.world_models"),
+    }
+    monkeypatch.setattr(Registry, "_plugins", lambda self: points)
+    assert WORLD_MODELS.make("floor") is not None and "floor" in WORLD_MODELS.names()
+    with pytest.raises(RegistryError, match="'gone' cannot be loaded: ModuleNotFoundError"):
+        WORLD_MODELS.find("gone")
+
+
+def test_a_class_of_another_kind_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thing.py").write_text("class Thing:\n    pass\n\n\ndef maker():\n    return Thing()\n")
+    for registry, base in ((WORLD_MODELS, "WorldModel"), (POLICIES, "Policy")):
+        for name in ("Thing", "maker"):
+            with pytest.raises(RegistryError, match=f"is no {registry.kind}: expected a class derived .*{base}"):
+                registry.make(f"{tmp_path / 'thing.py'}:{name}")
+        with pytest.raises(RegistryError, match=f"is no {registry.kind}"):
+            registry.make(object())
+    with pytest.raises(RegistryError, match="is no world model"):
+        wiw.Agent("heuristic", f"{tmp_path / 'thing.py'}:Thing")
+    assert WORLD_MODELS.make("none") is None
+
+
+def test_task_ids_and_paths_keep_their_case(tmp_path: Path, two_rooms: str) -> None:
+    (tmp_path / "task.py").write_text("from wiw.tasks.imagenav import ImageNav\n\n\nclass Mine(ImageNav):\n    pass\n")
+    for name in ("ImageNav-v0", "imagenav", "ImageNav", f"{tmp_path / 'task.py'}:Mine"):
+        assert wiw.make(name, scenes=two_rooms).task.scenes == two_rooms
+    assert type(TASKS.make(f"{tmp_path / 'task.py'}:Mine")).__name__ == "Mine"
