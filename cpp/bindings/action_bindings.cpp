@@ -46,14 +46,16 @@ py::array_t<double> gripper_array(std::span<const GripperPose> poses) {
 /// The trajectory of each plan of a batch [..., K], with the start in front where asked for.
 std::vector<PlanarPose> trajectories(const ActionArray& actions, const ActionSpace& space, bool start) {
   const auto length = static_cast<std::size_t>(actions.shape.back());
+  std::size_t plans = 1;
+  for (std::size_t axis = 0; axis + 1 < actions.shape.size(); ++axis) {
+    plans *= static_cast<std::size_t>(actions.shape[axis]);
+  }
   std::vector<PlanarPose> poses;
-  const std::size_t plans = length == 0 ? 0 : actions.values.size() / length;
   for (std::size_t i = 0; i < plans; ++i) {
     if (start) poses.emplace_back();
     const auto path = to_trajectory(std::span(actions.values).subspan(i * length, length), space);
     poses.insert(poses.end(), path.begin(), path.end());
   }
-  if (start && length == 0 && actions.shape.size() == 1) poses.emplace_back();
   return poses;
 }
 

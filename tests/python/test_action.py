@@ -58,6 +58,17 @@ def test_batches_and_the_start():
     assert action.to_trajectory([], include_start=True).shape == (1, 3)
 
 
+@pytest.mark.parametrize("shape", [(2, 0), (3, 2, 0), (0, 0), (0, 4), (2, 0, 4)])
+def test_each_plan_has_one_start_however_short_and_few_the_plans(shape):
+    plans = np.zeros(shape, int)
+    full = (*shape[:-1], shape[-1] + 1)
+    start = action.to_trajectory(plans, include_start=True)
+    assert start.shape == (*full, 3) and not start.any()
+    cameras = action.to_viewpoints(plans, include_start=True)
+    np.testing.assert_array_equal(cameras, np.broadcast_to(np.eye(4), (*full, 4, 4)))
+    assert action.to_trajectory(plans).shape == (*shape, 3)
+
+
 def test_step_sizes_are_configurable():
     space = action.ActionSpace(forward_m=0.25, turn_deg=30)
     np.testing.assert_allclose(action.to_trajectory([2, 1], space), walk([2, 1], 0.25, math.radians(30)))
