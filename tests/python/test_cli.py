@@ -32,7 +32,9 @@ def test_help_teaches_by_examples(capsys):
         with pytest.raises(SystemExit) as stop:
             main([*command, "--help"])
         assert stop.value.code == 0
-        assert example in " ".join(capsys.readouterr().out.split())
+        printed = capsys.readouterr().out
+        assert example in " ".join(printed.split())
+        assert len({line.index("$ wiw") for line in printed.splitlines() if "$ wiw" in line}) == 1, "not aligned"
 
 
 def test_no_command_shows_help_and_a_wrong_one_is_refused(capsys):

@@ -21,7 +21,7 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     candidate plans would lead: not at all (none), into a world where nothing moves (copy, the floor), into its own
     view warped by depth (warp), or into the true future (oracle, the ceiling).
 
-      $ wiw demo
+    $ wiw demo
 
     Args:
         out: Folder of the run; runs/demo-TIME if not given.

@@ -17,8 +17,8 @@ def report(
 ) -> int:
     """Prints the table of a run and writes its HTML report: one file that needs nothing else.
 
-      $ wiw report runs/first
-      $ wiw report runs/first --out first.html
+    $ wiw report runs/first
+    $ wiw report runs/first --out first.html
 
     Also works while the run is going on.
 

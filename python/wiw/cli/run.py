@@ -44,10 +44,10 @@ def run(
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
 
-      $ wiw run imagenav --world-model warp --episodes 50
-      $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
-      $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
-      $ wiw run imagenav --scenes house.glb --world-model warp
+    $ wiw run imagenav --world-model warp --episodes 50
+    $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
+    $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
+    $ wiw run imagenav --scenes house.glb --world-model warp
 
     Ctrl-C or SIGTERM stops a run without loss; `wiw resume` goes on with it.
 
@@ -102,7 +102,7 @@ def resume(
 ) -> int:
     """Goes on with a run that was stopped: only the episodes that have not ended are run.
 
-      $ wiw resume runs/first
+    $ wiw resume runs/first
 
     Args:
         run: The run's folder.

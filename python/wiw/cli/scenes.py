@@ -19,8 +19,8 @@ def scenes(
 ) -> int:
     """Loads scenes, says how large they are, and draws a sheet: each from above, and panoramas from inside.
 
-      $ wiw scenes apartments:val:4
-      $ wiw scenes house.glb --out house.png
+    $ wiw scenes apartments:val:4
+    $ wiw scenes house.glb --out house.png
 
     Args:
         spec: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
