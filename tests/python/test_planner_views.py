@@ -119,3 +119,13 @@ def test_impossible_views_are_refused():
     for arguments in (("front", (0, 5)), ("front", (5, 5), 180), ("panorama", (8, 15))):
         with pytest.raises(ArgumentError):
             planner.ViewMaker(*arguments)
+
+
+@pytest.mark.parametrize("empty", [(64, 0), (0, 128)])
+def test_images_without_a_pixel_are_refused(empty):
+    batch = planner.Batch.build([[[1]]])
+    for maker in (planner.ViewMaker("panorama", (64, 128)), planner.ViewMaker("front", (48, 48))):
+        with pytest.raises(ArgumentError, match="panorama size"):
+            batch.observations(np.zeros((1, *empty, 3), np.uint8), maker)
+        with pytest.raises(ArgumentError, match="panorama size"):
+            batch.views(PANORAMA[None], [np.zeros((1, 2, *empty, 3), np.uint8)], maker)

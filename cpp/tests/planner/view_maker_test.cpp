@@ -62,6 +62,22 @@ TEST_CASE("perspective frames can only be the front") {
       ArgumentError);
 }
 
+TEST_CASE("images without a pixel are refused") {
+  const std::uint8_t* const none = nullptr;
+  std::vector<std::uint8_t> out(3 * 8 * 16);
+  for (const Size empty : {Size{64, 0}, Size{0, 128}, Size{0, 0}}) {
+    for (const ViewKind kind : {ViewKind::kPanorama, ViewKind::kFront}) {
+      const ViewMaker maker({.kind = kind, .size = {8, 16}});
+      for (const double yaw : {0.0, 0.3}) {
+        CHECK_THROWS_AS(maker.from_panorama(none, empty, yaw, out.data()), ArgumentError);
+        CHECK_THROWS_AS(maker.depth(nullptr, empty, yaw, nullptr), ArgumentError);
+      }
+    }
+    const ViewMaker front({.kind = ViewKind::kFront, .size = {8, 8}});
+    CHECK_THROWS_AS(front.from_perspective(none, empty, out.data()), ArgumentError);
+  }
+}
+
 TEST_CASE("depth becomes planar in a perspective view") {
   const std::vector<float> sphere(kPanorama.pixels(), 2.0f);
   const ViewMaker maker({.kind = ViewKind::kFront, .size = {9, 9}});

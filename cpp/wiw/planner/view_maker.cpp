@@ -55,6 +55,7 @@ void ViewMaker::from_panorama(const std::uint8_t* panorama, Size size, double ya
 }
 
 void ViewMaker::resize_panorama(const std::uint8_t* panorama, Size size, double yaw, std::uint8_t* out) const {
+  panorama::check_panorama_size(size);
   const ImageView<const std::uint8_t> source{panorama, size, 3};
   if (size == spec_.size) {
     panorama::rotate(source, yaw, panorama::Interpolation::kBilinear, out);

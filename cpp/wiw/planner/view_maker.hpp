@@ -40,7 +40,7 @@ class ViewMaker {
   /// Bytes of all views of one observation, [count, height, width, 3].
   [[nodiscard]] std::size_t bytes() const { return 3 * spec_.size.pixels() * static_cast<std::size_t>(count()); }
 
-  /// Views of a panorama after a left turn by `yaw` radians.
+  /// Views of a panorama after a left turn by `yaw` radians. Throws ArgumentError for a size no panorama has.
   void from_panorama(const std::uint8_t* panorama, Size size, double yaw, std::uint8_t* out) const;
   /// A perspective frame (HFOV 90 degrees) as the front view. Throws ArgumentError where the spec asks for more than
   /// such a frame shows.
