@@ -35,6 +35,13 @@ inline ActionArray to_actions(const py::array& array) {
   return actions;
 }
 
+/// An array, or what NumPy makes of a sequence.
+inline py::array to_array(const py::handle& object) {
+  const py::array array = py::array::ensure(py::reinterpret_borrow<py::object>(object));
+  if (!array) throw ArgumentError("expected a plan of action ids [K], got " + std::string(py::repr(object)));
+  return array;
+}
+
 /// One plan: ids of shape [K].
 inline std::vector<Action> to_plan(const py::array& array) {
   ActionArray actions = to_actions(array);

@@ -18,12 +18,7 @@ void bind_core(py::module_& module) {
       "num_threads", [] { return wiw::ThreadPool::shared().size(); },
       "Threads of the shared pool (the machine's cores, or WIW_NUM_THREADS).");
   module.def(
-      "fold_key",
-      [](const std::vector<std::uint64_t>& parts) {
-        std::uint64_t key = wiw::fold_key({});
-        for (const std::uint64_t part : parts) key = wiw::fold_key({key, part});
-        return key;
-      },
+      "fold_key", [](const std::vector<std::uint64_t>& parts) { return wiw::fold_key(std::span(parts)); },
       py::arg("parts"), "Mixes integers, e.g. (run seed, episode, decision, candidate), into one uint64 key.");
   module.def(
       "uniform",

@@ -8,7 +8,6 @@
 #include "actions.hpp"
 #include "wiw/planner/assemble.hpp"
 #include "wiw/planner/beam_search.hpp"
-#include "wiw/planner/seeds.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -40,17 +39,12 @@ Bytes to_bytes(const py::array& array, const char* expected) {
   return Bytes(array);
 }
 
-ActionSequence plan_of(const py::handle& object) {
-  const py::array array = py::array::ensure(py::reinterpret_borrow<py::object>(object));
-  if (!array) throw ArgumentError("expected a plan of action ids [K], got " + std::string(py::repr(object)));
-  return to_plan(array);
-}
-
 Plans plans_of(const py::sequence& episodes) {
   Plans plans;
   for (const py::handle& episode : episodes) {
     auto& candidates = plans.emplace_back();
-    for (const py::handle& plan : py::reinterpret_borrow<py::sequence>(episode)) candidates.push_back(plan_of(plan));
+    for (const py::handle& plan : py::reinterpret_borrow<py::sequence>(episode))
+      candidates.push_back(to_plan(to_array(plan)));
   }
   return plans;
 }
@@ -477,12 +471,4 @@ void bind_planner(py::module_& module) {
   bind_views(module);
   bind_batch(module);
   bind_beam(module);
-  module.def(
-      "candidate_seeds",
-      [](std::uint64_t run_seed, std::uint64_t episode, std::uint64_t decision, std::size_t count) {
-        py::array_t<std::uint64_t> seeds(static_cast<py::ssize_t>(count));
-        candidate_seeds(run_seed, episode, decision, std::span(seeds.mutable_data(), count));
-        return seeds;
-      },
-      py::arg("run_seed"), py::arg("episode"), py::arg("decision"), py::arg("count"), "uint64 [count].");
 }

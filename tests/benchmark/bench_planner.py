@@ -13,7 +13,7 @@ import numpy as np
 from harness import measure, optional, report, spread
 
 import wiw
-from wiw._core import planner
+from wiw._core import core, planner
 from wiw.types import Goal, Key, Observation, Proposal
 
 PANORAMA = (576, 1024)
@@ -53,7 +53,7 @@ class Decision:
     def __call__(self) -> np.ndarray:
         search = planner.BeamSearch(1)
         batch = planner.Batch.build(search.ask([self.plans]), self.spec)
-        seeds = planner.candidate_seeds(0, 0, 0, batch.candidates)[batch.row_owner]
+        seeds = [core.fold_key([0, 0, 0, candidate]) for candidate in batch.row_owner.tolist()]
         observations = batch.observations(self.panoramas, self.conditioning)
         assert len(seeds) == len(observations)
         assert all(len(part.trajectories) == len(part.rows) for part in batch.parts)

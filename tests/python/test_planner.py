@@ -192,14 +192,6 @@ def test_beam_search_equals_brute_force(width, depth, count, seed):
         assert got == brute_force_beam(width, depth, propose(episode), score)
 
 
-def test_seeds_are_keys_not_streams():
-    seeds = planner.candidate_seeds(7, 3, 2, 8)
-    assert seeds.dtype == np.uint64
-    np.testing.assert_array_equal(seeds[:3], planner.candidate_seeds(7, 3, 2, 3))
-    others = [planner.candidate_seeds(*key, 8) for key in ((8, 3, 2), (7, 2, 3), (7, 3, 1))]
-    assert len(set(np.concatenate([seeds, *others]).tolist())) == 32
-
-
 def test_wrong_arguments_name_the_cure():
     with pytest.raises(ArgumentError, match="frames"):
         planner.ModelSpec(frames=1)

@@ -19,11 +19,18 @@ TEST_CASE("Philox4x32-10 gives the known answers of the Random123 distribution")
 TEST_CASE("keys depend on order and on every part") {
   CHECK(fold_key({1, 2}) != fold_key({2, 1}));
   CHECK(fold_key({1}) != fold_key({1, 0}));
+  CHECK(mix_key(1, 2) != mix_key(2, 1));
   std::set<std::uint64_t> keys;
   for (std::uint64_t episode = 0; episode < 100; ++episode) {
     for (std::uint64_t decision = 0; decision < 20; ++decision) keys.insert(fold_key({7, episode, decision}));
   }
   CHECK(keys.size() == 2000);
+}
+
+TEST_CASE("the key of a candidate is the one that runs on record were made with") {
+  CHECK(fold_key({}) == kRootKey);
+  CHECK(fold_key({0, 17, 3, 2}) == 15280227715066993766ull);
+  CHECK(fold_key({~std::uint64_t{0}, 5}) == 5845624468492206058ull);
 }
 
 TEST_CASE("uniform numbers fill [0, 1) evenly") {

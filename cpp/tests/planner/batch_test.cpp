@@ -4,7 +4,6 @@
 #include <doctest/doctest.h>
 
 #include "wiw/core/error.hpp"
-#include "wiw/planner/seeds.hpp"
 
 using namespace wiw;
 using enum Action;
@@ -87,16 +86,4 @@ TEST_CASE("impossible models are refused") {
   CHECK_THROWS_AS(Batch({}, {.frames = 1}), ArgumentError);
   CHECK_THROWS_AS(Batch({}, {.max_rows = -1}), ArgumentError);
   CHECK(Batch({}, {}).parts().empty());
-}
-
-TEST_CASE("seeds depend on every part of the key") {
-  std::vector<std::uint64_t> a(3);
-  std::vector<std::uint64_t> b(2);
-  candidate_seeds(1, 2, 3, a);
-  candidate_seeds(1, 2, 3, b);
-  CHECK(a[0] == b[0]);
-  CHECK(a[1] == b[1]);
-  CHECK(a[0] != a[1]);
-  candidate_seeds(1, 3, 2, b);
-  CHECK(a[0] != b[0]);
 }

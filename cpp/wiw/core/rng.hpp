@@ -4,6 +4,7 @@
 #include <array>
 #include <cstdint>
 #include <initializer_list>
+#include <span>
 
 namespace wiw {
 
@@ -20,17 +21,26 @@ inline std::array<std::uint32_t, 4> philox4x32(std::array<std::uint32_t, 4> coun
   return counter;
 }
 
-/// Folds a list of integers, e.g. (run seed, episode, decision, candidate), into one well-mixed 64-bit key.
-/// Order matters; every prefix gives an unrelated key.
-inline std::uint64_t fold_key(std::initializer_list<std::uint64_t> parts) {
-  std::uint64_t key = 0x243F6A8885A308D3ull;
-  for (const std::uint64_t part : parts) {
-    const auto block =
-        philox4x32({static_cast<std::uint32_t>(part), static_cast<std::uint32_t>(part >> 32), 0x77697700u, 0u},
-                   {static_cast<std::uint32_t>(key), static_cast<std::uint32_t>(key >> 32)});
-    key = (static_cast<std::uint64_t>(block[1]) << 32) | block[0];
-  }
+/// The key before any part: the first digits of pi behind the point.
+inline constexpr std::uint64_t kRootKey = 0x243F6A8885A308D3ull;
+
+/// Mixes one integer into a key; the results of different integers are unrelated.
+inline std::uint64_t mix_key(std::uint64_t key, std::uint64_t part) {
+  const auto block =
+      philox4x32({static_cast<std::uint32_t>(part), static_cast<std::uint32_t>(part >> 32), 0x77697700u, 0u},
+                 {static_cast<std::uint32_t>(key), static_cast<std::uint32_t>(key >> 32)});
+  return (static_cast<std::uint64_t>(block[1]) << 32) | block[0];
+}
+
+/// Folds integers, e.g. (run seed, episode, decision, candidate), into one well-mixed 64-bit key: each part with the
+/// key of those before it. Order matters; every prefix gives an unrelated key.
+inline std::uint64_t fold_key(std::span<const std::uint64_t> parts) {
+  std::uint64_t key = kRootKey;
+  for (const std::uint64_t part : parts) key = mix_key(mix_key(kRootKey, key), part);
   return key;
+}
+inline std::uint64_t fold_key(std::initializer_list<std::uint64_t> parts) {
+  return fold_key(std::span(parts.begin(), parts.size()));
 }
 
 /// Counter-based generator: the stream is a function of its key alone, so results depend neither on the order in
@@ -40,7 +50,6 @@ class Rng {
  public:
   using result_type = std::uint32_t;
   explicit Rng(std::uint64_t key) : key_{static_cast<std::uint32_t>(key), static_cast<std::uint32_t>(key >> 32)} {}
-  Rng(std::initializer_list<std::uint64_t> parts) : Rng(fold_key(parts)) {}
 
   static constexpr result_type min() { return 0; }
   static constexpr result_type max() { return 0xFFFFFFFFu; }

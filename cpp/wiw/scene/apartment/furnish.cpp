@@ -48,7 +48,7 @@ class Furnisher {
 
   void build(const Placed& piece) {
     const Category& category = catalogue()[piece.category];
-    Rng rng(fold_key({piece.key, 1}));
+    Rng rng(stream_key({piece.key, 1}));
     Make make{piece.size, rng, draft_.materials, draft_.palette.rooms[static_cast<std::size_t>(room_)]};
     make.on = is_on(category);
     category.make(make);
@@ -100,8 +100,8 @@ class Furnisher {
         if (prior.room != plan().type) continue;
         for (int i = 0; i < prior.most && rng_.chance(prior.chance); ++i) {
           Placed piece{index, room_};
-          piece.key = fold_key({draft_.seed, static_cast<std::uint64_t>(Stream::kObjects),
-                                static_cast<std::uint64_t>(room_), index, ++count});
+          piece.key = stream_key({draft_.seed, static_cast<std::uint64_t>(Stream::kObjects),
+                                  static_cast<std::uint64_t>(room_), index, ++count});
           Rng own(piece.key);
           for (int axis = 0; axis < 3; ++axis)
             piece.size[axis] = range(own, category.smallest[axis], category.largest[axis]);

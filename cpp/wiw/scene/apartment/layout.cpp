@@ -312,7 +312,7 @@ bool is_connectable(const Draft& draft) {
 /// A signature's owner: half of them train, a quarter each val and test.
 Split owner(const std::string& signature) {
   std::uint64_t key = 0x5EED;
-  for (const char c : signature) key = fold_key({key, static_cast<std::uint64_t>(c)});
+  for (const char c : signature) key = stream_key({key, static_cast<std::uint64_t>(c)});
   const std::array<Split, 4> kOwners{Split::kTrain, Split::kTrain, Split::kVal, Split::kTest};
   return kOwners[key & 3u];
 }

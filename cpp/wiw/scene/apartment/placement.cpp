@@ -108,8 +108,8 @@ Rect footprint(const Placed& piece) {
 Placed RoomPlan::design(std::size_t category) {
   const Category& row = catalogue()[category];
   Placed piece{category, room};
-  piece.key = fold_key({seed, static_cast<std::uint64_t>(Stream::kFurniture), static_cast<std::uint64_t>(room),
-                        category, pieces.size()});
+  piece.key = stream_key({seed, static_cast<std::uint64_t>(Stream::kFurniture), static_cast<std::uint64_t>(room),
+                          category, pieces.size()});
   Rng own(piece.key);
   for (int axis = 0; axis < 3; ++axis) piece.size[axis] = range(own, row.smallest[axis], row.largest[axis]);
   return piece;
