@@ -3,7 +3,7 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include "arrays.hpp"
+#include "actions.hpp"
 #include "wiw/env/vector_env.hpp"
 
 namespace py = pybind11;
@@ -11,21 +11,6 @@ using namespace wiw;
 using namespace wiw::bindings;
 
 namespace {
-
-std::vector<Action> to_actions(const Array<std::int8_t>& ids) {
-  expect_shape(ids, {-1}, "actions int8 [K]");
-  std::vector<Action> actions;
-  for (py::ssize_t i = 0; i < ids.size(); ++i) actions.push_back(to_action(ids.at(i)));
-  return actions;
-}
-
-py::array_t<double> to_array(const std::vector<Pose>& poses) {
-  py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{4}, py::ssize_t{4}});
-  for (std::size_t i = 0; i < poses.size(); ++i) {
-    Eigen::Map<Eigen::Matrix<double, 4, 4, Eigen::RowMajor>>(array.mutable_data() + 16 * i) = poses[i].matrix();
-  }
-  return array;
-}
 
 /// Allocates what `outputs` names, batch-major with `batch` as first axis, or without it when `batch` is 0.
 struct Images {
@@ -101,10 +86,10 @@ void bind_env(py::module_& module) {
           "A copy that moves on its own in the same world.")
       .def(
           "camera_poses_after",
-          [](const NavigationEnv& env, const Array<std::int8_t>& actions) {
-            return to_array(env.camera_poses_after(to_actions(actions)));
+          [](const NavigationEnv& env, const py::object& actions) {
+            return matrix_array(env.camera_poses_after(to_plan(to_array(actions))));
           },
-          py::arg("actions"), "float64 [K, 4, 4]: camera poses after each of int8 [K] primitives; nothing moves.")
+          py::arg("actions"), "float64 [K, 4, 4]: camera poses after each of [K] integer primitives; nothing moves.")
       .def(
           "observe",
           [](const NavigationEnv& env, const std::vector<std::string>& outputs) {
@@ -126,8 +111,8 @@ void bind_env(py::module_& module) {
       .def("__setitem__", &VectorEnv::replace, "Puts a copy of another environment in a place.")
       .def(
           "step",
-          [](VectorEnv& envs, const Array<std::int8_t>& ids) {
-            const std::vector<Action> actions = to_actions(ids);
+          [](VectorEnv& envs, const py::object& ids) {
+            const std::vector<Action> actions = to_plan(to_array(ids));
             py::array_t<bool> moved(static_cast<py::ssize_t>(envs.size()));
             const std::span<bool> view(moved.mutable_data(), envs.size());
             {
@@ -136,7 +121,7 @@ void bind_env(py::module_& module) {
             }
             return moved;
           },
-          py::arg("actions"), "int8 [N] primitives, one each; bool [N]: whose pose changed.")
+          py::arg("actions"), "[N] integer primitives, one each; bool [N]: whose pose changed.")
       .def(
           "observe",
           [](VectorEnv& envs, const std::vector<std::string>& outputs) {

@@ -134,3 +134,20 @@ def test_wrong_use_says_what_was_expected(two_rooms: str) -> None:
         vector.reset(options={"episode": [1]})
     with pytest.raises(ArgumentError, match="num_envs"):
         make(two_rooms, places=0)
+
+
+def test_the_core_takes_whole_primitives_only(two_rooms: str) -> None:
+    vector = make(two_rooms, 2, depth=False)
+    vector.reset()
+    core = vector._core
+    before = core[0].T_world_camera
+    for wrong in ([258, 258], [2.9, 2.0], [-1, 1], [2**40, 1], [1], [[1, 2]], "12"):
+        with pytest.raises(ArgumentError):
+            core.step(wrong)
+        with pytest.raises(ArgumentError):
+            core[0].camera_poses_after([wrong, wrong] if wrong == [1] else wrong)
+    np.testing.assert_array_equal(core[0].T_world_camera, before)
+    for ids in ([2, 3], np.array([2, 3], np.uint8), np.array([2, 3])):
+        assert core[0].camera_poses_after(ids).shape == (2, 4, 4)
+        assert core.step(ids).tolist() == [True, True]
+    assert core[0].camera_poses_after([]).shape == (0, 4, 4)
