@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wiw import _core
 from wiw.errors import ArgumentError
+from wiw.scenes import Scene
 
 Output = Literal["color", "depth", "instance"]
 OUTPUTS: tuple[Output, ...] = ("color", "depth", "instance")
@@ -84,6 +86,15 @@ class Renderer:
         if ids.size and (not np.issubdtype(ids.dtype, np.integer) or ids.min() < 0 or ids.max() > 0xFFFFFFFF):
             raise ArgumentError(f"expected instance_ids as unsigned integers [N], got {ids.dtype} {list(ids.shape)}")
         self._renderer.set_poses(ids.astype(np.uint32), np.asarray(T_world_instance, np.float32))
+
+
+@cache
+def resolve_backend(backend: Literal["auto", "cpu", "gpu"]) -> Literal["cpu", "gpu"]:
+    """The back end that "auto" stands for on this machine; the others as they are."""
+    if backend != "auto":
+        return backend
+    triangle = Scene.from_arrays([{"positions": np.eye(3, dtype=np.float32), "triangles": np.array([[0, 1, 2]])}])
+    return "gpu" if Renderer(triangle).description.startswith("gpu") else "cpu"
 
 
 def _prepare(

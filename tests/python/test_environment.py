@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import wiw
+import wiw.datasets.imagenav
+import wiw.tasks.imagenav
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets import episodes as episode_files
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
@@ -156,6 +157,24 @@ def test_episodes_are_out_of_sight_and_within_reach(two_rooms: str) -> None:
         assert 2 <= episode.geodesic <= 8
         assert episode.info["ideal_primitives"] <= 42
         assert np.sign(episode.start_position[0]) != np.sign(episode.goal_position[0])  # in different rooms
+
+
+def test_episodes_of_one_scene_are_each_made_once(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[int] = []
+    make = wiw.datasets.imagenav._episode
+    monkeypatch.setattr(
+        wiw.datasets.imagenav, "_episode", lambda world, index, *rest: made.append(index) or make(world, index, *rest)
+    )
+    episodes = ImageNav(scenes=Path(two_rooms), per_scene=2).episodes(6)
+    assert made == list(range(6))
+    assert episodes == ImageNav(scenes=two_rooms, per_scene=6).episodes(6)
+
+
+def test_the_renderer_is_part_of_what_a_task_is(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert ImageNav(scenes=two_rooms, backend="cpu").describe()["backend"] == "cpu"
+    assert ImageNav(scenes=two_rooms).describe()["backend"] in ("cpu", "gpu")
+    monkeypatch.setattr(wiw.tasks.imagenav, "resolve_backend", {"auto": "gpu"}.get)
+    assert ImageNav(scenes=two_rooms).describe()["backend"] == "gpu"
 
 
 def test_ideal_primitives_of_a_bend() -> None:

@@ -13,6 +13,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
+import wiw.tasks.imagenav
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
 from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
 from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
@@ -282,6 +283,18 @@ def test_a_run_is_resumed_from_another_folder(tmp_path, two_rooms, monkeypatch):
     monkeypatch.chdir(tmp_path)
     log = resume_run(tmp_path / "run", progress=False)
     assert [row["status"] for row in log.episodes] == ["done", "done"]
+
+
+def test_a_run_is_resumed_with_the_renderer_it_was_begun_with(tmp_path, two_rooms, monkeypatch):
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
+    log = evaluate(task, AgentRecipe("heuristic"), 1, out=tmp_path / "run", progress=False)
+    begun_with = log.store.config["task"]["backend"]
+    assert begun_with in ("cpu", "gpu") and log.store.info["task"]["options"]["backend"] == begun_with
+    now = {"auto": {"cpu": "gpu", "gpu": "cpu"}[begun_with], begun_with: begun_with}
+    monkeypatch.setattr(wiw.tasks.imagenav, "resolve_backend", now.get)
+    assert resume_run(tmp_path / "run", progress=False).complete
+    with pytest.raises(StoreError, match="backend"):
+        evaluate(task, AgentRecipe("heuristic"), 1, out=tmp_path / "run", resume=True, progress=False)
 
 
 def test_a_run_whose_scenes_are_gone_is_not_resumed(tmp_path, two_rooms):

@@ -130,6 +130,19 @@ def outcome(arm, episode, success, status="done", actions=30.0):
     return {"arm": arm, "episode": episode, "scene": f"s{episode % 3}", "status": status, "metrics": metrics}
 
 
+def shown(summary, width=100):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(summary)
+    return console.file.getvalue()
+
+
+def test_the_table_claims_the_same_episodes_only_where_they_are():
+    rows = [outcome(arm, i, 1) for arm in ("none", "warp") for i in range(3)]
+    assert "on the same episodes" in shown(summarise(["none", "warp"], rows, 3))
+    rows[-1] = outcome("warp", 2, 0, status="failed")
+    assert "each on the episodes that it has finished" in shown(summarise(["none", "warp"], rows, 3))
+
+
 def test_failed_episodes_are_left_out_and_counted():
     outcomes = [outcome("none", i, 0.0) for i in range(4)] + [outcome("warp", i, 1.0) for i in range(3)]
     outcomes.append(outcome("warp", 3, 0.0, status="failed"))

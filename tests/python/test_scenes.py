@@ -214,6 +214,16 @@ def test_unsupported_and_missing_files_are_named(tmp_path: Path) -> None:
         scenes.load(square(tmp_path), up="x")
 
 
+def test_a_file_may_be_called_like_the_apartments(tmp_path: Path) -> None:
+    mesh = square(tmp_path, "apartments_scan.glb")
+    assert scenes.resolve(mesh) == scenes.resolve(str(mesh)) == [str(mesh)]
+    assert scenes.resolve("apartments:val:2") == ["apartments:val/0", "apartments:val/1"]
+    with pytest.raises(ArgumentError, match="apartments:dev"):
+        scenes.resolve("apartments:dev")
+    with pytest.raises(FileError, match="no such file"):
+        scenes.resolve("apartments")
+
+
 def test_the_cache_is_used_and_follows_its_sources(tmp_path: Path, own_cache: Path) -> None:
     (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd photo.png\n")
     mesh = tmp_path / "m.obj"

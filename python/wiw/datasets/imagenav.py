@@ -33,13 +33,15 @@ class EpisodeRules:
     """Pairs tried per episode before giving up."""
 
 
-def generate(world: World, count: int, seed: int, rules: EpisodeRules = EpisodeRules()) -> list[Episode]:
-    """`count` episodes in one scene, a function of (scene, seed) alone; the first n do not depend on `count`.
+def generate(
+    world: World, count: int, seed: int, rules: EpisodeRules = EpisodeRules(), *, first: int = 0
+) -> list[Episode]:
+    """Episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
 
     Raises:
         ArgumentError: the scene has too few pairs of places that satisfy `rules`.
     """
-    return [_episode(world, index, seed, rules) for index in range(count)]
+    return [_episode(world, index, seed, rules) for index in range(first, first + count)]
 
 
 def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episode:

@@ -157,7 +157,9 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
     if arms is None:
         return {_own_arm(agent): agent_recipe(agent)}
     names = [_parts(str(name)) for name in arms]
-    made = {_arm_name(policy, model): _with_model(_with_policy(agent, policy), model) for policy, model in names}
+    made: dict[str, AgentRecipe | Ready] = {
+        _arm_name(policy, model): _with_model(_with_policy(agent, policy), model) for policy, model in names
+    }
     if not names or len(made) < len(names):
         raise ArgumentError(f"arms: expected different world models, got {[str(name) for name in arms]}")
     return made

@@ -41,6 +41,8 @@ class Summary:
     arms: tuple[ArmSummary, ...]
     differences: tuple[Difference, ...]
     """Each arm minus "none" and minus "copy", on the episodes that both have finished."""
+    same_episodes: bool
+    """Whether all arms have finished the same episodes, so that their lines can be compared as they stand."""
 
     def __getitem__(self, arm: str) -> ArmSummary:
         """The line of an arm."""
@@ -99,7 +101,7 @@ def summarise(
         for headline in _headlines(done)
         if base in arms and arm not in (base, "none") and (difference := compare(arm, base, done, headline, seed))
     )
-    return Summary(lines, differences)
+    return Summary(lines, differences, len({frozenset(ended) for ended in done.values()}) == 1)
 
 
 def _headlines(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Headline]:

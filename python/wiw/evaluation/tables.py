@@ -42,7 +42,8 @@ def _table(title: str) -> Table:
 
 
 def _arms(summary: Summary) -> Table:
-    table = _table("Arms, on the same episodes")
+    which = "on the same episodes" if summary.same_episodes else "each on the episodes that it has finished"
+    table = _table(f"Arms, {which}")
     counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in summary.arms)]
     _add_arm_column(table, [line.name for line in summary.arms])
     for headline in shown_headlines(summary):

@@ -17,6 +17,7 @@ from wiw.envs.navigation import NavigationEnv
 from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
 from wiw.errors import ArgumentError
+from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
 from wiw.types import Episode, Goal
@@ -86,16 +87,17 @@ class ImageNav:
 
     @staticmethod
     def portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """The same options, with paths that mean the same in any folder."""
+        """The same options, with paths that mean the same in any folder and the renderer that "auto" stands for."""
         ways: dict[str, Callable[[Any], str]] = {
             "scenes": absolute,
             "preset": presets.absolute,
+            "backend": resolve_backend,
             "episode_file": lambda path: str(Path(path).expanduser().absolute()),
             "scene_folder": lambda path: str(Path(path).expanduser().absolute()),
         }
         return {
             name: ways[name](value) if name in ways and value not in (None, "") else value
-            for name, value in options.items()
+            for name, value in {"backend": "auto", **options}.items()
         }
 
     @property
@@ -130,7 +132,8 @@ class ImageNav:
             if self.episode_file
             else {"scenes": self.scenes, "per_scene": self.per_scene}
         )
-        return {"task": self.name, "seed": self.seed, **source, **asdict(self.rules)}
+        backend = resolve_backend(self.backend)
+        return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules)}
 
     def environment(self, depth: bool = False) -> NavigationEnv:
         """A gymnasium environment of this task; `depth` adds it to the observations."""
@@ -177,7 +180,7 @@ class ImageNav:
 
     def goal(self, place: World, episode: Episode) -> Goal:
         """The goal image: front view at the goal's pose."""
-        pose = camera_pose(place.ground.put_down(episode.goal_position), episode.goal_yaw)
+        pose = camera_pose(np.asarray(place.ground.put_down(episode.goal_position), float), episode.goal_yaw)
         image = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("color",))["color"][0]
         return Goal(self.name, image=image)
 
@@ -217,7 +220,7 @@ class ImageNav:
 
     def _of_scene(self, scene: str, block: int) -> list[Episode]:
         """One block of episodes in one scene, numbered on from those before it."""
-        made = generate(world(scene, self.backend), self.per_scene * (block + 1), self.seed)[self.per_scene * block :]
+        made = generate(world(scene, self.backend), self.per_scene, self.seed, first=self.per_scene * block)
         return [replace(e, episode_id=f"{len(self._episodes) + i:04d}") for i, e in enumerate(made)]
 
 
