@@ -35,7 +35,7 @@ class Registry:
     kind: str
     """As in messages: "world model"."""
     group: str
-    """Entry-point group."""
+    """Entry-point group; empty where packages add none."""
     built_in: dict[str, str]
     """Name to `module:attribute`."""
     base: str = ""
@@ -63,7 +63,8 @@ class Registry:
         hint = f" Did you mean {' or '.join(near)}?" if near else ""
         raise RegistryError(
             f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
-            f"or give path.py:Class, package.module:Class, or an entry point in '{self.group}'."
+            + "or give path.py:Class, package.module:Class"
+            + (f", or an entry point in '{self.group}'." if self.group else ".")
         )
 
     def make(self, what: Any, **options: Any) -> Any:
@@ -84,7 +85,7 @@ class Registry:
         return self._checked(what, factory(**options))
 
     def _plugins(self) -> dict[str, Any]:
-        return {point.name: point for point in entry_points(group=self.group)}
+        return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
 
     def _load(self, name: str, load: Callable[[], Any]) -> Any:
         try:
@@ -172,7 +173,7 @@ POLICIES = Registry(
 TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"})
 METRICS = Registry(
     "metric",
-    "wiw.metrics",
+    "",
     {
         "success": "wiw.metrics.navigation:success_rate",
         "spl": "wiw.metrics.navigation:spl",

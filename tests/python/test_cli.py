@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import pytest
 from wiw.cli import main
 from wiw.cli.doctor import examine
 from wiw.evaluation.runlog import load_run
+from wiw.tasks.imagenav import ImageNav
 
 FAKES = Path(__file__).with_name("fakes.py")
 TASK = f"{FAKES}:line_task"
@@ -28,6 +30,7 @@ def test_help_teaches_by_examples(capsys):
         (["report"], "--out first.html"),
         (["scenes"], "apartments:val:4"),
         (["demo"], "oracle, the ceiling"),
+        (["episodes"], "--out val.json.gz"),
     ):
         with pytest.raises(SystemExit) as stop:
             main([*command, "--help"])
@@ -90,6 +93,44 @@ def test_failed_episodes_are_said_aloud_and_can_be_retried(tmp_path, capsys):
     assert "1 episode failed for infrastructure" in capsys.readouterr().err
     assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 0
     assert "no such scene" in capsys.readouterr().err
+
+
+@pytest.fixture
+def short(tmp_path):
+    """A preset of one decision."""
+    (tmp_path / "short.yaml").write_text("base: paper\ndecisions: 1\n")
+    return str(tmp_path / "short.yaml")
+
+
+def test_episodes_are_written_and_run_from_the_file(tmp_path, two_rooms, short, capsys, monkeypatch):
+    folder = tmp_path / "scans"
+    folder.mkdir()
+    for name in ("two_rooms.obj", "two_rooms.mtl"):
+        shutil.copy(Path(two_rooms).with_name(name), folder)
+    monkeypatch.chdir(tmp_path)
+    options = ["--episodes", "3", "--per-scene", "3", "--seed", "4"]
+    assert main(["episodes", "imagenav", "--scenes", "scans/two_rooms.obj", *options, "--out", "scans/e.json.gz"]) == 0
+    assert "3 episodes in 1 scene, " in capsys.readouterr().out
+    folder = folder.rename(tmp_path / "moved")
+    command = ["run", "imagenav", "--policy", "heuristic", "--episodes", "2", "--no-report", "--preset", short]
+    assert main([*command, "--episode-file", "moved/e.json.gz", "--out", "run"]) == 0
+    log = load_run("run")
+    task = ImageNav(scenes=folder / "two_rooms.obj", per_scene=3, seed=4)
+    assert log.store.episodes() == task.episodes(2)
+    assert [row["status"] for row in log.episodes] == ["done", "done"]
+    (tmp_path / "e.json.gz").write_bytes((folder / "e.json.gz").read_bytes())
+    assert main([*command, "--episode-file", "e.json.gz", "--out", "lost"]) == 2
+    assert "two_rooms.obj: no such file" in capsys.readouterr().err
+    assert main([*command, "--episode-file", "e.json.gz", "--scene-folder", "moved", "--out", "found"]) == 0
+    assert load_run("found").store.episodes() == task.episodes(2)
+    assert main(["episodes", "imagenav", "--scenes", "moved/two_rooms.obj", *options, "--out", "no/where.json"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_per_scene_is_an_option(tmp_path, two_rooms, short):
+    command = ["run", "imagenav", "--scenes", two_rooms, "--policy", "heuristic", "--preset", short, "--no-report"]
+    assert main([*command, "--episodes", "1", "--per-scene", "2", "--out", str(tmp_path / "run")]) == 0
+    assert load_run(tmp_path / "run").store.config["task"]["per_scene"] == 2
 
 
 def test_errors_are_one_clean_line(tmp_path, capsys):

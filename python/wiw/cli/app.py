@@ -14,6 +14,7 @@ import tyro
 import wiw
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
+from wiw.cli.episodes import episodes
 from wiw.cli.names import list_names
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
@@ -36,6 +37,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (report, "report", "Table and HTML report of a run."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),
+    (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
 )
 
 EXIT_ERROR, EXIT_INTERRUPTED, EXIT_RESUME = 2, 130, 75

@@ -12,7 +12,7 @@ from rich.markup import escape
 def list_names() -> int:
     """Lists world models, policies, tasks, metrics and presets: built-in ones, and those of installed packages.
 
-    A package adds its own by entry points in the groups named in the headings.
+    A package adds its own by entry points in the groups named beside the headings.
     """
     from rich.console import Console
     from rich.table import Table

@@ -27,6 +27,9 @@ def run(
     revision: MaybeName = None,
     arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    per_scene: MaybeCount = None,
+    episode_file: Annotated[Path | None, arg(metavar="FILE")] = None,
+    scene_folder: Folder = None,
     episodes: Count = 20,
     seed: Count = 0,
     workers: Count = 1,
@@ -48,6 +51,7 @@ def run(
     $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
     $ wiw run imagenav --scenes house.glb --world-model warp
+    $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
 
     Ctrl-C or SIGTERM stops a run without loss; `wiw resume` goes on with it.
 
@@ -59,6 +63,9 @@ def run(
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them.
         scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
+        episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
+        scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
         episodes: How many.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.
@@ -78,7 +85,8 @@ def run(
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
 
     options = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
-    recipe = TaskRecipe(task, options if motion is None else {**options, "motion": motion})
+    more = {"motion": motion, "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder}
+    recipe = TaskRecipe(task, {**options, **{name: value for name, value in more.items() if value is not None}})
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width

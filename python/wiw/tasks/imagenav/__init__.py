@@ -159,10 +159,8 @@ class ImageNav:
                 break
             self._episodes += self._of_scene(scenes[0] if whole_scene else scenes[done], done if whole_scene else 0)
         if len(self._episodes) < count:
-            raise ArgumentError(
-                f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; "
-                "name more scenes (apartments:val:N) or raise per_scene"
-            )
+            more = "ask for fewer" if self.episode_file else "name more scenes (apartments:val:N) or raise per_scene"
+            raise ArgumentError(f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; {more}")
         return self._episodes[:count]
 
     def require(self, episodes: Iterable[Episode]) -> None:

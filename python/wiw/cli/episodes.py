@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw episodes`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+
+def episodes(
+    task: Positional[Annotated[str, arg(metavar="TASK")]] = "imagenav",
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("episodes.json.gz"),
+    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    episodes: Annotated[int, arg(metavar="N")] = 20,
+    per_scene: Annotated[int | None, arg(metavar="N")] = None,
+    seed: Annotated[int, arg(metavar="N")] = 0,
+    backend: Literal["auto", "cpu", "gpu"] = "auto",
+) -> int:
+    """Generates the episodes of a task and writes them to a file, which `wiw run --episode-file` takes.
+
+    $ wiw episodes imagenav --scenes apartments:val:20 --episodes 100 --out val.json.gz
+    $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json
+    $ wiw run imagenav --episode-file house.json --world-model warp
+
+    Scenes that lie below the file's folder are named relative to it, so that the folder may be moved or shared.
+
+    Args:
+        task: See `wiw list`.
+        out: JSON; gzipped if the name ends in .gz.
+        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        episodes: How many.
+        per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
+        seed: The episodes are a function of it and the scenes.
+        backend: Renderer, which sees to it that goals are out of sight.
+    """
+    from wiw.datasets.episodes import save
+    from wiw.errors import FileError
+    from wiw.registry import TASKS
+
+    options = {"scenes": scenes, "seed": seed, "backend": backend}
+    made = TASKS.make(task, **options if per_scene is None else {**options, "per_scene": per_scene})
+    found = made.episodes(episodes)
+    try:
+        save(out, found, task, seed=seed, scenes=scenes)
+    except OSError as error:
+        raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
+    places = len({episode.scene for episode in found})
+    lengths = sorted(episode.geodesic for episode in found)
+    print(
+        f"{len(found)} episodes in {places} scene{'s' if places > 1 else ''}, {lengths[0]:.1f} to {lengths[-1]:.1f} m"
+    )
+    print(f"episodes  {out}")
+    return 0
