@@ -27,6 +27,41 @@ class Key:
         return Key(self.seed, self.episode, decision)
 
 
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom in pixels, 0 at the left (upper) edge of the first pixel; left > right: across the seam."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """The one thing in view that a task is about, as a red box would point it out; nothing says what it is."""
+
+    mask: NDArray[np.bool_]
+    """bool [576, 1024]: its visible pixels in the panorama."""
+    panorama_box: Box | None
+    """Around the mask; None where nothing of it is visible."""
+    front_box: Box | None
+    """Around its visible pixels in the front view."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an agent believes at a decision: a distribution over the goal's choices."""
+
+    choices: tuple[str, ...]
+    probabilities: NDArray[np.float64]
+    """float64 [len(choices)], sum 1."""
+
+    @property
+    def label(self) -> str:
+        """The likeliest choice."""
+        return self.choices[int(np.argmax(self.probabilities))]
+
+    @property
+    def confidence(self) -> float:
+        """Its probability."""
+        return float(np.max(self.probabilities))
+
+
 @dataclass(frozen=True)
 class Observation:
     """What the agent perceives: images, odometry since the episode's start, and depth where the run grants it.
@@ -42,6 +77,8 @@ class Observation:
     """float64 [3]: x forward and y left in metres, azimuth in radians (left positive), in the frame of the start."""
     depth: NDArray[np.float32] | None = None
     """float32 [576, 1024] distance along the ray in metres, 0 where nothing is hit; None unless asked for."""
+    target: Target | None = None
+    """Where the task points something out."""
 
     def as_dict(self) -> dict[str, Any]:
         """The observation as gymnasium spaces see it; `depth` only where present."""
@@ -57,6 +94,8 @@ class Goal:
     image: NDArray[np.uint8] | None = None
     """uint8 [480, 480, 3], HFOV 90 degrees."""
     text: str | None = None
+    choices: tuple[str, ...] = ()
+    """What an answer is chosen from, where the task asks for one."""
 
 
 @dataclass(frozen=True)
@@ -145,6 +184,8 @@ class Decision:
     calls: Mapping[str, int] = field(default_factory=dict)
     """Counts: rows and frames asked of the world model for this episode."""
     note: str = ""
+    answer: Answer | None = None
+    """What the agent believes now, where the goal has choices."""
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,12 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
+from wiw.evaluation.rows import decision_row
+from wiw.loop.agent import Query
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
 from wiw.tasks.imagenav import ImageNav
-from wiw.types import Proposal
+from wiw.types import Answer, DecisionRecord, Goal, Key, Observation, Proposal, Truth
 
 
 class Recorder:
@@ -324,3 +326,30 @@ def test_asking_for_the_impossible_says_so(task: ImageNav) -> None:
         wiw.Agent(Greedy(), "warp").decide(observation, env.goal, wiw.types.Key(0, 0))
     with pytest.raises(ArgumentError, match="simulator"):
         wiw.Agent(Greedy(), "oracle").decide(observation, env.goal, wiw.types.Key(0, 0))
+
+
+class Quiz(Greedy):
+    """Believes what it was made with, if its goal has choices."""
+
+    def __init__(self, *probabilities: float) -> None:
+        self.probabilities = np.array(probabilities)
+
+    def answer(self, situations, proposals, rollouts):
+        return [Answer(s.goal.choices, self.probabilities) if s.goal.choices else None for s in situations]
+
+
+def test_answers_reach_the_decision_and_the_environment() -> None:
+    goal = Goal("quiz", choices=("chair", "lamp"))
+    query = Query(Observation(np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), np.zeros(3)),
+                  goal, Key(0, 0))  # fmt: skip
+    decision = wiw.Agent(Quiz(0.3, 0.7)).decide_batch([query])[0]
+    assert decision.answer.label == "lamp" and decision.answer.confidence == 0.7
+    assert decision_row("a", record_of(decision), False).values["answer"].startswith('{"label":"lamp"')
+    for wrong in (Quiz(0.3, 0.3), Quiz(1.0), Quiz(-0.5, 1.5), Quiz(np.nan, 1.0), Greedy()):
+        with pytest.raises(ContractError, match=r"\.answer: expected"):
+            wiw.Agent(wrong).decide_batch([query])
+
+
+def record_of(decision) -> DecisionRecord:
+    here = Truth(np.zeros(3), 0.0, 1.0, 1.0)
+    return DecisionRecord(0, 0, decision, decision.actions[:1], here, here, np.zeros((2, 3)))

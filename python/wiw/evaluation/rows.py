@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.types import DecisionRecord, EpisodeResult, Truth
+from wiw.types import Answer, DecisionRecord, EpisodeResult, Truth
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
@@ -94,6 +94,7 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "scores": None if decision.scores is None else to_json(decision.scores),
         "proposals": to_json(proposals),
         "real_frames": None if real is None else to_json(real),
+        "answer": None if decision.answer is None else to_json(_answer(decision.answer)),
         "note": decision.note,
         "path": to_json(record.path),
         "seconds": to_json(dict(decision.seconds)),
@@ -103,6 +104,14 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
     }
     images = dict(_images(record)) if with_images else {}
     return DecisionRow(arm, int(record.episode), int(record.index), values, images)
+
+
+def _answer(answer: Answer) -> dict[str, Any]:
+    return {
+        "label": answer.label,
+        "confidence": answer.confidence,
+        "probabilities": dict(zip(answer.choices, answer.probabilities, strict=True)),
+    }
 
 
 def _truth(when: str, truth: Truth) -> dict[str, float]:

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 1 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 2 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -38,6 +38,7 @@ CREATE TABLE decision (
     scores TEXT,                    -- JSON: one a proposal
     proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note}]
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
+    answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
     seconds TEXT NOT NULL,          -- JSON: wall time by stage

@@ -23,7 +23,9 @@ from wiw.errors import StoreError
 from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+DECISION_JSON = ("actions", "executed", "scores", "answer", "proposals", "real_frames", "path", "seconds", "calls")
+"""Columns of table `decision` that hold JSON."""
 APPLICATION_ID = 0x77697721
 """Marks the file as a run store (SQLite's application_id)."""
 FILE_NAME = "run.sqlite"
@@ -191,7 +193,7 @@ class RunStore:
             (arm, episode),
         )
         for row in rows:
-            for column in ("actions", "executed", "scores", "proposals", "real_frames", "path", "seconds", "calls"):
+            for column in DECISION_JSON:
                 row[column] = None if row[column] is None else json.loads(row[column])
         return rows
 

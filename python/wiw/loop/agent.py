@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
-from wiw.loop.contract import check_model, check_proposals, checked_plan, checked_scores
+from wiw.loop.contract import check_model, check_proposals, checked_answers, checked_plan, checked_scores
 from wiw.loop.imagine import Imagination, imagine
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
@@ -138,11 +138,13 @@ class Agent:
                     beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
                 imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
             proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], [dict(calls) for calls in beams.calls]
+        with clock("revise"):
+            answers = checked_answers(self.revision, self.revision.answer(revising, proposals, rollouts), revising)
         seconds = clock.share(len(queries))
         return [
-            self._decision(query, situation, plans, rollout, score, seconds, cost)
-            for query, situation, plans, rollout, score, cost in zip(
-                queries, revising, proposals, rollouts, scores, calls, strict=True
+            self._decision(query, situation, plans, rollout, score, answer, seconds, cost)
+            for query, situation, plans, rollout, score, answer, cost in zip(
+                queries, revising, proposals, rollouts, scores, answers, calls, strict=True
             )
         ]
 
@@ -225,7 +227,15 @@ class Agent:
         return self._lives[name]
 
     def _decision(
-        self, query: Query, situation: Situation, proposals: Any, rollouts: Any, scores: Any, seconds: Any, calls: Any
+        self,
+        query: Query,
+        situation: Situation,
+        proposals: Any,
+        rollouts: Any,
+        scores: Any,
+        answer: Any,
+        seconds: Any,
+        calls: Any,
     ) -> Decision:
         actions, chosen = self.revision.revise(situation, proposals, scores)
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
@@ -238,6 +248,7 @@ class Agent:
             rollouts=None if rollouts is None else tuple(rollouts),
             scores=np.asarray(scores, np.float64),
             chosen=chosen,
+            answer=answer,
             observation=query.observation,
             goal=query.goal,
             key=query.key,

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError
-from wiw.types import Proposal
+from wiw.policies.base import Situation
+from wiw.types import Answer, Proposal
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
@@ -94,3 +95,24 @@ def checked_scores(policy: Any, scores: Any, proposals: Sequence[Sequence[Propos
         if row.shape != (len(plans),) or not np.isfinite(row).all():
             raise ContractError(f"{name}: expected {len(plans)} finite numbers, one a plan, got {row.tolist()}")
     return found
+
+
+def checked_answers(policy: Any, answers: Any, situations: Sequence[Situation]) -> list[Answer | None]:
+    """A distribution over the goal's choices for each episode whose goal has some, None for the others.
+
+    Raises:
+        ContractError: other choices, or numbers that are no distribution.
+    """
+    name = f"{type(policy).__name__}.answer"
+    if not isinstance(answers, Sequence) or len(answers) != len(situations):
+        raise ContractError(f"{name}: expected one answer for each of {len(situations)} episodes, got {answers!r}")
+    for answer, situation in zip(answers, situations, strict=True):
+        choices = situation.goal.choices
+        if answer is None and not choices:
+            continue
+        if not isinstance(answer, Answer) or answer.choices != choices:
+            raise ContractError(f"{name}: expected an Answer over {list(choices)}, got {answer!r}")
+        p = np.asarray(answer.probabilities, np.float64)
+        if p.shape != (len(choices),) or not (p >= 0).all() or abs(p.sum() - 1) > 1e-3:
+            raise ContractError(f"{name}: expected {len(choices)} probabilities that sum to 1, got {p.tolist()}")
+    return list(answers)

@@ -49,7 +49,8 @@ class Trial:
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Executes the decision's first segment and observes."""
         before = self.env.truth()
-        outcome = self.env.run(decision.actions[: decision.execute])
+        plan = decision.actions[: decision.execute]
+        outcome = self.env.run(plan) if decision.answer is None else self.env.run(plan, decision.answer)
         record = DecisionRecord(
             self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path
         )

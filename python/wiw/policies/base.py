@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Goal, Key, Observation, Proposal, Rollout
+from wiw.types import Answer, Goal, Key, Observation, Proposal, Rollout
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,18 @@ class Policy(ABC):
         """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
         best = int(np.argmax(scores))
         return proposals[best].actions, best
+
+    def answer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[Answer | None]:
+        """What each episode's agent believes, where its goal has choices; `rollouts` are None without a world model.
+
+        Asked of the revising policy once a decision, with what is seen and what was imagined. Default: no answer.
+        """
+        return [None] * len(situations)
 
     @property
     def can_revise(self) -> bool:
