@@ -5,14 +5,19 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
+from wiw.errors import FileError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
-from wiw.scenes import Scene, open_scene
+from wiw.scenes import Scene, is_generated, open_scene
 
 CAPACITY = 4
 """Worlds kept: enough for the live episodes of a run that goes scene by scene (an apartment takes about 100 MB)."""
+
+SLACK = 1.0
+"""Metres that a navigation mesh may reach beyond its scene: Recast's cells and the gaps between them."""
 
 
 @dataclass(frozen=True)
@@ -27,18 +32,47 @@ class World:
     """Heights of the floor; the mesh lies up to 0.2 m above it."""
 
 
-_worlds: OrderedDict[tuple[str, str], World] = OrderedDict()
+_worlds: OrderedDict[tuple[str, str, Path | None], World] = OrderedDict()
 
 
 def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
     """The world of a scene spec that names one scene, from memory where possible; the oldest unused is dropped."""
-    key = (scene, backend)
+    path = navmesh_file(scene)
+    key = (scene, backend, path)
     if key in _worlds:
         _worlds.move_to_end(key)
         return _worlds[key]
     loaded = open_scene(scene)
-    made = World(scene, loaded, Renderer(loaded, backend=backend), NavMesh.build(loaded), Ground(loaded))
+    made = World(scene, loaded, Renderer(loaded, backend=backend), _navmesh(path, loaded), Ground(loaded))
     _worlds[key] = made
     while len(_worlds) > CAPACITY:
         _worlds.popitem(last=False)
     return made
+
+
+def navmesh_file(scene: str) -> Path | None:
+    """Habitat's navigation mesh beside a scene's file, "house.navmesh" for "house.glb"; None where there is none."""
+    if is_generated(scene):
+        return None
+    path = Path(scene).expanduser().with_suffix(".navmesh")
+    return path if path.is_file() else None
+
+
+def _navmesh(path: Path | None, scene: Scene) -> NavMesh:
+    """The mesh that came with the scene, else one built from it.
+
+    Raises:
+        FileError: the file is damaged, or its mesh is not where the scene is.
+    """
+    if path is None:
+        return NavMesh.build(scene)
+    navmesh = NavMesh.load(path)
+    places = navmesh.triangles()[0].reshape(-1, 3)
+    low, high = places.min(axis=0), places.max(axis=0)
+    if (low < scene.bounds[0] - SLACK).any() or (high > scene.bounds[1] + SLACK).any():
+        raise FileError(
+            f"{path}: its mesh reaches from {low.round(1)} to {high.round(1)}, the scene from "
+            f"{scene.bounds[0].round(1)} to {scene.bounds[1].round(1)} (metres, Y up): expected the mesh of this very "
+            "scene; take the file away to have one built"
+        )
+    return navmesh

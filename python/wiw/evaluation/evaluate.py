@@ -104,7 +104,7 @@ def resume_run(
     Raises:
         ArgumentError: fewer than one worker.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
-            its preset's file has changed.
+            its preset's file has changed, or the navigation mesh beside a scene has come or gone.
         FileError: the scene of an episode that is left is not there; nothing is recorded.
     """
     if workers is not None:
@@ -167,13 +167,14 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     else:
         started = time.perf_counter()
         episodes = built.episodes(options.episodes)
-        _require(built, episodes)
+        used = _require(built, episodes)
         folder = options.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
         info = {
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "pictures": _spread(options.episodes, options.keep_images),
+            "scenes": used,
             "live": options.live,
             "workers": options.workers,
             "command": sys.argv,
@@ -183,17 +184,17 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     return _finish(store, task, agents, options.workers, options.progress)
 
 
-def _require(task: Any, episodes: Iterable[Episode]) -> None:
-    """Asks a task that can tell whether all that its episodes need is there, before anything is run."""
-    if hasattr(task, "require"):
-        task.require(episodes)
+def _require(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
+    """Asks a task that can tell whether all that its episodes need is there, before anything is run, and what it is."""
+    return dict(task.require(episodes)) if hasattr(task, "require") else {}
 
 
 def _require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
-    """The same for the episodes that a run has left."""
-    episodes = store.episodes()
+    """The same for the episodes that a run has left, which must be run with what the others were run with."""
+    episodes, kept = store.episodes(), store.info.get("scenes", {})
     try:
-        _require(task, [episodes[index] for arm in arms for index in store.pending(arm, retry_failed)])
+        used = _require(task, [episodes[index] for arm in arms for index in store.pending(arm, retry_failed)])
+        store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
     except Error:
         store.close()
         raise

@@ -124,6 +124,14 @@ class RunStore:
         """
         _require_same(self.path, self.config["task"], json.loads(to_json(task)))
 
+    def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
+        """Holds the run to something else it was begun with.
+
+        Raises:
+            StoreError: it differs; says in what.
+        """
+        _require_same(self.path, begun_with, now)
+
     @classmethod
     def read(cls, run: str | Path) -> RunStore:
         """An existing store for reading, also while it is being written.

@@ -12,7 +12,7 @@ import numpy as np
 
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.imagenav import camera_pose, generate, ideal_primitives
-from wiw.datasets.worlds import World, world
+from wiw.datasets.worlds import World, navmesh_file, world
 from wiw.envs.navigation import NavigationEnv
 from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
@@ -54,7 +54,8 @@ class ImageNav:
     """The task: where episodes come from, when one ends, and what is measured.
 
     Args:
-        scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world.
+        scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world; where
+            Habitat's navigation mesh lies beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
         preset: "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
@@ -163,14 +164,20 @@ class ImageNav:
             raise ArgumentError(f"imagenav: asked for {count} episodes, but there are {len(self._episodes)}; {more}")
         return self._episodes[:count]
 
-    def require(self, episodes: Iterable[Episode]) -> None:
+    def require(self, episodes: Iterable[Episode]) -> dict[str, dict[str, str]]:
         """Finds out whether the scenes of episodes are there, without loading any.
+
+        Returns:
+            For each scene, what it is used with: its "navmesh", a file or "built".
 
         Raises:
             FileError: one is not; names it.
         """
+        used = {}
         for scene in dict.fromkeys(episode.scene for episode in episodes):
             resolve(scene)
+            used[scene] = {"navmesh": str(navmesh_file(scene) or "built")}
+        return used
 
     def episode(self, index: int) -> Episode:
         """Episode `index` of the task."""

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes with the navigation mesh that came with them."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from wiw import scenes
+from wiw.datasets.worlds import navmesh_file, world
+from wiw.errors import FileError, StoreError
+from wiw.evaluation.evaluate import evaluate, resume_run
+from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
+from wiw.evaluation.store import store_path
+from wiw.nav import NavMesh, NavMeshSettings
+
+
+@pytest.fixture
+def house(two_rooms: str, tmp_path: Path) -> Path:
+    """A scene in a folder of its own."""
+    for name in ("two_rooms.obj", "two_rooms.mtl"):
+        shutil.copy(Path(two_rooms).with_name(name), tmp_path)
+    return (tmp_path / "two_rooms.obj").rename(tmp_path / "house.obj")
+
+
+def test_habitats_mesh_beside_a_scene_is_used(house: Path) -> None:
+    assert navmesh_file(str(house)) is None and navmesh_file("apartments:val/0") is None
+    NavMesh.build(scenes.load(house), NavMeshSettings(agent_radius=0.4)).save(house.with_suffix(".navmesh"))
+    assert navmesh_file(str(house)) == house.with_suffix(".navmesh")
+    thin, built = world(str(house)).navmesh, NavMesh.build(scenes.load(house))
+    assert thin.area == NavMesh.load(house.with_suffix(".navmesh")).area < 0.9 * built.area
+
+
+def test_the_mesh_of_another_scene_is_refused(house: Path) -> None:
+    floor = np.array([[20, 0, 0], [30, 0, 0], [30, 0, 10], [20, 0, 10]], np.float32)
+    far = NavMesh.from_triangles(floor, np.array([[0, 2, 1], [0, 3, 2]]))
+    far.save(house.with_suffix(".navmesh"))
+    with pytest.raises(
+        FileError, match=r"house\.navmesh: its mesh reaches from .* expected the mesh of this very scene"
+    ):
+        world(str(house))
+
+
+def test_the_manifest_names_the_mesh_and_a_run_keeps_to_it(house: Path, tmp_path: Path) -> None:
+    task = TaskRecipe("imagenav", {"scenes": house, "decisions": 1})
+    log = evaluate(task, AgentRecipe("heuristic"), 2, out=tmp_path / "run", progress=False)
+    assert log.store.info["scenes"] == {str(house): {"navmesh": "built"}}
+    with sqlite3.connect(store_path(tmp_path / "run")) as store:
+        store.execute("DELETE FROM outcome WHERE episode = 1")
+    NavMesh.build(scenes.load(house)).save(house.with_suffix(".navmesh"))
+    with pytest.raises(StoreError, match=r"house\.navmesh"):
+        resume_run(tmp_path / "run", progress=False)
+    log = evaluate(task, AgentRecipe("heuristic"), 1, out=tmp_path / "other", progress=False)
+    assert log.store.info["scenes"] == {str(house): {"navmesh": str(house.with_suffix(".navmesh"))}}
+    house.with_suffix(".navmesh").unlink()
+    assert resume_run(tmp_path / "run", progress=False).complete
