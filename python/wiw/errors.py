@@ -12,6 +12,7 @@ __all__ = [
     "InfrastructureError",
     "NavigationError",
     "RegistryError",
+    "RolloutError",
     "StoreError",
 ]
 
@@ -21,11 +22,29 @@ class RegistryError(Error, LookupError):
 
 
 class ContractError(Error, TypeError):
-    """A plugged-in model, policy or metric broke its contract (wrong shape, dtype, count, or NaN)."""
+    """A plugged-in model, policy or metric broke its contract (wrong shape, dtype, count, or NaN).
+
+    `kind` names a breach of a world model: "type", "dtype", "nan", "shape" or "frames" (another number of them).
+    """
+
+    def __init__(self, message: str = "", kind: str = "contract") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class InfrastructureError(Error):
     """Something around the task failed (a server, a file, memory): the episode is recorded as such and not scored."""
+
+
+class RolloutError(InfrastructureError):
+    """A world model gave no usable answer, however often it was asked.
+
+    `kind` is "raised", "deadline", or the kind of the `ContractError` that its answer was.
+    """
+
+    def __init__(self, message: str = "", kind: str = "raised") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class StoreError(Error):

@@ -247,3 +247,6 @@ class EpisodeResult:
     """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal."""
     seconds: float = 0.0
     error: str = ""
+    """Traceback."""
+    kind: str = ""
+    """What failed: "environment", "agent", "worker" (its process died), or "world_model/" and a `RolloutError.kind`."""

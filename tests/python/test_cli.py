@@ -89,9 +89,11 @@ def test_report_and_resume_of_a_finished_run(tmp_path, capsys):
 
 
 def test_failed_episodes_are_said_aloud_and_can_be_retried(tmp_path, capsys):
-    assert run("--scenes", "broken", "--episodes", 3, "--out", tmp_path / "run", "--no-report") == 0
-    assert "1 episode failed for infrastructure" in capsys.readouterr().err
-    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 0
+    assert run("--scenes", "broken", "--episodes", 3, "--out", tmp_path / "run", "--no-report") == 1
+    shown = capsys.readouterr()
+    assert "1 episode failed for infrastructure" in shown.err
+    assert "INVALID RUN" in shown.out and "2/3" in shown.out
+    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 1
     assert "no such scene" in capsys.readouterr().err
 
 

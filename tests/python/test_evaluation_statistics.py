@@ -143,7 +143,7 @@ def test_the_table_claims_the_same_episodes_only_where_they_are():
     assert "each on the episodes that it has finished" in shown(summarise(["none", "warp"], rows, 3))
 
 
-def test_failed_episodes_are_left_out_and_counted():
+def test_episodes_that_were_not_judged_are_counted_and_said():
     outcomes = [outcome("none", i, 0.0) for i in range(4)] + [outcome("warp", i, 1.0) for i in range(3)]
     outcomes.append(outcome("warp", 3, 0.0, status="failed"))
     summary = summarise(["none", "warp"], outcomes, episodes=5)
@@ -151,7 +151,18 @@ def test_failed_episodes_are_left_out_and_counted():
     assert summary["warp"].estimates["success"].value == 100.0
     difference = summary.difference("warp", "none")
     assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
-    assert any("1 episode left out" in note for note in notes(summary))
+    assert (summary["warp"].asked, summary["warp"].judged, summary["none"].judged) == (5, "3/5", "4/5")
+    said = " ".join(notes(summary))
+    assert "warp: 3 of 5 episodes asked were judged, 1 failed for infrastructure, 1 are still to run" in said
+    assert "over all 5, SR would lie between 60.0 and 100.0 %" in said
+
+
+@pytest.mark.parametrize(("failed", "invalid"), [(0, False), (2, False), (3, True)])
+def test_a_run_is_invalid_where_over_one_percent_of_an_arm_failed(failed, invalid):
+    outcomes = [outcome("warp", i, 1.0, status="failed" if i < failed else "done") for i in range(200)]
+    summary = summarise(["warp"], outcomes, episodes=200)
+    assert bool(summary.invalid) == invalid
+    assert any("INVALID RUN" in note and "3 of 200" in note for note in notes(summary)) == invalid
 
 
 def test_differences_are_paired_by_episode_and_signed_towards_the_better():

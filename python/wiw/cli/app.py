@@ -49,7 +49,7 @@ class Terminated(BaseException):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code: 0, 1 (nothing could be judged), 2 (error), 75 or 130 (stopped)."""
+    """Runs one command and returns its exit code: 0, 1 (the run is invalid), 2 (error), 75 or 130 (stopped)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [argument for argument in given if argument != "--debug"]

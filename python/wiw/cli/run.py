@@ -43,6 +43,7 @@ def run(
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     live: Count = 4,
     keep_images: Count = 2,
+    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -79,6 +80,8 @@ def run(
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         keep_images: Episodes that keep pictures for the report.
+        deadline: Most seconds for a call of the world model, 600 if not given; it is asked three times before the
+            episode is recorded as failed for infrastructure, which is never a failure of the task.
         report: Whether to write report.html at the end.
     """
     from wiw.evaluation.evaluate import evaluate
@@ -95,7 +98,10 @@ def run(
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 
     def work() -> Any:
-        return evaluate(recipe, agent, episodes, seed, folder, workers, arms=names, live=live, keep_images=keep_images)
+        return evaluate(
+            recipe, agent, episodes, seed, folder, workers,
+            arms=names, live=live, keep_images=keep_images, deadline=deadline,
+        )  # fmt: skip
 
     return finish(stoppable(work, folder), report)
 
@@ -136,8 +142,8 @@ def stoppable(work: Callable[[], Any], folder: Path) -> Any:
 
 
 def finish(log: Any, report: bool) -> int:
-    """Prints the table and what went wrong, writes the report; 1 if no episode could be judged."""
-    log.summary()
+    """Prints the table and what went wrong, writes the report; 1 if the run is invalid."""
+    numbers = log.summary()
     failed = [episode for episode in log.episodes if episode["status"] == "failed"]
     if failed:
         count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
@@ -151,7 +157,7 @@ def finish(log: Any, report: bool) -> int:
     if report:
         print(f"report  {log.report()}")
     print(f"run     {log.path}")
-    return 1 if len(failed) == len(log.episodes) else 0
+    return 1 if numbers.invalid else 0
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:

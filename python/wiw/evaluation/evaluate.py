@@ -37,6 +37,7 @@ def evaluate(
     live: int = 4,
     keep_images: int = 2,
     resume: bool = False,
+    deadline: float | None = None,
     **task_options: Any,
 ) -> RunLog:
     """Runs an agent on the first `episodes` episodes of a task.
@@ -60,6 +61,8 @@ def evaluate(
         live: episodes kept live at a time in each process, so that model calls are batched.
         keep_images: how many episodes keep pictures for the report, spread evenly.
         resume: whether to go on with the run in `out` where it was stopped.
+        deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
+            600 unless it was given another.
         task_options: options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
@@ -68,7 +71,7 @@ def evaluate(
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
     """
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline)
     return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
 
 
@@ -84,9 +87,10 @@ def run_arms(
     live: int = 4,
     keep_images: int = 2,
     resume: bool = False,
+    deadline: float | None = None,
 ) -> RunLog:
     """Runs several named agents on the same episodes; see `evaluate` for the rest."""
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline)
     return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
 
 
@@ -129,6 +133,10 @@ def resume_run(
     return _finish(store, task, agents, workers or info["workers"], progress, retry_failed=retry_failed)
 
 
+FOR_EVER = 1e12
+"""Seconds that stand for no deadline where a number has to be written down."""
+
+
 @dataclass(frozen=True)
 class _Options:
     """What `evaluate` and `run_arms` have in common."""
@@ -141,10 +149,18 @@ class _Options:
     live: int
     keep_images: int
     resume: bool
+    deadline: float | None
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
             _at_least(name, getattr(self, name), least)
+        if self.deadline is not None and not self.deadline > 0:
+            raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
+
+    @property
+    def limits(self) -> dict[str, Any]:
+        """What every agent is built with beyond its own recipe."""
+        return {} if self.deadline is None else {"deadline": min(self.deadline, FOR_EVER)}
 
 
 def _at_least(name: str, value: int, least: int) -> None:
@@ -177,6 +193,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "scenes": used,
             "live": options.live,
             "workers": options.workers,
+            "limits": options.limits,
             "command": sys.argv,
             "preparation_seconds": time.perf_counter() - started,
         }
@@ -217,7 +234,7 @@ def _finish(
 ) -> RunLog:
     """Runs what is missing, closes the store and opens it for reading."""
     info = store.info
-    plan = Plan(task, agents, store.config["seed"], info["live"], frozenset(info["pictures"]))
+    plan = Plan(task, agents, store.config["seed"], info["live"], frozenset(info["pictures"]), info["limits"])
     pending = {arm: store.pending(arm, retry_failed) for arm in agents}
     board = make_board(progress and any(pending.values()))
     try:

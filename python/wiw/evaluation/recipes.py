@@ -13,6 +13,8 @@ from wiw.errors import ArgumentError
 NUMBERS = ("candidates", "horizon", "execute", "depth", "width")
 """Of an agent; where it leaves one open, the task's own is taken."""
 
+NO_LIMITS: Mapping[str, Any] = {}
+
 
 @dataclass(frozen=True)
 class TaskRecipe:
@@ -58,11 +60,15 @@ class AgentRecipe:
             if value is not None and value < 1:
                 raise ArgumentError(f"agent: expected {name} of at least 1, got {value}")
 
-    def build(self, defaults: Mapping[str, Any]) -> Any:
-        """The agent; what is None is taken from the task's defaults (M, L and the executed primitives)."""
+    def build(self, defaults: Mapping[str, Any], limits: Mapping[str, Any] = NO_LIMITS) -> Any:
+        """The agent; what is None is taken from the task's defaults (M, L and the executed primitives).
+
+        `limits` are what a run gives every agent beyond its identity: its `deadline`.
+        """
         from wiw.loop.agent import Agent
 
-        return Agent(**{name: value for name, value in asdict(self).items() if value is not None}).settled(defaults)
+        given = {name: value for name, value in asdict(self).items() if value is not None}
+        return Agent(**given, **limits).settled(defaults)
 
     def with_model(self, model: str) -> AgentRecipe:
         """The same agent with another world model."""
@@ -113,9 +119,9 @@ class Ready:
 class ReadyAgent(Ready):
     """A `wiw.Agent` in memory; what it leaves open is the task's."""
 
-    def build(self, defaults: Mapping[str, Any]) -> Any:
-        """The agent with the task's numbers where it has none of its own."""
-        return self.thing.settled(defaults)
+    def build(self, defaults: Mapping[str, Any], limits: Mapping[str, Any] = NO_LIMITS) -> Any:
+        """The agent with the task's numbers where it has none of its own, under the run's limits."""
+        return self.thing.but(**limits).settled(defaults)
 
     def describe(self) -> dict[str, Any]:
         """What the agent says of itself, less the numbers that it leaves open."""

@@ -63,6 +63,11 @@ class RunLog:
         """Whether every arm has ended every episode."""
         return not any(self.store.pending(arm) for arm in self.arms)
 
+    @property
+    def valid(self) -> bool:
+        """Whether every arm has ended every episode and at most 1 % of them failed for infrastructure."""
+        return self.complete and not self.numbers().invalid
+
     def numbers(self) -> Summary:
         """Means, intervals and paired differences, without printing."""
         config = self.store.config
@@ -82,7 +87,8 @@ class RunLog:
         """The table of arms as plain values: one dict an arm, with `<metric>`, `<metric>_low` and `<metric>_high`."""
         lines = []
         for arm in self.numbers().arms:
-            line: dict[str, Any] = {"arm": arm.name, "role": arm.role, "n": arm.done, "failed": arm.failed}
+            line: dict[str, Any] = {"arm": arm.name, "role": arm.role}
+            line |= {"n": arm.done, "asked": arm.asked, "failed": arm.failed}
             for metric, estimate in arm.estimates.items():
                 line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
             lines.append(line)

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 2 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 3 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -23,7 +23,8 @@ CREATE TABLE outcome (              -- how an episode ended in an arm; absent wh
     status TEXT NOT NULL CHECK (status IN ('done', 'failed')),  -- failed: infrastructure, never the task
     metrics TEXT NOT NULL,          -- JSON: name to number
     seconds REAL NOT NULL,
-    error TEXT NOT NULL,
+    error TEXT NOT NULL,            -- traceback; empty where nothing failed
+    kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind of RolloutError>; else empty
     PRIMARY KEY (arm, episode)
 ) WITHOUT ROWID;
 

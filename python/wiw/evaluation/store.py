@@ -23,7 +23,7 @@ from wiw.errors import StoreError
 from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 DECISION_JSON = ("actions", "executed", "scores", "answer", "proposals", "real_frames", "path", "seconds", "calls")
 """Columns of table `decision` that hold JSON."""
 APPLICATION_ID = 0x77697721
@@ -254,6 +254,7 @@ class RunStore:
                         "metrics": to_json(dict(result.metrics)),
                         "seconds": result.seconds,
                         "error": result.error,
+                        "kind": result.kind,
                     },
                 )
                 shortest = result.metrics.get("shortest", math.nan)

@@ -17,6 +17,9 @@ ROLES = {
 }
 """What the reference arms stand for; any other arm is a world model under test, or a policy without one."""
 
+MOST_FAILED = 0.01
+"""Share of an arm's episodes whose infrastructure may fail before the run counts as invalid."""
+
 
 @dataclass(frozen=True)
 class ArmSummary:
@@ -31,7 +34,17 @@ class ArmSummary:
     pending: int
     """Episodes not run yet."""
     estimates: Mapping[str, Estimate]
-    """By metric: "success" and "spl" in percent, "actions" in primitives."""
+    """Over the episodes that count, by metric: "success" and "spl" in percent, "actions" in primitives."""
+
+    @property
+    def asked(self) -> int:
+        """Episodes of the run, whether they count or not."""
+        return self.done + self.failed + self.pending
+
+    @property
+    def judged(self) -> str:
+        """E.g. "20", or "18/20" where some of those asked do not count."""
+        return str(self.done) if self.done == self.asked else f"{self.done}/{self.asked}"
 
 
 @dataclass(frozen=True)
@@ -43,6 +56,16 @@ class Summary:
     """Each arm minus "none" and minus "copy", on the episodes that both have finished."""
     same_episodes: bool
     """Whether all arms have finished the same episodes, so that their lines can be compared as they stand."""
+
+    @property
+    def invalid(self) -> tuple[str, ...]:
+        """Why the run must not be quoted, a sentence an arm; empty for a valid run."""
+        return tuple(
+            f"{line.failed} of {line.asked} episodes of {line.name} failed for infrastructure "
+            f"({100 * line.failed / line.asked:.1f} %; at most {100 * MOST_FAILED:g} % may)."
+            for line in self.arms
+            if line.failed > MOST_FAILED * line.asked
+        )
 
     def __getitem__(self, arm: str) -> ArmSummary:
         """The line of an arm."""
@@ -127,17 +150,15 @@ def notes(summary: Summary) -> list[str]:
     """What a reader must know about the numbers, one sentence each."""
     found = [f"{line.name}: {line.role}." for line in summary.arms if line.name in ROLES and len(summary.arms) > 1]
     found = [" ".join(found)] if found else []
+    if summary.invalid:
+        found.insert(0, f"INVALID RUN, not to be quoted: {' '.join(summary.invalid)} `wiw resume --retry-failed`.")
+    found += [_missing(line) for line in summary.arms if line.done < line.asked]
     first = next((estimate for line in summary.arms for estimate in line.estimates.values()), None)
     if first is not None:
         found.append(
             f"95 % intervals: the wider of a bootstrap over {first.scenes} scenes and an interval over episodes."
             if first.scenes > 1
             else f"95 % intervals over episodes of one scene ({first.method})."
-        )
-    failed = sum(line.failed for line in summary.arms)
-    if failed:
-        found.append(
-            f"{failed} episode{'s' if failed > 1 else ''} left out: infrastructure failed, the task was not judged."
         )
     widest = max(
         (line.estimates["success"] for line in summary.arms if "success" in line.estimates),
@@ -149,6 +170,18 @@ def notes(summary: Summary) -> list[str]:
             f"{widest.n} episodes say little: intervals of SR are up to {widest.high - widest.low:.0f} points wide."
         )
     return found
+
+
+def _missing(line: ArmSummary) -> str:
+    """What the rate could be if nobody had been left out: with every missing episode lost, and with every one won."""
+    said = f"{line.name}: {line.done} of {line.asked} episodes asked were judged"
+    said += f", {line.failed} failed for infrastructure" if line.failed else ""
+    said += f", {line.pending} are still to run" if line.pending else ""
+    if "success" not in line.estimates:
+        return f"{said}."
+    won = line.estimates["success"].value * line.done
+    least, most = won / line.asked, (won + 100 * (line.asked - line.done)) / line.asked
+    return f"{said}; over all {line.asked}, SR would lie between {least:.1f} and {most:.1f} %."
 
 
 def show_estimate(estimate: Estimate, signed: bool = False) -> str:

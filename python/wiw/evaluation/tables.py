@@ -13,7 +13,7 @@ from rich.text import Text
 from wiw.evaluation.statistics import Estimate
 from wiw.evaluation.summary import ArmSummary, Summary, column_title, notes, show_estimate, show_p, shown_headlines
 
-COUNTS = (("n", "done", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
+COUNTS = (("n", "judged", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
 
 
@@ -32,7 +32,8 @@ def summary_tables(summary: Summary, width: int) -> Any:
     parts: list[Any] = [_arms(summary)]
     for base in dict.fromkeys(d.base for d in summary.differences):
         parts.append(_differences(summary, base, " " if width >= ROOMY else "\n"))
-    return Group(*parts, *(Text(note, style="dim") for note in notes(summary)))
+    styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
+    return Group(*parts, *styled)
 
 
 def _table(title: str) -> Table:

@@ -49,6 +49,8 @@ class Plan:
     """Episodes kept live at a time in one process."""
     pictures: frozenset[int]
     """Episodes whose decisions keep pictures."""
+    limits: Mapping[str, Any] = field(default_factory=dict)
+    """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class Runner:
 
         if self._arm != job.arm:
             self._agent = None
-            self._agent = self._plan.agents[job.arm].build(self._task.defaults)
+            self._agent = self._plan.agents[job.arm].build(self._task.defaults, self._plan.limits)
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
         sink = RowSink(job, self._plan, send)
@@ -217,7 +219,7 @@ class _Crew:
                 self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
             else:
                 error = f"the worker process died twice on this episode, last: {cause}"
-                result = EpisodeResult(index, episode.episode_id, episode.scene, "failed", error=error)
+                result = EpisodeResult(index, episode.episode_id, episode.scene, "failed", error=error, kind="worker")
                 self._desk.write(OutcomeRow(worker.job.arm, result))
 
 

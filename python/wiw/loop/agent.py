@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.contract import check_model, check_proposals, checked_answers, checked_plan, checked_scores
@@ -59,6 +60,7 @@ class Agent:
             extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
             Without a model nothing is imagined, and there is one level.
         width: plans of an episode that are kept and extended; None means `candidates`.
+        deadline: seconds that a call of the world model may take before it counts as failed (`wiw.loop.attempts`).
 
     Raises:
         ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
@@ -76,6 +78,7 @@ class Agent:
         execute: int | None = None,
         depth: int = 1,
         width: int | None = None,
+        deadline: float = DEADLINE,
     ) -> None:
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
@@ -98,7 +101,10 @@ class Agent:
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
             )
+        self._deadline = deadline
+        self._ask: Attempts | None = None
         if self.model is not None:
+            self._ask = Attempts(self.model, deadline)
             check_model(self.model, self.horizon * self.depth)
             if self.depth > 1:
                 self._check_depth(self.model)
@@ -126,17 +132,17 @@ class Agent:
                 self.revision.observe(revising)
             proposals = self.policy.propose(proposing, self.candidates, self.horizon)
             check_proposals(self.policy, proposals, len(queries), self.candidates, self.horizon)
-        if self.model is None:
+        if self._ask is None:
             rollouts: list[list[Rollout] | None] = [None] * len(queries)
             calls: list[dict[str, int]] = [{} for _ in queries]
             scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
         else:
             beams = Beams(proposing, proposals, self.width, self.depth)
-            imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
+            imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
             while beams.level < self.depth:
                 with clock("propose"):
                     beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
-                imagined, scores = self._look_ahead(self.model, queries, revising, beams, clock)
+                imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
             proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], [dict(calls) for calls in beams.calls]
         with clock("revise"):
             answers = checked_answers(self.revision, self.revision.answer(revising, proposals, rollouts), revising)
@@ -155,6 +161,7 @@ class Agent:
     def but(self, **changes: Any) -> Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
+        parts["deadline"] = self._deadline
         return Agent(**{**parts, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, int]) -> Agent:
@@ -175,10 +182,10 @@ class Agent:
         }
 
     def _look_ahead(
-        self, model: WorldModel, queries: Sequence[Query], revising: Sequence[Situation], beams: Beams, clock: Clock
+        self, ask: Attempts, queries: Sequence[Query], revising: Sequence[Situation], beams: Beams, clock: Clock
     ) -> tuple[Imagination, list[NDArray[np.float64]]]:
         """Imagines and scores the plans of one level."""
-        imagined = imagine(model, queries, beams.proposals, beams.origins, self.revision.frames, clock)
+        imagined = imagine(ask, queries, beams.proposals, beams.origins, self.revision.frames, clock)
         beams.spend(imagined.calls)
         with clock("revise"):
             scores = self.revision.score(revising, beams.proposals, imagined.rollouts)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the loop holds policies and world models to; `checked_rollout` does the same for frames."""
+"""What the loop holds policies and world models to; `Attempts` does the same for frames."""
 
 from __future__ import annotations
 

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw._core import core, planner
 from wiw.errors import ArgumentError
+from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout
-from wiw.world_models.base import Accepts, WorldModel, checked_rollout
+from wiw.world_models.base import Accepts
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Imagination:
 
 
 def imagine(
-    model: WorldModel,
+    ask: Attempts,
     queries: Sequence[Any],
     proposals: Sequence[Sequence[Proposal]],
     origins: Sequence[Sequence[int]],
@@ -56,7 +57,7 @@ def imagine(
 
     `origins` numbers the seed of each proposal.
     """
-    accepts = model.accepts
+    accepts = ask.model.accepts
     with clock("platform"):
         batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], _spec(accepts))
         panoramas = np.stack([query.observation.panorama for query in queries])
@@ -68,7 +69,7 @@ def imagine(
             observations = _at_start(conditioning, part, answers, accepts)
             controls = _controls(accepts, part)
         with clock("world_model"):
-            answers.append(checked_rollout(model, observations, controls, seeds[part.rows]))
+            answers.append(ask(observations, controls, seeds[part.rows]))
     with clock("platform"):
         kind = "perspective" if accepts.view == "perspective" else "panorama"
         view = "front" if kind == "perspective" else frames.view

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, ContractError
+from wiw.errors import ArgumentError, ContractError, RolloutError
 from wiw.loop.agent import Agent, Query
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
 
@@ -66,7 +66,8 @@ def run_episodes(
 
     An exception in an episode is infrastructure: the episode is reported as failed and the rest go on. One in a batch
     may be due to any of its episodes, so each of them is run again by itself, after the others: what fails does not
-    depend on what else was live. A broken contract or a wrong argument would hit every episode alike, so it is raised.
+    depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so it is
+    raised; so is what the sink raises.
     """
     waiting, trials, suspects = deque(episodes), list[Trial](), deque[tuple[int, Episode]]()
     envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
@@ -94,7 +95,7 @@ def _start(item: tuple[int, Episode], envs: list[Any], trials: list[Trial], seed
         observation = env.begin(episode)
     except Exception as error:  # whatever went wrong, the run goes on and the record says so
         envs.append(env)
-        sink.episode(_failed(index, episode, begin, error))
+        sink.episode(_failed(index, episode, begin, "environment", error))
         return
     trials.append(Trial(index, episode, env, Key(seed, index), observation, begin))
 
@@ -108,21 +109,25 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
     except (ArgumentError, ContractError):
         raise
     except Exception as error:
+        kind = f"world_model/{error.kind}" if isinstance(error, RolloutError) else "agent"
         for trial in trials:
             trial.done = True
         if len(trials) > 1:
             sink.again([trial.index for trial in trials])
             return [(trial.index, trial.episode) for trial in trials]
-        sink.episode(_failed(trials[0].index, trials[0].episode, trials[0].begin, error))
+        sink.episode(_failed(trials[0].index, trials[0].episode, trials[0].begin, kind, error))
         return []
     for trial, decision in zip(trials, decisions, strict=True):
         try:
-            sink.decision(trial.carry_out(decision))
-            if trial.done:
-                sink.episode(_finished(trial))
+            record = trial.carry_out(decision)
+            result = _finished(trial) if trial.done else None
         except Exception as error:
             trial.done = True
-            sink.episode(_failed(trial.index, trial.episode, trial.begin, error))
+            sink.episode(_failed(trial.index, trial.episode, trial.begin, "environment", error))
+            continue
+        sink.decision(record)
+        if result is not None:
+            sink.episode(result)
     return []
 
 
@@ -132,6 +137,7 @@ def _finished(trial: Trial) -> EpisodeResult:
     return EpisodeResult(trial.index, trial.episode.episode_id, trial.episode.scene, "done", metrics, seconds)
 
 
-def _failed(index: int, episode: Episode, begin: float, error: Exception) -> EpisodeResult:
+def _failed(index: int, episode: Episode, begin: float, kind: str, error: Exception) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
-    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, time.perf_counter() - begin, text)
+    seconds = time.perf_counter() - begin
+    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, seconds, text, kind)

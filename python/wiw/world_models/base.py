@@ -145,14 +145,28 @@ def checked_rollout(
     """`model.rollout` with its answer held to the contract.
 
     Raises:
-        ContractError: wrong type, dtype or shape, named with what was expected.
+        ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected.
     """
     frames = model.rollout(observations, controls, seeds)
     expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
-        came = f"{frames.dtype} {frames.shape}" if isinstance(frames, np.ndarray) else type(frames).__name__
+        kind, came = _breach(frames, expected)
         raise ContractError(
             f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
-            f"width, 3), got {came}"
+            f"width, 3), got {came}",
+            kind,
         )
     return frames
+
+
+def _breach(frames: Any, expected: tuple[int, ...]) -> tuple[str, str]:
+    """How an answer breaks the contract: in one word, and as seen."""
+    if not isinstance(frames, np.ndarray):
+        return "type", type(frames).__name__
+    came = f"{frames.dtype} {frames.shape}"
+    if np.issubdtype(frames.dtype, np.floating) and np.isnan(frames).any():
+        return "nan", f"{came} with NaN"
+    if frames.dtype != np.uint8:
+        return "dtype", came
+    other = frames.ndim == 5 and (*frames.shape[:1], *frames.shape[2:]) == (*expected[:1], *expected[2:])
+    return ("frames" if other else "shape"), came

@@ -70,9 +70,8 @@ def sentence(summary: Summary) -> str:
     shown = [line for line in judged if line.role == "world model"] or judged[-1:]
     parts = []
     for line in shown[:3]:
-        rate = (
-            f"With {line.name}, the agent succeeded in {line.estimates['success'].value:.1f} % of {line.done} episodes"
-        )
+        share = line.estimates["success"].value
+        rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {line.judged} episodes"
         parts.append(rate + _verdict(_found(summary, line.name, "none")))
     return " ".join(parts)
 

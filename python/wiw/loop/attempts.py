@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Asking a world model until it answers as agreed: a few tries a call, each within a deadline.
+
+A call that outlives its deadline is abandoned, for Python cannot end a thread: it goes on until it returns by itself or
+the process ends, with its memory, and on a GPU with its place in the queue. The next try waits once more for it, so
+that a model that is merely slow is never entered twice at a time; then it asks in a new thread, which mends a lost
+request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
+that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from contextvars import copy_context
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, ContractError, RolloutError
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import WorldModel, checked_rollout
+
+TRIES = 3
+PAUSES = (0.2, 1.0)
+"""Seconds before the second and the third try; a server that restarts may be back by then."""
+DEADLINE = 600.0
+"""Seconds a call may take unless the user says otherwise: room for a first call that loads and compiles."""
+
+
+class Attempts:
+    """A world model's answers, held to the contract and to a deadline.
+
+    Args:
+        model: what is asked.
+        deadline: seconds that a call may take; `math.inf` waits for ever. A model that is handed the simulator is asked
+            in the caller's own thread, without a deadline: a graphics context belongs to the thread that made it.
+    """
+
+    def __init__(self, model: WorldModel, deadline: float = DEADLINE) -> None:
+        if not deadline > 0:
+            raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
+        self.model, self.deadline = model, deadline
+        self.retries = 0
+        """Tries so far that gave nothing and were followed by another."""
+        self._helper: _Helper | None = None
+
+    def __reduce__(self) -> Any:
+        return Attempts, (self.model, self.deadline)
+
+    def __call__(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Frames as `WorldModel.rollout` promises them.
+
+        Raises:
+            RolloutError: every try failed. An answer that breaks the contract in the same way twice is not asked for a
+                third time.
+        """
+        said: list[str] = []
+        for attempt in range(TRIES):
+            try:
+                return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
+            except Exception as error:
+                said.append(_said(error))
+                hopeless = isinstance(error, ContractError) and said.count(said[-1]) > 1
+                if attempt + 1 == TRIES or hopeless:
+                    raise self._failure(error, said) from error
+                self.retries += 1
+                time.sleep(PAUSES[attempt])
+        raise AssertionError("unreachable")
+
+    def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
+        kind = getattr(error, "kind", "contract") if isinstance(error, ContractError | _LateError) else "raised"
+        name = type(self.model).__name__
+        return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
+
+    def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        if self.deadline > threading.TIMEOUT_MAX or "simulator" in self.model.accepts.needs:
+            return work()
+        if self._helper is not None and not self._helper.idle(self.deadline):
+            self._helper = None
+        if self._helper is None:
+            self._helper = _Helper()
+        return self._helper.do(work, self.deadline)
+
+
+class _LateError(Exception):
+    """The deadline has passed."""
+
+    kind = "deadline"
+
+
+class _Errand:
+    """One piece of work and what came of it."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self.work: Callable[[], Any] | None = work
+        self.context, self.torch = copy_context(), _torch_state()
+        self.ended = threading.Event()
+        self.value: Any = None
+        self.error: BaseException | None = None
+
+    def run(self) -> None:
+        assert self.work is not None
+        try:
+            with _as_in(self.torch):
+                self.value = self.context.run(self.work)
+        except BaseException as error:
+            self.error = error
+        self.work = None
+        self.ended.set()
+
+
+class _Helper:
+    """A thread that works for another one; the same one each time, for thread-local state of the model's libraries."""
+
+    def __init__(self) -> None:
+        self._errands: queue.SimpleQueue[_Errand | None] = queue.SimpleQueue()
+        self._last: _Errand | None = None
+        threading.Thread(target=_serve, args=(self._errands,), daemon=True, name="wiw world model").start()
+        weakref.finalize(self, self._errands.put, None)
+
+    def idle(self, seconds: float) -> bool:
+        """Whether the thread is free, or becomes so in time."""
+        return self._last is None or self._last.ended.wait(seconds)
+
+    def do(self, work: Callable[[], Any], seconds: float) -> Any:
+        errand = self._last = _Errand(work)
+        self._errands.put(errand)
+        if not errand.ended.wait(seconds):
+            raise _LateError(f"no answer within {seconds:g} s (deadline); the call was abandoned")
+        self._last = None
+        if errand.error is not None:
+            raise errand.error
+        return errand.value
+
+
+def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
+    while (errand := errands.get()) is not None:
+        errand.run()
+        del errand  # else its frames would stay until the next one comes
+
+
+def _said(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, ContractError | _LateError) else f"{type(error).__name__}: {text}"
+
+
+def _torch_state() -> tuple[bool, bool, int | None] | None:
+    """What torch keeps for each thread: gradients, inference mode, GPU."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return None
+    gpu = torch.cuda.current_device() if torch.cuda.is_initialized() else None
+    return torch.is_grad_enabled(), torch.is_inference_mode_enabled(), gpu
+
+
+@contextmanager
+def _as_in(state: tuple[bool, bool, int | None] | None) -> Iterator[None]:
+    """The asking thread's torch state, in the helper's."""
+    with ExitStack() as stack:
+        if state is not None:
+            torch, (gradients, inference, gpu) = sys.modules["torch"], state
+            stack.enter_context(torch.inference_mode(inference))
+            stack.enter_context(torch.set_grad_enabled(gradients))
+            if gpu is not None:
+                torch.cuda.set_device(gpu)
+        yield
