@@ -202,7 +202,7 @@ def test_a_run_killed_at_random_moments_ends_as_if_nothing_had_happened(referenc
 def test_recipes_survive_json():
     agent = AgentRecipe("matcher", "warp", horizon=7)
     assert AgentRecipe(**agent.to_json()) == agent and agent.arm == "warp"
-    task = TaskRecipe("imagenav", {"scenes": "apartments:val", "seed": 3})
+    task = TaskRecipe("imagenav", {"scenes": "apartments:val", "seed": 3, "backend": "cpu"})
     assert TaskRecipe(**task.to_json()) == task
     assert Ready(LineTask()).to_json() is None
     assert agent.with_model("none").arm == "none" and AgentRecipe("m", "/x/y.py:Mine").arm == "Mine"
