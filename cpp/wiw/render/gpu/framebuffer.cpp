@@ -35,14 +35,37 @@ void Framebuffer::allocate(GlTexture& texture, int layers, GLint internal, GLenu
   gl_.TexParameteri(GL_TEXTURE_2D_ARRAY, GL_TEXTURE_MAG_FILTER, GL_NEAREST);
 }
 
-void Framebuffer::reserve(Size size, int layers, ProgramKey outputs, bool depth_test) {
-  if (size.width > size_.width || size.height > size_.height || layers > layers_) {
-    size_ = {std::max(size.height, size_.height), std::max(size.width, size_.width)};
-    layers_ = std::max(layers, layers_);
-    framebuffer_ = {};
-    for (GlTexture& target : targets_) target = {};
-    depth_buffer_ = {};
+void Framebuffer::release() {
+  framebuffer_ = {};
+  for (GlTexture& target : targets_) target = {};
+  depth_buffer_ = {};
+  size_ = {};
+  layers_ = 0;
+}
+
+/// Grows every axis by itself, so that alternating requests share one room, as long as that stays small.
+void Framebuffer::choose_room(Size size, int layers) {
+  const auto pixels = [](Size each, int count) { return each.pixels() * static_cast<std::size_t>(count); };
+  Size room{std::max(size.height, size_.height), std::max(size.width, size_.width)};
+  int deep = std::max(layers, layers_);
+  if (pixels(room, deep) > std::max(pixels(size, layers), kBatchPixels)) {
+    room = size;
+    deep = layers;
   }
+  if (room == size_ && deep == layers_) return;
+  release();
+  size_ = room;
+  layers_ = deep;
+}
+
+bool Framebuffer::is_complete(ProgramKey outputs, bool depth_test) const {
+  bool complete = framebuffer_.id() != 0 && (!depth_test || depth_buffer_.id() != 0);
+  for (std::size_t i = 0; i < targets_.size(); ++i)
+    complete = complete && (!wants(outputs, i) || targets_[i].id() != 0);
+  return complete;
+}
+
+void Framebuffer::allocate_missing(ProgramKey outputs, bool depth_test) {
   if (framebuffer_.id() == 0) framebuffer_ = GlFramebuffer(gl_);
   gl_.ActiveTexture(GL_TEXTURE0);
   for (std::size_t i = 0; i < targets_.size(); ++i) {
@@ -52,6 +75,21 @@ void Framebuffer::reserve(Size size, int layers, ProgramKey outputs, bool depth_
   if (depth_test && depth_buffer_.id() == 0) {
     allocate(depth_buffer_, 1, GL_DEPTH_COMPONENT32F, GL_DEPTH_COMPONENT, GL_FLOAT);
   }
+}
+
+void Framebuffer::reserve(Size size, int layers, ProgramKey outputs, bool depth_test) {
+  choose_room(size, layers);
+  if (is_complete(outputs, depth_test)) return;
+  allocate_missing(outputs, depth_test);
+  if (gl_.GetError() == GL_NO_ERROR) return;
+  const bool larger = size_ != size || layers_ != layers;
+  release();
+  if (larger) {
+    reserve(size, layers, outputs, depth_test);
+    return;
+  }
+  throw OutOfGraphicsMemory("making " + std::to_string(layers) + " targets of " + std::to_string(size.height) + " x " +
+                            std::to_string(size.width));
 }
 
 void Framebuffer::bind(int layer, ProgramKey outputs, bool depth_test) {

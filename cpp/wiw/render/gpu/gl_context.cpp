@@ -169,10 +169,19 @@ void GlContext::check(const char* doing) {
   const GLenum code = gl_.GetError();
   if (code == GL_NO_ERROR) return;
   if (code == GL_CONTEXT_LOST) lost_ = true;
+  if (code == GL_OUT_OF_MEMORY) throw OutOfGraphicsMemory(std::string(doing) + " on " + info_.renderer);
   std::string cause = "OpenGL error " + std::to_string(code);
-  if (code == GL_OUT_OF_MEMORY) cause = "out of graphics memory; use smaller batches, textures or scenes";
   if (code == GL_CONTEXT_LOST) cause = "the OpenGL context was lost; make a new renderer";
   throw BackendError(std::string(doing) + " on " + info_.renderer + ": " + cause);
+}
+
+void GlContext::discard_errors() {
+  constexpr int kMostFlags = 16;  // a driver may keep several, each of which is reported once
+  for (int i = 0; i < kMostFlags && gl_.GetError != nullptr; ++i) {
+    const GLenum code = gl_.GetError();
+    if (code == GL_NO_ERROR) return;
+    if (code == GL_CONTEXT_LOST) lost_ = true;
+  }
 }
 
 GlContext::Current::Current(GlContext& context)
@@ -195,6 +204,8 @@ GlContext::Current::Current(GlContext& context)
 }
 
 GlContext::Current::~Current() {
+  // What an exception left behind must not be taken for a failure of the next call.
+  context_.discard_errors();
   const EglLibrary& egl = context_.egl_;
   if (previous_ == EGL_NO_CONTEXT) {
     egl.make_current(context_.display_, EGL_NO_SURFACE, EGL_NO_SURFACE, EGL_NO_CONTEXT);

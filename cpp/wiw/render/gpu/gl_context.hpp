@@ -66,7 +66,8 @@ class GlContext {
   /// Render targets, shared likewise: calls are serialised, so one set serves all.
   [[nodiscard]] Workspace& workspace() { return *workspace_; }
 
-  /// Throws BackendError naming `doing` if a GL call failed since the last check; use while current.
+  /// Throws BackendError naming `doing` if a GL call failed since the last check, OutOfGraphicsMemory if that was why;
+  /// use while current.
   void check(const char* doing);
 
  private:
@@ -74,6 +75,7 @@ class GlContext {
   void load_functions();
   void read_info();
   void require_own_process() const;
+  void discard_errors();
 
   const EglLibrary& egl_;
   Gl gl_;

@@ -16,9 +16,7 @@ namespace wiw::gpu {
 
 namespace {
 
-/// Pixels and views drawn before one read-back: the batch's textures take 12 bytes a pixel, and drivers give at least
-/// 256 layers.
-constexpr std::size_t kBatchPixels = std::size_t{8} << 20;
+/// Views drawn before one read-back: drivers give at least 256 layers.
 constexpr std::size_t kBatchViews = 256;
 
 int grid_side(int samples) { return samples == 16 ? 4 : samples == 9 ? 3 : samples == 4 ? 2 : 1; }
@@ -82,21 +80,21 @@ class GpuRenderer final : public Renderer {
 
   void render(std::span<const Pose> T_world_camera, const Camera& camera, const RenderTargets& targets) override {
     check_request(T_world_camera, camera);
-    const ProgramKey outputs = outputs_of(targets);
-    if (outputs == 0 || T_world_camera.empty()) return;
+    if (outputs_of(targets) == 0 || T_world_camera.empty()) return;
     check_size(camera);
     const GlContext::Current current(*context_);
     prepare_state();
-    const std::size_t step = std::clamp<std::size_t>(kBatchPixels / camera.size.pixels(), 1, kBatchViews);
-    for (std::size_t first = 0; first < T_world_camera.size(); first += step) {
+    std::size_t step = std::clamp<std::size_t>(kBatchPixels / camera.size.pixels(), 1, kBatchViews);
+    for (std::size_t first = 0; first < T_world_camera.size();) {
       const auto part = T_world_camera.subspan(first, std::min(step, T_world_camera.size() - first));
-      if (camera.projection == Projection::kPerspective) {
-        draw_perspective(part, camera, outputs);
-      } else {
-        draw_panoramas(part, camera, outputs);
+      try {
+        render_part(part, first, camera, targets);
+        first += part.size();
+      } catch (const OutOfGraphicsMemory&) {
+        context_->workspace().release();
+        if (part.size() == 1) throw;
+        step = part.size() / 2;
       }
-      read_back(camera.size, part.size(), first, targets);
-      context_->check("rendering");
     }
   }
 
@@ -153,9 +151,23 @@ class GpuRenderer final : public Renderer {
     }
   }
 
+  /// Views that are drawn together and read back at once, to the targets' places from `first` on.
+  void render_part(std::span<const Pose> part, std::size_t first, const Camera& camera, const RenderTargets& targets) {
+    if (camera.projection == Projection::kPerspective) {
+      draw_perspective(part, camera, outputs_of(targets));
+    } else {
+      draw_panoramas(part, camera, outputs_of(targets));
+    }
+    read_back(camera.size, part.size(), first, targets);
+    context_->check("rendering");
+  }
+
   void draw_perspective(std::span<const Pose> poses, const Camera& camera, ProgramKey outputs) {
     const std::vector<Eigen::Vector2f> offsets = sample_offsets(samples_);
     const bool sampled = samples_ > 1 && (outputs & kColorOut) != 0;
+    Framebuffer& batch = context_->workspace().batch;
+    batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, true);
+    if (sampled) context_->workspace().samples.reserve(camera.size, samples_, kColorOut, true);
     std::vector<View> views;
     for (const Pose& pose : poses) views.push_back(perspective_view(pose, camera, Eigen::Vector2f::Zero(), 1));
     if (sampled) {
@@ -165,8 +177,6 @@ class GpuRenderer final : public Renderer {
     }
     memory_->views.upload(views, GL_STREAM_DRAW);
     const ProgramKey direct = sampled ? outputs & ~kColorOut : outputs;
-    Framebuffer& batch = context_->workspace().batch;
-    batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, true);
     for (std::size_t i = 0; i < poses.size() && direct != 0; ++i) {
       bind_layer(batch, static_cast<int>(i), camera.size, direct, true);
       draw_view(views, i, direct);
@@ -180,7 +190,6 @@ class GpuRenderer final : public Renderer {
 
   void draw_samples(const std::vector<View>& views, std::size_t first_view, Size size) {
     Framebuffer& target = context_->workspace().samples;
-    target.reserve(size, samples_, kColorOut, true);
     for (int i = 0; i < samples_; ++i) {
       bind_layer(target, i, size, kColorOut, true);
       draw_view(views, first_view + static_cast<std::size_t>(i), kColorOut);
@@ -196,17 +205,17 @@ class GpuRenderer final : public Renderer {
   }
 
   void draw_panoramas(std::span<const Pose> poses, const Camera& camera, ProgramKey outputs) {
-    std::vector<View> views;
-    for (const Pose& pose : poses) {
-      for (int face = 0; face < kFaces; ++face) views.push_back(face_view(pose, face, camera.size, samples_));
-    }
-    memory_->views.upload(views, GL_STREAM_DRAW);
     const int side = face_size(camera.size, samples_);
     const ProgramKey face_outputs = outputs | kIdOut | kCubeFace;
     Framebuffer& batch = context_->workspace().batch;
     Framebuffer& faces = context_->workspace().faces;
     batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, false);
     faces.reserve({side, side}, kFaces, face_outputs, true);
+    std::vector<View> views;
+    for (const Pose& pose : poses) {
+      for (int face = 0; face < kFaces; ++face) views.push_back(face_view(pose, face, camera.size, samples_));
+    }
+    memory_->views.upload(views, GL_STREAM_DRAW);
     for (std::size_t i = 0; i < poses.size(); ++i) {
       for (int face = 0; face < kFaces; ++face) {
         bind_layer(faces, face, {side, side}, face_outputs, true);
@@ -319,7 +328,9 @@ class GpuRenderer final : public Renderer {
     std::size_t total = 0;
     for (const Output& output : outputs) total += count * output.view_bytes;
 
-    gl_->BindBuffer(GL_PIXEL_PACK_BUFFER, context_->workspace().packed.id());
+    GlBuffer& packed = context_->workspace().packed;
+    if (packed.id() == 0) packed = GlBuffer(*gl_);
+    gl_->BindBuffer(GL_PIXEL_PACK_BUFFER, packed.id());
     gl_->BufferData(GL_PIXEL_PACK_BUFFER, static_cast<GLsizeiptr>(total), nullptr, GL_STREAM_READ);
     for (std::size_t i = 0; i < count; ++i) {
       context_->workspace().batch.bind(static_cast<int>(i), outputs_of(targets), false);

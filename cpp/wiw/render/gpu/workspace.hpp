@@ -9,6 +9,12 @@ namespace wiw::gpu {
 struct Workspace {
   explicit Workspace(const Gl& gl) : batch(gl), faces(gl), samples(gl), packed(gl) {}
 
+  /// Gives all graphics memory back.
+  void release() {
+    for (Framebuffer* target : {&batch, &faces, &samples}) target->release();
+    packed = {};
+  }
+
   Framebuffer batch;
   Framebuffer faces;
   Framebuffer samples;
