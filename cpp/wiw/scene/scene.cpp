@@ -76,7 +76,12 @@ void Scene::validate() const {
       throw ArgumentError("Scene: instance '" + instance.name + "' must have id " + std::to_string(i + 1));
     check_index(instance.category, categories.size(), "category of '" + instance.name + "'");
     for (const std::uint32_t mesh : instance.meshes) {
-      check_index(static_cast<std::int32_t>(mesh), meshes.size(), "mesh of '" + instance.name + "'");
+      if (mesh < meshes.size()) continue;
+      throw ArgumentError("Scene: mesh of '" + instance.name + "' is " + std::to_string(mesh) +
+                          ", but there are only " + std::to_string(meshes.size()));
+    }
+    if (!instance.T_world_instance.matrix().allFinite()) {
+      throw ArgumentError("Scene: the pose of '" + instance.name + "' is not finite");
     }
   }
 }

@@ -87,7 +87,8 @@ struct Scene {
 
   [[nodiscard]] std::size_t triangle_count() const;  // over placements
   [[nodiscard]] Eigen::AlignedBox3f bounds() const;  // world
-  /// Throws ArgumentError naming the first broken invariant (index out of range, array length, non-finite position).
+  /// Throws ArgumentError naming the first broken invariant (index out of range, array length, a position or pose that
+  /// is not finite).
   void validate() const;
 };
 

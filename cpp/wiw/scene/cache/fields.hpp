@@ -6,7 +6,8 @@
 namespace wiw::cache {
 
 // What is stored of each type, in order: written once, for the writer and the reader alike. An archive offers
-// value (plain data), text, texts, pairs, array (a Buffer) and list (of what has fields itself).
+// value (plain data), text, texts, pairs, array (a Buffer, with a checksum), texels (a Buffer without) and list (of
+// what has fields itself).
 
 template <class Archive, class T>
 void fields_of(Archive& archive, T& texture)
@@ -15,7 +16,7 @@ void fields_of(Archive& archive, T& texture)
   archive.text(texture.name);
   archive.value(texture.size.height);
   archive.value(texture.size.width);
-  archive.array(texture.rgba);
+  archive.texels(texture.rgba);
 }
 
 template <class Archive, class T>

@@ -56,6 +56,16 @@ class Reader {
   }
   template <class T>
   void array(Buffer<T>& buffer) {
+    std::uint64_t checksum = 0;
+    value(checksum);
+    texels(buffer);
+    const auto* first = reinterpret_cast<const std::uint8_t*>(buffer.data());
+    if (cache::array_checksum({first, buffer.size() * sizeof(T)}) != checksum) {
+      throw Error("the checksum of an array does not fit");
+    }
+  }
+  template <class T>
+  void texels(Buffer<T>& buffer) {
     std::uint64_t offset = 0;
     std::uint64_t length = 0;
     value(offset);

@@ -1,4 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
+#include <fcntl.h>
 #include <unistd.h>
 
 #include <atomic>
@@ -55,6 +56,11 @@ class Writer {
   }
   template <class T>
   void array(const Buffer<T>& buffer) {
+    value(cache::array_checksum(as_bytes(buffer.data(), buffer.size() * sizeof(T))));
+    texels(buffer);
+  }
+  template <class T>
+  void texels(const Buffer<T>& buffer) {
     align();
     value(position_);
     value(std::uint64_t{buffer.size()});
@@ -107,6 +113,15 @@ std::filesystem::path draft_of(const std::filesystem::path& path) {
   return draft;
 }
 
+/// Waits until a file's bytes, or a folder's names, are on the disk.
+bool sync_to_disk(const std::filesystem::path& path) {
+  const int file = open(path.c_str(), O_RDONLY | O_CLOEXEC);
+  if (file < 0) return false;
+  const bool done = fsync(file) == 0;
+  close(file);
+  return done;
+}
+
 }  // namespace
 
 void write_scene_cache(const Scene& scene, const std::filesystem::path& path) {
@@ -118,13 +133,15 @@ void write_scene_cache(const Scene& scene, const std::filesystem::path& path) {
   fields_of(writer, scene);
   writer.finish();
   std::error_code error;
-  if (stream) std::filesystem::rename(draft, path, error);
-  if (!stream || error) {
+  const bool complete = stream && sync_to_disk(draft);  // else a power cut could leave the name without the bytes
+  if (complete) std::filesystem::rename(draft, path, error);
+  if (!complete || error) {
     std::error_code ignored;
     std::filesystem::remove(draft, ignored);
     throw FileError(path.string(),
                     "cannot be written (" + (error ? error.message() : std::string("is the disk full?")) + ")");
   }
+  sync_to_disk(path.has_parent_path() ? path.parent_path() : ".");  // not every file system can: the name may come late
 }
 
 }  // namespace wiw
