@@ -8,6 +8,7 @@
 
 #include "scene/samples.hpp"
 #include "wiw/core/error.hpp"
+#include "wiw/scene/import/mesh_baker.hpp"
 #include "wiw/scene/measure.hpp"
 
 using wiw::FileError;
@@ -217,6 +218,75 @@ TEST_CASE("triangles without area are dropped") {
   GlbParts parts;
   parts.triangles = {0, 1, 2, 0, 0, 3, 0, 2, 3};
   CHECK(load_mesh(folder.write("a.glb", sample_glb(parts)))->triangle_count() == 2);
+}
+
+TEST_CASE("PLY elements come once, vertices first, with properties") {
+  const Folder folder;
+  const std::string vertices = "element vertex 3\nproperty float x\nproperty float y\nproperty float z\n";
+  const std::string faces = "element face 1\nproperty list uchar int vertex_indices\n";
+  const std::string body = "end_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n";
+  const auto ply = [&](const std::string& elements, const std::string& rows = "") {
+    return folder.write("a.ply", "ply\nformat ascii 1.0\n" + elements + body + rows);
+  };
+  CHECK(load_mesh(ply(vertices + faces))->triangle_count() == 1);
+  CHECK_THROWS_WITH_AS(load_mesh(ply(vertices + vertices + faces, "4 5 6\n7 8 9\n0 0 1\n")),
+                       doctest::Contains("declares the element 'vertex' twice"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(ply(vertices + faces + faces, "3 0 1 2\n")),
+                       doctest::Contains("declares the element 'face' twice"), FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(ply(faces + vertices)), doctest::Contains("no element 'vertex' before its faces"),
+                       FileError);
+  CHECK_THROWS_WITH_AS(load_mesh(ply("element vertex 3\n" + faces)), doctest::Contains("no property"), FileError);
+}
+
+TEST_CASE("transforms that overflow are the file's error") {
+  const Folder folder;
+  GlbParts parts;
+  parts.positions = {0, 0, 0, 1e10f, 0, 0, 1e10f, 1e10f, 0, 0, 1e10f, 0};
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("far.glb", sample_glb(parts))),
+                       doctest::Contains("far.glb: 'Chair_01' reaches farther than 10^7"), FileError);
+  parts.nodes = R"([{"mesh":0,"name":"Chair_01","scale":[1e30,1e30,1e30]}])";
+  CHECK_THROWS_WITH_AS(load_mesh(folder.write("over.glb", sample_glb(parts))), doctest::Contains("over.glb: "),
+                       FileError);
+}
+
+TEST_CASE("a node flattened to a plane is drawn, one squeezed to a line is named") {
+  const Folder folder;
+  GlbParts parts;
+  parts.nodes = R"([{"mesh":0,"name":"flat","scale":[2,1,0]}])";
+  const auto flat = load_mesh(folder.write("flat.glb", sample_glb(parts)));
+  CHECK(flat->triangle_count() == 2);
+  CHECK(same_box(flat->bounds(), {0, 0, 0}, {2, 1, 0}));
+  parts.nodes = R"([{"mesh":0,"name":"flat"},{"mesh":0,"name":"line","scale":[2,0,0]}])";
+  parts.scene_nodes = "[0,1]";
+  const auto line = load_mesh(folder.write("line.glb", sample_glb(parts)));
+  CHECK(line->instances.size() == 1);
+  REQUIRE(line->warnings.size() == 1);
+  CHECK(line->warnings[0].find("node 'line' is scaled to nothing") == 0);
+}
+
+TEST_CASE("normals survive every scale, and are left to the triangles where there is no inverse") {
+  wiw::Mesh mesh;
+  mesh.positions = std::vector<Eigen::Vector3f>{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}};
+  mesh.normals = std::vector<Eigen::Vector3f>(3, Eigen::Vector3f(0.6f, 0, 0.8f));
+  mesh.triangles = std::vector<Eigen::Matrix<std::uint32_t, 3, 1>>{{0, 1, 2}};
+  const auto baked = [&](const Eigen::Vector3f& scale) {
+    wiw::Scene scene;
+    wiw::MeshBaker(scene).bake(mesh, Eigen::Affine3f(Eigen::Scaling(scale)), 0);
+    return scene.meshes[0];
+  };
+  CHECK(baked({1, 1, 0}).normals.empty());
+  CHECK(baked({1, 1, 1e-30f}).normals[0].isApprox(Eigen::Vector3f::UnitZ()));
+  CHECK(baked({2, 1, 1}).normals[0].isApprox(Eigen::Vector3f(0.3f, 0, 0.8f).normalized()));
+  CHECK(baked({-1, 1, 1}).normals[0].isApprox(Eigen::Vector3f(-0.6f, 0, 0.8f)));
+}
+
+TEST_CASE("textures are summed by their headers before any is decoded") {
+  const Folder folder;
+  folder.write("huge.bmp", sample_bmp(4096));
+  folder.write("sample.mtl", "newmtl wood\nmap_Kd huge.bmp\n");
+  const auto file = folder.write("a.obj", sample_obj());
+  CHECK_THROWS_WITH_AS(load_mesh(file, {.limits = {.texture_bytes = 67'108'863}}),
+                       doctest::Contains("has 67108864 bytes of decoded textures, more than"), FileError);
 }
 
 TEST_CASE("limits are enforced by figure and name") {

@@ -17,10 +17,10 @@ void append(std::string& bytes, const T& value) {
   bytes.append(raw, sizeof(value));
 }
 
-/// A 2 x 2 image, rows from the top: red green / blue white.
-inline std::string sample_bmp() {
+/// A 2 x 2 image, rows from the top: red green / blue white. Its header may claim another width and height.
+inline std::string sample_bmp(std::uint32_t claimed = 2) {
   std::string bytes = "BM";
-  for (const std::uint32_t word : {70U, 0U, 54U, 40U, 2U, 2U}) append(bytes, word);
+  for (const std::uint32_t word : {70U, 0U, 54U, 40U, claimed, claimed}) append(bytes, word);
   for (const std::uint16_t half : {std::uint16_t{1}, std::uint16_t{24}}) append(bytes, half);
   for (const std::uint32_t word : {0U, 16U, 2835U, 2835U, 0U, 0U}) append(bytes, word);
   const unsigned char bottom[8] = {255, 0, 0, 255, 255, 255, 0, 0};  // blue white, as BGR, padded to 4 bytes

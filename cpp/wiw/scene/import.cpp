@@ -13,15 +13,16 @@
 #include "wiw/scene/import/assimp_scene.hpp"
 #include "wiw/scene/import/ceiling.hpp"
 #include "wiw/scene/import/collada_check.hpp"
+#include "wiw/scene/import/extent.hpp"
 #include "wiw/scene/import/file.hpp"
-#include "wiw/scene/import/gltf_json.hpp"
+#include "wiw/scene/import/gltf_check.hpp"
 #include "wiw/scene/import/guarded_io.hpp"
 #include "wiw/scene/import/ply_header.hpp"
 
 namespace wiw {
 namespace {
 
-constexpr int kImporterVersion = 1;  // raise it whenever the same file and options give another scene
+constexpr int kImporterVersion = 2;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {
@@ -90,8 +91,8 @@ ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& optio
   convert_materials(file, context, *scene);
   convert_nodes(file, context, up, *scene);
   if (scene->instances.empty()) throw FileError(path.string(), "holds no triangles");
+  check_imported(*scene, path);
   if (options.ceiling_height) add_ceiling(*scene, *options.ceiling_height);
-  scene->validate();
   return scene;
 }
 

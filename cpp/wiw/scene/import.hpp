@@ -32,6 +32,7 @@ struct ImportOptions {
   std::vector<std::filesystem::path> texture_folders;  // searched by base name after the file's own folders
   std::vector<std::filesystem::path> model_folders;    // SDF: searched for model://NAME before the world's own folders
   ImportTrace* trace = nullptr;
+  SharedCount* texture_bytes = nullptr;  // counted together by the files of one scene
 };
 
 /// Reads GLB, glTF, OBJ, PLY or DAE into a Y-up scene in metres: one instance per node that carries meshes, placed by

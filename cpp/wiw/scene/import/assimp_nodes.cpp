@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <assimp/scene.h>
 
+#include <Eigen/Eigenvalues>
+#include <algorithm>
+
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/assimp_scene.hpp"
 #include "wiw/scene/import/category.hpp"
@@ -42,6 +45,14 @@ std::vector<PlacedNode> placed_nodes(const aiScene& file, const FileContext& con
   return placed;
 }
 
+/// False for a stretch to a line or a point; what it flattens to a plane can still be seen.
+bool spans_a_plane(const Eigen::Matrix3f& stretch) {
+  const Eigen::SelfAdjointEigenSolver<Eigen::Matrix3d> solver(stretch.cast<double>(), Eigen::EigenvaluesOnly);
+  Eigen::Array3d lengths = solver.eigenvalues().array().abs();
+  std::ranges::sort(lengths);
+  return lengths[1] > 1e-9;
+}
+
 /// The node's name says best what a thing is, then its mesh's, then its material's.
 std::string category_of(const aiScene& file, const aiNode& node) {
   std::string category = category_from_name(node.mName.C_Str());
@@ -66,7 +77,7 @@ void convert_nodes(const aiScene& file, const FileContext& context, const UpAxis
   for (const auto& [node, T_file_node] : nodes) {
     // turn (R S p + t) = (turn R turn^T) (turn S p) + turn t: the first factor stays in the pose, the second is baked.
     const auto [rotation, stretch] = split_rotation(T_file_node.linear());
-    if (std::abs(stretch.determinant()) < 1e-18f) {
+    if (!spans_a_plane(stretch)) {
       scene.warnings.push_back("node '" + std::string(node->mName.C_Str()) + "' is scaled to nothing and left out");
       continue;
     }

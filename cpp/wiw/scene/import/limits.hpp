@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstddef>
+#include <mutex>
 #include <string>
 
 namespace wiw {
@@ -13,6 +14,21 @@ struct ImportLimits {
   std::size_t nodes = 1'000'000;                      // of the scene graph
   std::size_t texture_pixels = std::size_t{1} << 28;  // one texture: 16384 x 16384
   std::size_t texture_bytes = std::size_t{8} << 30;   // all textures together, decoded to RGBA
+};
+
+/// A figure that several threads add to. A mutex, because GCC 12.2 at -O3 lost the addend of an atomic's
+/// `fetch_add(n) + n` here.
+class SharedCount {
+ public:
+  /// The figure with `more` in it.
+  std::size_t add(std::size_t more) {
+    const std::lock_guard lock(mutex_);
+    return figure_ += more;
+  }
+
+ private:
+  std::mutex mutex_;
+  std::size_t figure_ = 0;
 };
 
 /// Throws FileError naming file, figure and limit if `figure` exceeds `limit`. `what` is plural: "triangles".

@@ -8,6 +8,18 @@
 namespace wiw {
 namespace {
 
+/// Normals are covectors: n' ~ A^-T n, whose sign keeps them on their side under a mirroring map. A map that flattens
+/// has no inverse; there the triangles' own normals, which the renderer takes if there are none, are the right ones.
+std::vector<Eigen::Vector3f> mapped_normals(const Mesh& source, const Eigen::Matrix3f& linear) {
+  Eigen::Matrix3f normal_map = linear.inverse().transpose();
+  std::vector<Eigen::Vector3f> normals;
+  if (!normal_map.allFinite()) return normals;
+  normal_map /= normal_map.cwiseAbs().maxCoeff();
+  normals.reserve(source.normals.size());
+  for (const Eigen::Vector3f& normal : source.normals) normals.push_back((normal_map * normal).normalized());
+  return normals;
+}
+
 Mesh transformed(const Mesh& source, const Eigen::Affine3f& map) {
   Mesh mesh = source;
   std::vector<Eigen::Vector3f> positions;
@@ -15,12 +27,7 @@ Mesh transformed(const Mesh& source, const Eigen::Affine3f& map) {
   for (const Eigen::Vector3f& position : source.positions) positions.push_back(map * position);
   mesh.positions = std::move(positions);
 
-  // Normals are covectors: n' ~ A^-T n. The sign keeps them on their side under a mirroring map.
-  const Eigen::Matrix3f normal_map = map.linear().inverse().transpose();
-  std::vector<Eigen::Vector3f> normals;
-  normals.reserve(source.normals.size());
-  for (const Eigen::Vector3f& normal : source.normals) normals.push_back((normal_map * normal).normalized());
-  mesh.normals = std::move(normals);
+  mesh.normals = mapped_normals(source, map.linear());
 
   if (map.linear().determinant() < 0.f) {
     std::vector<Eigen::Matrix<std::uint32_t, 3, 1>> triangles(source.triangles.begin(), source.triangles.end());

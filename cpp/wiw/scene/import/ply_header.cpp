@@ -6,6 +6,7 @@
 #include <bit>
 #include <cstdint>
 #include <cstring>
+#include <set>
 #include <sstream>
 #include <string>
 #include <string_view>
@@ -106,6 +107,26 @@ Header read_header(std::string_view file, const std::string& path) {
   throw FileError(path, "ends within its header (truncated file)");
 }
 
+/// assimp gives each vertex and face its place by the element's count, so it must meet each element once, and faces
+/// after the vertices that they name.
+void check_elements(const Header& header, const std::string& path) {
+  std::set<std::string_view> names;
+  for (const Element& element : header.elements) {
+    if (!names.insert(element.name).second) {
+      throw FileError(path, "declares the element '" + element.name + "' twice (damaged file)");
+    }
+    if (element.name == "face" && !names.contains("vertex")) {
+      throw FileError(path, "declares no element 'vertex' before its faces; export it with the vertices first");
+    }
+    if (element.properties.empty() && element.count > 0) {
+      throw FileError(path, "declares no property of the element '" + element.name + "' (damaged file)");
+    }
+  }
+  for (const char* needed : {"vertex", "face"}) {
+    if (!names.contains(needed)) throw FileError(path, std::string("declares no element '") + needed + "'");
+  }
+}
+
 std::size_t list_length(std::string_view file, std::size_t at, std::size_t bytes, bool big_endian) {
   std::uint64_t length = 0;
   for (std::size_t i = 0; i < bytes; ++i) {
@@ -134,7 +155,6 @@ std::size_t row_end(const Element& element, std::string_view file, std::size_t a
 void check_binary(const Header& header, std::string_view file, const std::string& path) {
   std::size_t at = header.bytes;
   for (const Element& element : header.elements) {
-    if (element.properties.empty()) continue;
     for (std::size_t row = 0; row < element.count; ++row) {
       at = row_end(element, file, at, header.format == "binary_big_endian");
       if (at == std::string_view::npos) {
@@ -163,11 +183,7 @@ void check_ply(const std::filesystem::path& path) {
   const auto bytes = read_file(path);
   const std::string_view file(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   const Header header = read_header(file, path.string());
-  for (const char* needed : {"vertex", "face"}) {
-    if (std::ranges::find(header.elements, needed, &Element::name) == header.elements.end()) {
-      throw FileError(path.string(), std::string("declares no element '") + needed + "'");
-    }
-  }
+  check_elements(header, path.string());
   if (header.format == "ascii") {
     check_ascii(header, file, path.string());
   } else if (header.format == "binary_little_endian" || header.format == "binary_big_endian") {

@@ -16,9 +16,12 @@
 namespace wiw {
 namespace fs = std::filesystem;
 
-struct TextureSource::Result {
-  Texture texture;
-  std::string problem;  // empty: decoded
+/// Where a reference leads: to an image of the mesh file or a file of its own.
+struct TextureSource::Found {
+  const aiTexture* embedded = nullptr;
+  fs::path file;
+  Size size;            // by the image's header
+  std::string problem;  // empty: usable
   ImportTrace trace;
 };
 
@@ -46,20 +49,16 @@ std::string as_path(std::string reference) {
 
 std::string size_text(Size size) { return std::to_string(size.width) + " x " + std::to_string(size.height); }
 
-/// Checks the header against the limit before the pixels are decoded.
-Texture decode_within(const std::string& name, std::span<const std::uint8_t> bytes, const ImportLimits& limits) {
-  const Size size = image_size(bytes);
-  if (size.pixels() > limits.texture_pixels) {
-    throw Error("is " + size_text(size) + " pixels, more than the limit of " + std::to_string(limits.texture_pixels) +
-                " (raise limits.texture_pixels to allow it)");
-  }
-  return decode_image(name, bytes);
+bool is_raw(const aiTexture& image) { return image.mHeight > 0; }
+
+std::span<const std::uint8_t> encoded(const aiTexture& image) {
+  return {reinterpret_cast<const std::uint8_t*>(image.pcData), image.mWidth};
 }
 
-Texture decode_embedded(const aiTexture& image, const std::string& name, const ImportLimits& limits) {
-  const auto* data = reinterpret_cast<const std::uint8_t*>(image.pcData);
-  if (image.mHeight == 0) return decode_within(name, {data, image.mWidth}, limits);
-  const Size size{static_cast<int>(image.mHeight), static_cast<int>(image.mWidth)};
+Size raw_size(const aiTexture& image) { return {static_cast<int>(image.mHeight), static_cast<int>(image.mWidth)}; }
+
+Texture raw_texture(const aiTexture& image, std::string name) {
+  const Size size = raw_size(image);
   std::vector<std::uint8_t> rgba(4 * size.pixels());
   for (std::size_t i = 0; i < size.pixels(); ++i) {
     const aiTexel& texel = image.pcData[i];
@@ -68,7 +67,7 @@ Texture decode_embedded(const aiTexture& image, const std::string& name, const I
     rgba[4 * i + 2] = texel.b;
     rgba[4 * i + 3] = texel.a;
   }
-  return {name, size, std::move(rgba)};
+  return {std::move(name), size, std::move(rgba)};
 }
 
 }  // namespace
@@ -87,54 +86,84 @@ std::vector<fs::path> TextureSource::candidates(const std::string& reference) co
   return paths;
 }
 
-TextureSource::Result TextureSource::decode(const std::string& reference) const {
-  Result result;
+TextureSource::Found TextureSource::look_for(const std::string& reference) const {
+  Found found;
   try {
-    if (const aiTexture* image = file_.GetEmbeddedTexture(reference.c_str())) {
-      const std::string name = image->mFilename.length > 0 ? image->mFilename.C_Str() : reference;
-      result.texture = decode_embedded(*image, name, options_.limits);
-      return result;
+    found.embedded = file_.GetEmbeddedTexture(reference.c_str());
+    if (found.embedded) {
+      found.size = is_raw(*found.embedded) ? raw_size(*found.embedded) : image_size(encoded(*found.embedded));
+    } else {
+      find_file(reference, found);
     }
-    for (const fs::path& candidate : candidates(reference)) {
-      std::error_code ignored;
-      if (!fs::is_regular_file(candidate, ignored)) {
-        result.trace.absent.push_back(candidate);
-        continue;
-      }
-      result.trace.read.push_back(candidate);
-      check_limit(candidate.string(), "bytes", size_of_file(candidate), options_.limits.file_bytes, "file_bytes");
-      result.texture = decode_within(candidate.filename().string(), read_file(candidate), options_.limits);
-      return result;
+    if (found.size.pixels() > options_.limits.texture_pixels) {
+      throw Error("is " + size_text(found.size) + " pixels, more than the limit of " +
+                  std::to_string(options_.limits.texture_pixels) + " (raise limits.texture_pixels to allow it)");
     }
-    result.problem = "was not found";
   } catch (const Error& error) {
-    result.problem = error.what();
+    found.problem = error.what();
   }
-  return result;
+  return found;
+}
+
+void TextureSource::find_file(const std::string& reference, Found& found) const {
+  for (const fs::path& candidate : candidates(reference)) {
+    std::error_code ignored;
+    if (!fs::is_regular_file(candidate, ignored)) {
+      found.trace.absent.push_back(candidate);
+      continue;
+    }
+    found.file = candidate;
+    found.trace.read.push_back(candidate);
+    check_limit(candidate.string(), "bytes", size_of_file(candidate), options_.limits.file_bytes, "file_bytes");
+    found.size = image_size(read_file(candidate));
+    return;
+  }
+  throw Error("was not found");
+}
+
+Texture TextureSource::decode(const std::string& reference, const Found& found) {
+  if (!found.embedded) return decode_image(found.file.filename().string(), read_file(found.file));
+  const aiTexture& image = *found.embedded;
+  const std::string name = image.mFilename.length > 0 ? image.mFilename.C_Str() : reference;
+  return is_raw(image) ? raw_texture(image, name) : decode_image(name, encoded(image));
+}
+
+void TextureSource::check_bytes(const std::vector<Found>& found) const {
+  std::size_t bytes = 0;
+  for (const Found& image : found) bytes += image.problem.empty() ? 4 * image.size.pixels() : 0;
+  const bool is_part = options_.texture_bytes != nullptr;
+  const std::size_t all = is_part ? options_.texture_bytes->add(bytes) : bytes;
+  check_limit(path_.string(), is_part ? "bytes of decoded textures with other models'" : "bytes of decoded textures",
+              all, options_.limits.texture_bytes, "texture_bytes");
 }
 
 void TextureSource::load(const std::vector<std::string>& references, Scene& scene) {
-  std::vector<Result> results(references.size());
-  parallel_for(references.size(), [&](std::size_t i) { results[i] = decode(references[i]); });
-  std::size_t bytes = 0;
-  for (std::size_t i = 0; i < results.size(); ++i) {
-    Result& result = results[i];
+  std::vector<Found> found(references.size());
+  parallel_for(references.size(), [&](std::size_t i) { found[i] = look_for(references[i]); });
+  check_bytes(found);
+  std::vector<Texture> textures(references.size());
+  parallel_for(references.size(), [&](std::size_t i) {
+    try {
+      if (found[i].problem.empty()) textures[i] = decode(references[i], found[i]);
+    } catch (const Error& error) {
+      found[i].problem = error.what();
+    }
+  });
+  for (std::size_t i = 0; i < found.size(); ++i) {
     if (options_.trace) {
       auto& trace = *options_.trace;
-      trace.read.insert(trace.read.end(), result.trace.read.begin(), result.trace.read.end());
-      trace.absent.insert(trace.absent.end(), result.trace.absent.begin(), result.trace.absent.end());
+      trace.read.insert(trace.read.end(), found[i].trace.read.begin(), found[i].trace.read.end());
+      trace.absent.insert(trace.absent.end(), found[i].trace.absent.begin(), found[i].trace.absent.end());
     }
-    if (!result.problem.empty()) {
+    if (!found[i].problem.empty()) {
       indices_[references[i]] = kNone;
       scene.warnings.push_back("texture '" + references[i] + "' of " + path_.filename().string() + " " +
-                               result.problem + "; drawn in a neutral colour");
+                               found[i].problem + "; drawn in a neutral colour");
       continue;
     }
-    bytes += result.texture.rgba.size();
     indices_[references[i]] = static_cast<std::int32_t>(scene.textures.size());
-    scene.textures.push_back(std::move(result.texture));
+    scene.textures.push_back(std::move(textures[i]));
   }
-  check_limit(path_.string(), "bytes of decoded textures", bytes, options_.limits.texture_bytes, "texture_bytes");
 }
 
 std::int32_t TextureSource::find(const std::string& reference) const {

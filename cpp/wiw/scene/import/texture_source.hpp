@@ -21,15 +21,19 @@ class TextureSource {
  public:
   TextureSource(const aiScene& file, std::filesystem::path path, const ImportOptions& options);
 
-  /// Decodes all references in parallel into scene.textures. A reference without a usable image adds one warning.
+  /// Decodes all references in parallel into scene.textures, once their headers have told that they keep the limits. A
+  /// reference without a usable image adds one warning. Throws FileError above limits.texture_bytes.
   void load(const std::vector<std::string>& references, Scene& scene);
 
   /// Index into Scene::textures; kNone if the reference could not be loaded.
   [[nodiscard]] std::int32_t find(const std::string& reference) const;
 
  private:
-  struct Result;
-  [[nodiscard]] Result decode(const std::string& reference) const;
+  struct Found;
+  [[nodiscard]] Found look_for(const std::string& reference) const;
+  void find_file(const std::string& reference, Found& found) const;
+  static Texture decode(const std::string& reference, const Found& found);
+  void check_bytes(const std::vector<Found>& found) const;
   [[nodiscard]] std::vector<std::filesystem::path> candidates(const std::string& reference) const;
 
   const aiScene& file_;

@@ -8,6 +8,7 @@
 #include "wiw/core/thread_pool.hpp"
 #include "wiw/scene/import/category.hpp"
 #include "wiw/scene/import/ceiling.hpp"
+#include "wiw/scene/import/extent.hpp"
 #include "wiw/scene/import/up_axis.hpp"
 #include "wiw/scene/sdf/primitives.hpp"
 
@@ -34,8 +35,8 @@ ScenePtr Assembler::assemble(const std::filesystem::path& path) {
   load_parts();
   for (const Model& model : world_.models) add_model(model);
   if (scene_->instances.empty()) throw FileError(path.string(), "holds no triangles");
+  check_imported(*scene_, path);
   if (options_.ceiling_height) add_ceiling(*scene_, *options_.ceiling_height);
-  scene_->validate();
   return scene_;
 }
 
@@ -49,11 +50,13 @@ void Assembler::load_parts() {
   const std::vector<std::filesystem::path> files(unique.begin(), unique.end());
   std::vector<ScenePtr> parts(files.size());
   std::vector<ImportTrace> traces(files.size());
+  SharedCount texture_bytes;
   parallel_for(files.size(), [&](std::size_t i) {
     ImportOptions options = options_;
     options.up = Up::kY;  // as the file has it: SDF poses ignore a mesh file's own up axis
     options.ceiling_height.reset();
     options.trace = &traces[i];
+    options.texture_bytes = &texture_bytes;
     parts[i] = load_mesh(files[i], options);
   });
   for (std::size_t i = 0; i < files.size(); ++i) {
@@ -74,10 +77,6 @@ void Assembler::add_part(const std::filesystem::path& file, ScenePtr part) {
     scene_->materials.push_back(std::move(material));
   }
   scene_->warnings.insert(scene_->warnings.end(), part->warnings.begin(), part->warnings.end());
-  std::size_t bytes = 0;
-  for (const Texture& texture : scene_->textures) bytes += texture.rgba.size();
-  check_limit(file.string(), "bytes of decoded textures with the models before it", bytes,
-              options_.limits.texture_bytes, "texture_bytes");
   parts_[file] = {std::move(part), first_material};
 }
 

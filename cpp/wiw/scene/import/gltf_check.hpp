@@ -11,7 +11,8 @@ namespace wiw {
 
 /// Checks the parts of a GLB or glTF file that assimp takes for granted, and returns warnings about textures that it
 /// drops without a word (Basis Universal, WebP), counted. Throws FileError for chunks that do not fit the file's
-/// length, images of no known type and required extensions that are not read.
+/// length, accessors that reach beyond their buffers, images of no known type, required extensions that are not read
+/// and versions other than 2.
 std::vector<std::string> check_gltf(const std::filesystem::path& path, MeshFormat format);
 
 }  // namespace wiw
