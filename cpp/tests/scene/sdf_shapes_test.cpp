@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <doctest/doctest.h>
 
+#include <algorithm>
 #include <cmath>
 #include <numbers>
 #include <pugixml.hpp>
@@ -27,6 +28,12 @@ double volume(const wiw::Mesh& mesh) {
 
 std::string world(const std::string& content) {
   return "<sdf version=\"1.9\"><world name=\"w\">" + content + "</world></sdf>";
+}
+
+/// A file of one model.
+std::string sdf(const std::string& content) {
+  std::string text = "<sdf version=\"1.9\">";
+  return text.append(content).append("</sdf>");
 }
 
 std::string model(const std::string& content, const std::string& name = "m") {
@@ -122,6 +129,68 @@ TEST_CASE("poses chain from world to visual and follow relative_to") {
                                            "<link name=\"b\"><pose relative_to=\"a\">0 1 0 0 0 0</pose>" +
                                            kUnitBox + "</link>"));
   CHECK((centre(*relative) - Eigen::Vector3f(1, 1, 5)).norm() < 1e-5f);
+}
+
+TEST_CASE("relative_to finds every kind of frame of its model") {
+  const Folder folder;
+  const auto place = [&](const std::string& content) {
+    return centre(*wiw::load_sdf_world(folder.write("f.sdf", world(content))));
+  };
+  const auto is = [](const Eigen::Vector3f& found, float x, float y, float z) {
+    CAPTURE(found.transpose());
+    CHECK((found - Eigen::Vector3f(x, y, z)).norm() < 1e-5f);
+  };
+  const auto box = [](const std::string& frame) {
+    return "<visual name=\"v\"><pose relative_to=\"" + frame +
+           "\">1 0 0 0 0 0</pose><geometry><box><size>1 1 1</size></box></geometry></visual>";
+  };
+  const std::string frame = "<frame name=\"f\"><pose>0 0 5 0 0 1.5707963</pose></frame>";
+  const auto link = [](const std::string& content) { return "<link name=\"l\">" + content + "</link>"; };
+  is(place(model(frame + link("<pose>0 7 0 0 0 0</pose>" + box("l")))), 1, 7, 0);
+  is(place(model(frame + link("<pose>0 7 0 0 0 0</pose>" + box("f")))), 0, 1, 5);
+  is(place(model(frame + link("<pose>0 7 0 0 0 0</pose>" + box("__model__")))), 1, 0, 0);
+
+  // A joint's pose is by default relative to its child.
+  const std::string base = "<link name=\"base\"><pose>0 0 2 0 0 0</pose></link>";
+  const std::string joint = "<joint name=\"j\"><parent>l</parent><child>base</child><pose>0 3 0 0 0 0</pose></joint>";
+  is(place(model(base + joint + link("<pose relative_to=\"j\">4 0 0 0 0 0</pose>" + kUnitBox))), 4, 3, 2);
+  // A frame's, to what it is attached to.
+  const std::string attached = "<frame name=\"g\" attached_to=\"base\"><pose>0 1 0 0 0 0</pose></frame>";
+  is(place(model(base + attached + link(box("g")))), 1, 1, 2);
+
+  const std::string inner = model("<pose>0 0 9 0 0 0</pose>" + base, "inner");
+  is(place(model(inner + link(box("inner")))), 1, 0, 9);
+  is(place(model(inner + link(box("inner::base")))), 1, 0, 11);
+  is(place(model("<pose>3 0 0 0 0 0</pose>" + base, "other") +
+           model("<pose relative_to=\"other::base\">0 1 0 0 0 0</pose>" + link(kUnitBox))),
+     3, 1, 2);
+
+  // placement_frame: the pose is that frame's, not the model's origin's.
+  const std::string placed = link("<pose>0 0 2 0 0 0</pose>" + kUnitBox) + "</model>";
+  is(place("<model name=\"m\" placement_frame=\"l\"><pose>5 0 0 0 0 0</pose>" + placed), 5, 0, 0);
+  folder.write("models/part/model.sdf", sdf("<model name=\"part\">" + placed));
+  const std::string include = "<include><uri>model://part</uri><pose>5 0 0 0 0 0</pose>";
+  is(place(include + "</include>"), 5, 0, 2);
+  is(place(include + "<placement_frame>l</placement_frame></include>"), 5, 0, 0);
+}
+
+TEST_CASE("what is relative to nothing is left out by name, and the rest is drawn") {
+  const Folder folder;
+  const std::string good = model("<link name=\"l\">" + kUnitBox + "</link>", "good");
+  const auto lost = [](const std::string& frame) { return "<pose relative_to=\"" + frame + "\">0 0 0 0 0 0</pose>"; };
+  std::string visual = "<visual name=\"w\">";
+  visual.append(lost("q")).append("<geometry><box><size>1 1 1</size></box></geometry></visual>");
+  const auto scene = load(folder, good + model("<link name=\"l\">" + kUnitBox + visual + "</link>", "half") +
+                                      model("<link name=\"a\">" + lost("x::y") + kUnitBox + "</link>", "none") +
+                                      model(lost("nowhere") + "<link name=\"l\">" + kUnitBox + "</link>", "moved"));
+  CHECK(scene->instances.size() == 2);
+  CHECK(scene->triangle_count() == 24);
+  REQUIRE(scene->warnings.size() == 3);
+  CHECK(scene->warnings[0].find("the pose of 'w' is relative to 'q', which is no link, joint, frame or model of the "
+                                "model 'half'; left out") != std::string::npos);
+  CHECK(scene->warnings[1].find("'a' is relative to 'x::y'") != std::string::npos);
+  CHECK(scene->warnings[2].find("'moved' is relative to 'nowhere', which is no link, joint, frame or model of the "
+                                "world 'w'") != std::string::npos);
   CHECK_THROWS_WITH_AS(
       load(folder, model("<link name=\"a\"><pose relative_to=\"x\">0 0 0 0 0 0</pose>" + kUnitBox + "</link>")),
       doctest::Contains("relative to 'x', which is no link"), wiw::FileError);
@@ -184,6 +253,83 @@ TEST_CASE("what is not supported is named, what is wrong is refused") {
   CHECK_THROWS_WITH_AS(load(folder, geometry("<sphere><radius>-1</radius></sphere>")),
                        doctest::Contains("should be positive"), wiw::FileError);
   CHECK_THROWS_WITH_AS(load(folder, ""), doctest::Contains("places no model"), wiw::FileError);
+}
+
+TEST_CASE("poses and sizes that overflow are the world's error") {
+  const Folder folder;
+  const auto refused = [&](const std::string& content) {
+    CHECK_THROWS_WITH_AS(load(folder, content), doctest::Contains("w.sdf: "), wiw::FileError);
+  };
+  refused(model("<pose>1e300 0 0 0 0 0</pose><link name=\"l\">" + kUnitBox + "</link>"));
+  refused(model("<pose>1e8 0 0 0 0 0</pose><link name=\"l\">" + kUnitBox + "</link>"));
+  refused(
+      model("<link name=\"l\"><visual name=\"v\"><geometry><box><size>1e39 1 1</size></box></geometry></visual>"
+            "</link>"));
+}
+
+TEST_CASE("includes that multiply are counted and read once") {
+  const Folder folder;
+  std::string leaf = "<sdf version=\"1.9\"><model name=\"m\"><link name=\"l\">" + kUnitBox + "</link></model></sdf>";
+  folder.write("f4.sdf", leaf);
+  for (const char level : {'0', '1', '2', '3'}) {
+    const std::string next{'f', static_cast<char>(level + 1)};
+    std::string includes;
+    for (int i = 0; i < 5; ++i) {
+      includes.append("<include><uri>").append(next).append(".sdf</uri><name>n").append(std::to_string(i));
+      includes.append("</name></include>");
+    }
+    folder.write(std::string{'f', level} + ".sdf", sdf(model(includes)));
+  }
+  const auto file = folder.write("w.sdf", world("<include><uri>f0.sdf</uri></include>"));
+  wiw::ImportTrace trace;
+  CHECK(wiw::load_sdf_world(file, {.trace = &trace})->instances.size() == 625);
+  CHECK(trace.read.size() == 6);
+  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.nodes = 1000}}),
+                       doctest::Contains("has 1001 placed models and visuals, more than the limit of 1000"),
+                       wiw::FileError);
+}
+
+TEST_CASE("a model.config that is missing or unusable is followed") {
+  const Folder folder;
+  const auto file = folder.write("worlds/w.world", world("<include><uri>model://thing</uri></include>"));
+  const auto thing = [&](const std::string& name, const std::string& size) {
+    folder.write("models/thing/" + name, sdf(model("<link name=\"l\"><visual name=\"v\"><geometry><box><size>" + size +
+                                                   "</size></box></geometry></visual></link>")));
+  };
+  thing("model.sdf", "1 1 1");
+  thing("model2.sdf", "2 2 2");
+  const auto config = folder.path() / "models/thing/model.config";
+  wiw::ImportTrace without;
+  CHECK(wiw::load_sdf_world(file, {.trace = &without})->bounds().sizes().isApproxToConstant(1.f));
+  CHECK(std::ranges::find(without.absent, config) != without.absent.end());
+
+  folder.write("models/thing/model.config", "<model><sdf>model2.sdf</sdf></model>");
+  wiw::ImportTrace with;
+  CHECK(wiw::load_sdf_world(file, {.trace = &with})->bounds().sizes().isApproxToConstant(2.f));
+  CHECK(std::ranges::find(with.read, config) != with.read.end());
+  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.file_bytes = 35}}),
+                       doctest::Contains("limits.file_bytes"), wiw::FileError);
+
+  folder.write("models/thing/model.config", "<model><sdf>");
+  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file), doctest::Contains("model.config: is not well-formed XML"),
+                       wiw::FileError);
+}
+
+TEST_CASE("the meshes of a world share one texture budget") {
+  const Folder folder;
+  std::string content;
+  folder.write("sample.mtl", "newmtl wood\nmap_Kd huge.bmp\n");
+  folder.write("huge.bmp", sample_bmp(512));
+  for (const std::string name : {"a", "b", "c"}) {
+    folder.write(name + ".obj", sample_obj());
+    content += model("<link name=\"l\"><visual name=\"v\"><geometry><mesh><uri>" + name +
+                         ".obj</uri></mesh></geometry></visual></link>",
+                     name);
+  }
+  const auto file = folder.write("w.sdf", world(content));
+  CHECK(wiw::load_sdf_world(file, {.limits = {.texture_bytes = 3 << 20}})->instances.size() == 3);
+  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.texture_bytes = (3 << 20) - 1}}),
+                       doctest::Contains("has 3145728 bytes of decoded textures with other models'"), wiw::FileError);
 }
 
 TEST_CASE("limits hold over all placements of a world") {

@@ -12,29 +12,76 @@
 namespace wiw::sdf {
 namespace {
 
-constexpr int kMostHops = 64;  // of relative_to; more is a circle
+constexpr int kMostHops = 1000;  // from frame to frame; more is a circle
 
 std::string place(const pugi::xml_node& element) {
   return "<" + std::string(element.name()) + "> of '" + element.parent().attribute("name").as_string("?") + "'";
 }
 
-pugi::xml_node sibling_named(const pugi::xml_node& element, const std::string& name) {
-  for (const pugi::xml_node& sibling : element.parent().children()) {
-    const std::string kind = sibling.name();
-    if (kind != "link" && kind != "frame" && kind != "model" && kind != "include") continue;
-    if (name == sibling.attribute("name").value() || name == sibling.child_value("name")) return sibling;
+std::string name_of(const pugi::xml_node& element) {
+  return element.attribute("name") ? element.attribute("name").value() : element.child_value("name");
+}
+
+pugi::xml_node child_named(const pugi::xml_node& model, const std::string& name) {
+  for (const pugi::xml_node& child : model.children()) {
+    const std::string kind = child.name();
+    const bool is_frame = kind == "link" || kind == "joint" || kind == "frame" || kind == "model" || kind == "include";
+    if (is_frame && !name.empty() && name == name_of(child)) return child;
   }
   return {};
 }
 
-/// `relative_to` since SDF 1.7, `frame` in 1.5 and 1.6; for a <frame> element without it, what it is attached to.
-std::string reference_frame(const pugi::xml_node& element) {
+/// What the pose is relative to by name: `relative_to` since SDF 1.7, `frame` in 1.5 and 1.6; without it, what a
+/// <frame> is attached to and the child link of a <joint>.
+std::string reference_name(const pugi::xml_node& element) {
   const pugi::xml_node pose = element.child("pose");
   for (const char* key : {"relative_to", "frame"}) {
     if (*pose.attribute(key).value()) return pose.attribute(key).value();
   }
-  return element.attribute("attached_to").value();
+  const std::string kind = element.name();
+  return kind == "joint" ? element.child_value("child") : element.attribute("attached_to").value();
 }
+
+/// One question for a pose. Names are those of the model around the element, `part::name` those of a model nested in
+/// it (http://sdformat.org/tutorials?tut=pose_frame_semantics).
+class FrameWalk {
+ public:
+  explicit FrameWalk(const std::filesystem::path& file) : file_(file) {}
+
+  Eigen::Isometry3d pose_of(const pugi::xml_node& element) {
+    if (++hops_ > kMostHops)
+      throw UnknownFrame(file_.string(), "the pose of '" + name_of(element) + "' is relative to itself");
+    const Eigen::Isometry3d pose = reference_of(element) * own_pose(element, file_);
+    const std::string placed = element.attribute("placement_frame").value();
+    return placed.empty() ? pose : pose * frame_in(element, placed, name_of(element)).inverse();
+  }
+
+  Eigen::Isometry3d frame_in(const pugi::xml_node& model, const std::string& frame, const std::string& asker) {
+    const bool is_model = std::string(model.name()) == "model";
+    if (frame == (is_model ? "__model__" : "world")) return Eigen::Isometry3d::Identity();
+    const std::size_t cut = frame.find("::");
+    const pugi::xml_node found = child_named(model, frame.substr(0, cut));
+    if (!found) {
+      throw UnknownFrame(file_.string(), "the pose of '" + asker + "' is relative to '" + frame +
+                                             "', which is no link, joint, frame or model of the " + model.name() +
+                                             " '" + name_of(model) + "'");
+    }
+    const Eigen::Isometry3d pose = pose_of(found);
+    return cut == std::string::npos ? pose : pose * frame_in(found, frame.substr(cut + 2), asker);
+  }
+
+ private:
+  Eigen::Isometry3d reference_of(const pugi::xml_node& element) {
+    const bool in_link = std::string(element.parent().name()) == "link";
+    const std::string frame = reference_name(element);
+    if (!frame.empty())
+      return frame_in(in_link ? element.parent().parent() : element.parent(), frame, name_of(element));
+    return in_link ? pose_of(element.parent()) : Eigen::Isometry3d::Identity();
+  }
+
+  const std::filesystem::path& file_;
+  int hops_ = 0;
+};
 
 }  // namespace
 
@@ -73,23 +120,13 @@ Eigen::Isometry3d own_pose(const pugi::xml_node& element, const std::filesystem:
   return pose;
 }
 
-Eigen::Isometry3d pose_in_parent(const pugi::xml_node& element, const std::filesystem::path& file) {
-  Eigen::Isometry3d pose = own_pose(element, file);
-  pugi::xml_node current = element;
-  for (int hop = 0; hop < kMostHops; ++hop) {
-    const std::string frame = reference_frame(current);
-    if (frame.empty() || frame == "world" || frame == "__model__") return pose;
-    const pugi::xml_node next = sibling_named(current, frame);
-    if (!next) {
-      throw FileError(file.string(), "the pose of '" + std::string(current.attribute("name").value()) +
-                                         "' is relative to '" + frame +
-                                         "', which is no link, frame or model beside it");
-    }
-    pose = own_pose(next, file) * pose;
-    current = next;
-  }
-  throw FileError(file.string(),
-                  "the pose of '" + std::string(element.attribute("name").value()) + "' is relative to itself");
+Eigen::Isometry3d pose_in_model(const pugi::xml_node& element, const std::filesystem::path& file) {
+  return FrameWalk(file).pose_of(element);
+}
+
+Eigen::Isometry3d frame_in_model(const pugi::xml_node& model, const std::string& name,
+                                 const std::filesystem::path& file) {
+  return FrameWalk(file).frame_in(model, name, name_of(model));
 }
 
 }  // namespace wiw::sdf

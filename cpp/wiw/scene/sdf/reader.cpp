@@ -4,9 +4,9 @@
 #include <algorithm>
 
 #include "wiw/core/error.hpp"
-#include "wiw/scene/import/file.hpp"
 #include "wiw/scene/sdf/materials.hpp"
 #include "wiw/scene/sdf/pose.hpp"
+#include "wiw/scene/sdf/xml.hpp"
 
 namespace wiw::sdf {
 namespace fs = std::filesystem;
@@ -47,26 +47,36 @@ void Reader::warn(const std::string& text) {
   if (std::ranges::find(world_.warnings, text) == world_.warnings.end()) world_.warnings.push_back(text);
 }
 
-pugi::xml_document Reader::parse(const fs::path& file) {
-  check_limit(file.string(), "bytes", size_of_file(file), options_.limits.file_bytes, "file_bytes");
-  if (options_.trace) options_.trace->read.push_back(file);
-  pugi::xml_document document;
-  const pugi::xml_parse_result result = document.load_file(file.c_str());
-  if (!result) {
-    throw FileError(file.string(), "is not well-formed XML: " + std::string(result.description()) + " at byte " +
-                                       std::to_string(result.offset));
+pugi::xml_node Reader::root_of(const fs::path& file) {
+  const auto [known, added] = documents_.try_emplace(file);
+  if (added) known->second = read_xml(file, options_);
+  const pugi::xml_node root = known->second.child("sdf");
+  if (!root) throw FileError(file.string(), "has no <sdf> element; expected a Gazebo world or model");
+  return root;
+}
+
+void Reader::count_placed() {
+  check_limit(path_.string(), "placed models and visuals", ++placed_, options_.limits.nodes, "nodes");
+}
+
+std::optional<Eigen::Isometry3d> Reader::pose_of(const pugi::xml_node& element, const fs::path& file) {
+  try {
+    return pose_in_model(element, file);
+  } catch (const UnknownFrame& error) {
+    warn(std::string(error.what()) + "; left out");
+    return std::nullopt;
   }
-  if (!document.child("sdf")) throw FileError(file.string(), "has no <sdf> element; expected a Gazebo world or model");
-  return document;
 }
 
 World Reader::read() {
-  const pugi::xml_document document = parse(path_);
-  const pugi::xml_node root = document.child("sdf");
+  const pugi::xml_node root = root_of(path_);
   const pugi::xml_node world = root.child("world");
   world_.name = path_.stem().string();
   read_children(world ? world : root, {.file = path_});
-  if (world_.models.empty()) throw FileError(path_.string(), "places no model that can be drawn");
+  if (world_.models.empty()) {
+    const std::string cause = world_.warnings.empty() ? "" : " (" + world_.warnings.front() + ")";
+    throw FileError(path_.string(), "places no model that can be drawn" + cause);
+  }
   return std::move(world_);
 }
 
@@ -81,8 +91,10 @@ void Reader::read_children(const pugi::xml_node& parent, const Scope& scope) {
     if (tag == "model") {
       const std::string name = child.attribute("name").as_string("model");
       const bool lends_name = scope.depth > 0 && only_wraps(parent);
-      read_model(child, {lends_name ? scope.name : joined(scope.name, name), name,
-                         scope.T_world * pose_in_parent(child, scope.file), scope.file, scope.depth + 1});
+      const auto pose = pose_of(child, scope.file);
+      if (!pose) continue;
+      read_model(child, {lends_name ? scope.name : joined(scope.name, name), name, scope.T_world * *pose, scope.file,
+                         scope.depth + 1});
     }
     if (tag == "actor" || tag == "population" || tag == "road")
       warn("<" + tag + "> elements are not supported and left out");
@@ -98,18 +110,33 @@ void Reader::read_include(const pugi::xml_node& element, const Scope& parent) {
     return;
   }
   const fs::path file = finder_.sdf_of(folder);
-  const pugi::xml_document document = parse(file);
-  const pugi::xml_node model = document.child("sdf").child("model");
+  const pugi::xml_node model = root_of(file).child("model");
   if (!model) throw FileError(file.string(), "holds no <model>");
   const std::string kind = model.attribute("name").as_string(folder.filename().c_str());
   const std::string own_name = element.child("name") ? element.child_value("name") : kind;
   const bool lends_name = parent.depth > 0 && only_wraps(element.parent());
-  const Eigen::Isometry3d pose = element.child("pose") ? pose_in_parent(element, parent.file) : own_pose(model, file);
-  read_model(model, {lends_name ? parent.name : joined(parent.name, own_name), kind, parent.T_world * pose, file,
-                     parent.depth + 1});
+  const auto pose = element.child("pose") ? pose_of(element, parent.file) : own_pose(model, file);
+  const auto placed = placement(element, model, file);
+  if (!pose || !placed) return;
+  read_model(model, {lends_name ? parent.name : joined(parent.name, own_name), kind,
+                     parent.T_world * *pose * placed->inverse(), file, parent.depth + 1});
+}
+
+std::optional<Eigen::Isometry3d> Reader::placement(const pugi::xml_node& include, const pugi::xml_node& model,
+                                                   const fs::path& file) {
+  const std::string outer = include.child_value("placement_frame");
+  const std::string frame = outer.empty() ? model.attribute("placement_frame").value() : outer;
+  if (frame.empty()) return Eigen::Isometry3d::Identity();
+  try {
+    return frame_in_model(model, frame, file);
+  } catch (const UnknownFrame& error) {
+    warn(std::string(error.what()) + "; left out");
+    return std::nullopt;
+  }
 }
 
 void Reader::read_model(const pugi::xml_node& element, const Scope& scope) {
+  count_placed();
   Model model{scope.name, scope.kind, scope.T_world, {}};
   for (const pugi::xml_node& link : element.children("link")) read_visuals(link, scope.file, model);
   if (!model.visuals.empty()) world_.models.push_back(std::move(model));
@@ -117,10 +144,12 @@ void Reader::read_model(const pugi::xml_node& element, const Scope& scope) {
 }
 
 void Reader::read_visuals(const pugi::xml_node& link, const fs::path& file, Model& model) {
-  const Eigen::Isometry3d T_model_link = pose_in_parent(link, file);
   for (const pugi::xml_node& element : link.children("visual")) {
+    count_placed();
+    const auto pose = pose_of(element, file);
+    if (!pose) continue;
     Visual visual;
-    visual.T_model_visual = T_model_link * pose_in_parent(element, file);
+    visual.T_model_visual = *pose;
     if (!read_geometry(element.child("geometry"), file, visual.geometry)) continue;
     std::vector<std::string> warnings;
     visual.color = material_color(element, file, warnings);

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #pragma once
 
+#include <map>
+#include <optional>
 #include <pugixml.hpp>
 
 #include "wiw/scene/sdf/model_finder.hpp"
@@ -24,7 +26,14 @@ class Reader {
     int depth = 0;
   };
 
-  pugi::xml_document parse(const std::filesystem::path& file);
+  /// The <sdf> element of a file, which is parsed once.
+  pugi::xml_node root_of(const std::filesystem::path& file);
+  void count_placed();
+  /// Empty, with a warning, if the pose is relative to nothing that is there.
+  std::optional<Eigen::Isometry3d> pose_of(const pugi::xml_node& element, const std::filesystem::path& file);
+  /// Pose in an included model of the frame that the include's pose places; empty, with a warning, as above.
+  std::optional<Eigen::Isometry3d> placement(const pugi::xml_node& include, const pugi::xml_node& model,
+                                             const std::filesystem::path& file);
   void read_children(const pugi::xml_node& parent, const Scope& scope);
   void read_model(const pugi::xml_node& element, const Scope& scope);
   void read_include(const pugi::xml_node& element, const Scope& parent);
@@ -37,6 +46,8 @@ class Reader {
   const ImportOptions& options_;
   ModelFinder finder_;
   World world_;
+  std::map<std::filesystem::path, pugi::xml_document> documents_;
+  std::size_t placed_ = 0;
 };
 
 }  // namespace wiw::sdf
