@@ -57,8 +57,9 @@ ThreadPool::ThreadPool(int threads) {
   workers_.reserve(static_cast<std::size_t>(threads) - 1);
   try {
     for (int i = 1; i < threads; ++i) workers_.emplace_back([this] { work(); });
-  } catch (const std::exception&) {  // std::system_error or std::bad_alloc
-    // The machine refuses more threads (a limit on processes or memory): those that started share the work.
+  } catch (const std::exception&) {  // NOLINT(bugprone-empty-catch): see below
+    // std::system_error or std::bad_alloc: the machine refuses more (a limit on processes or memory), and those threads
+    // that started share the work.
   }
 }
 
