@@ -25,8 +25,13 @@ struct Images {
         targets.front = add<std::uint8_t>(name, batch, {config.front.height, config.front.width, 3});
       } else if (name == "depth") {
         targets.depth = add<float>(name, batch, {config.panorama.height, config.panorama.width});
+      } else if (name == "panorama_ids") {
+        targets.panorama_ids = add<std::uint32_t>(name, batch, {config.panorama.height, config.panorama.width});
+      } else if (name == "front_ids") {
+        targets.front_ids = add<std::uint32_t>(name, batch, {config.front.height, config.front.width});
       } else {
-        throw ArgumentError("observe: expected outputs among panorama, front, depth, got '" + name + "'");
+        throw ArgumentError("observe: expected outputs among panorama, front, depth, panorama_ids, front_ids, got '" +
+                            name + "'");
       }
     }
   }
@@ -102,7 +107,7 @@ void bind_env(py::module_& module) {
           },
           py::arg("outputs") = std::vector<std::string>{"panorama", "front"},
           "{name: array}: panorama uint8 [H, W, 3], front uint8 [h, w, 3], depth float32 [H, W] (distance along the "
-          "ray).");
+          "ray), panorama_ids uint32 [H, W] and front_ids uint32 [h, w] (instances, 0 where nothing is hit).");
 
   py::class_<VectorEnv>(module, "VectorEnv")
       .def(py::init<std::vector<NavigationEnv>>(), py::arg("envs"))

@@ -101,12 +101,13 @@ void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targ
   for (const NavigationEnv& env : envs) poses.push_back(env.T_world_camera());
   const NavigationConfig& config = envs[0].config();
   Renderer& renderer = *envs[0].world().renderer;
-  if (targets.panorama != nullptr || targets.depth != nullptr) {
+  if (targets.panorama != nullptr || targets.depth != nullptr || targets.panorama_ids != nullptr) {
     renderer.render(poses, {.projection = Projection::kEquirectangular, .size = config.panorama},
-                    {.color = targets.panorama, .depth = targets.depth});
+                    {.color = targets.panorama, .depth = targets.depth, .instance = targets.panorama_ids});
   }
-  if (targets.front != nullptr) {
-    renderer.render(poses, {.size = config.front, .hfov = config.front_hfov}, {.color = targets.front});
+  if (targets.front != nullptr || targets.front_ids != nullptr) {
+    renderer.render(poses, {.size = config.front, .hfov = config.front_hfov},
+                    {.color = targets.front, .instance = targets.front_ids});
   }
 }
 

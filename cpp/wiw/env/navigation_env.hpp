@@ -36,9 +36,11 @@ struct World {
 
 /// Where one observation is written; null members are not rendered.
 struct ObservationTargets {
-  std::uint8_t* panorama = nullptr;  // [H, W, 3]
-  std::uint8_t* front = nullptr;     // [h, w, 3]
-  float* depth = nullptr;            // [H, W] of the panorama, distance along the ray
+  std::uint8_t* panorama = nullptr;       // [H, W, 3]
+  std::uint8_t* front = nullptr;          // [h, w, 3]
+  float* depth = nullptr;                 // [H, W] of the panorama, distance along the ray
+  std::uint32_t* panorama_ids = nullptr;  // [H, W] Instance::id of what each pixel shows, 0 where nothing is hit
+  std::uint32_t* front_ids = nullptr;     // [h, w]
 };
 
 /// A point agent with a heading on a navigation mesh. Copying it forks the simulation: copies share the world, which

@@ -42,9 +42,12 @@ void VectorEnv::observe(const ObservationTargets& targets) const {
   for (std::size_t first = 0, last; first < envs_.size(); first = last) {
     last = first + 1;
     while (last < envs_.size() && envs_[last].world().renderer == envs_[first].world().renderer) ++last;
-    wiw::observe(std::span(envs_).subspan(first, last - first), {.panorama = at(targets.panorama, first * panorama * 3),
-                                                                 .front = at(targets.front, first * front * 3),
-                                                                 .depth = at(targets.depth, first * panorama)});
+    wiw::observe(std::span(envs_).subspan(first, last - first),
+                 {.panorama = at(targets.panorama, first * panorama * 3),
+                  .front = at(targets.front, first * front * 3),
+                  .depth = at(targets.depth, first * panorama),
+                  .panorama_ids = at(targets.panorama_ids, first * panorama),
+                  .front_ids = at(targets.front_ids, first * front)});
   }
 }
 
