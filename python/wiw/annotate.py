@@ -23,11 +23,25 @@ Color = tuple[int, int, int]
 RED: Color = (220, 40, 40)
 
 
-def box(image: Image, edges: Sequence[float], label: str = "", *, color: Color = RED, thickness: int = 3) -> Image:
+def box(
+    image: Image,
+    edges: Sequence[float],
+    label: str = "",
+    *,
+    color: Color = RED,
+    thickness: int = 3,
+    outside: bool = False,
+) -> Image:
     """Outline a box (left, top, right, bottom), the line inside it, the label above it.
 
-    left > right means a box across the seam of a panorama: both parts are drawn, open at the seam.
+    left > right means a box across the seam of a panorama: both parts are drawn, open at the seam. `outside` puts the
+    line around the box, as far as the image goes, so that it hides nothing of a small one.
     """
+    if outside:
+        left, top, right, bottom = edges
+        height, width = image.shape[:2]
+        left, top = max(0, left - thickness), max(0, top - thickness)
+        edges = (left, top, min(width, right + thickness), min(height, bottom + thickness))
     return _core.box(image, list(edges), color, thickness, label)
 
 

@@ -170,7 +170,7 @@ POLICIES = Registry(
     },
     "wiw.policies.base:Policy",
 )
-TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"})
+TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav", "ar": "wiw.tasks.ar:AR"})
 METRICS = Registry(
     "metric",
     "",

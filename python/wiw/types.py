@@ -81,9 +81,29 @@ class Observation:
     """Where the task points something out."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The observation as gymnasium spaces see it; `depth` only where present."""
-        values = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
-        return values if self.depth is None else {**values, "depth": self.depth}
+        """The observation as gymnasium spaces see it; `depth` only where present.
+
+        Where something is pointed out, its box is drawn in red on the images and given as "panorama_box" and
+        "front_box", float32 [4], all -1 where nothing of it is visible; the mask is left out.
+        """
+        values: dict[str, Any] = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
+        if self.depth is not None:
+            values["depth"] = self.depth
+        return values if self.target is None else {**values, **_boxed(self, self.target)}
+
+
+def _boxed(observation: Observation, target: Target) -> dict[str, Any]:
+    """Images with the target's box drawn, and the boxes."""
+    from wiw import annotate
+
+    values: dict[str, Any] = {}
+    for name, image, box in (
+        ("panorama", observation.panorama, target.panorama_box),
+        ("front", observation.front, target.front_box),
+    ):
+        values[name] = image if box is None else annotate.box(image, box, thickness=2, outside=True)
+        values[f"{name}_box"] = np.full(4, -1, np.float32) if box is None else np.array(box, np.float32)
+    return values
 
 
 @dataclass(frozen=True)
@@ -215,7 +235,8 @@ class Episode:
     geodesic: float
     """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """ImageNav reads "ideal_primitives", the least number of primitives, and "radius", the goal's own in metres."""
+    """ImageNav reads "ideal_primitives", the least number of primitives, and "radius", the goal's own in metres.
+    AR reads "target", an instance's id, and "category", what it is."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +265,9 @@ class EpisodeResult:
     scene: str
     status: Literal["done", "failed"]
     metrics: Mapping[str, float] = field(default_factory=dict)
-    """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal."""
+    """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
+    AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of
+    choices)."""
     seconds: float = 0.0
     error: str = ""
     """Traceback."""

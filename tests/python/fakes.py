@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from wiw._core import core
-from wiw.types import Decision, Episode, Goal, Observation, Proposal, Rollout, Truth
+from wiw.policies.base import Policy
+from wiw.types import Answer, Decision, Episode, Goal, Observation, Proposal, Rollout, Truth
 
 FORWARD, LEFT = 1, 2
 STEP = 0.2
@@ -164,3 +165,30 @@ class LineAgent:
 def line_task(scenes: str = "", seed: int = 0, preset: str = "paper", backend: str = "auto", **rules: Any) -> LineTask:
     """The task as the command line makes it; scenes "slow" takes its time, "broken" cannot start an episode."""
     return LineTask(seed=seed, delay=0.05 * (scenes == "slow"), broken=("0001",) if scenes == "broken" else ())
+
+
+class SizeReader(Policy):
+    """Walks as the heuristic does and tells things by how much of the panorama they fill: 0.01 steradians each.
+
+    A thing that fills between 0.01 n and 0.01 (n + 1) is taken for choice n, with a given confidence.
+    """
+
+    def __init__(self, confidence: float = 0.9, plan: tuple[int, ...] = (FORWARD, FORWARD)) -> None:
+        self.confidence, self.plan = confidence, plan
+
+    def propose(self, situations: Any, candidates: int, horizon: int) -> list[list[Proposal]]:
+        return [[Proposal(np.array(self.plan[:horizon], np.int8))] for _ in situations]
+
+    def score(self, situations: Any, proposals: Any, rollouts: Any) -> list[Any]:
+        return [np.zeros(len(plans)) for plans in proposals]
+
+    def answer(self, situations: Any, proposals: Any, rollouts: Any) -> list[Any]:
+        return [self._answer(situation) for situation in situations]
+
+    def _answer(self, situation: Any) -> Answer:
+        choices, mask = situation.goal.choices, situation.observation.target.mask
+        rows = np.cos((np.arange(mask.shape[0]) + 0.5) / mask.shape[0] * np.pi - np.pi / 2)
+        size = float((mask * rows[:, None]).sum()) * 2 * np.pi**2 / mask.size
+        believed = min(int(size / 0.01), len(choices) - 1)
+        rest = (1 - self.confidence) / (len(choices) - 1)
+        return Answer(choices, np.where(np.arange(len(choices)) == believed, self.confidence, rest))

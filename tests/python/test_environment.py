@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import wiw.datasets.imagenav
-import wiw.tasks.imagenav
+import wiw.tasks.navigation
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets import episodes as episode_files
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
@@ -173,7 +173,7 @@ def test_episodes_of_one_scene_are_each_made_once(two_rooms: str, monkeypatch: p
 def test_the_renderer_is_part_of_what_a_task_is(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert ImageNav(scenes=two_rooms, backend="cpu").describe()["backend"] == "cpu"
     assert ImageNav(scenes=two_rooms).describe()["backend"] in ("cpu", "gpu")
-    monkeypatch.setattr(wiw.tasks.imagenav, "resolve_backend", {"auto": "gpu"}.get)
+    monkeypatch.setattr(wiw.tasks.navigation, "resolve_backend", {"auto": "gpu"}.get)
     assert ImageNav(scenes=two_rooms).describe()["backend"] == "gpu"
 
 

@@ -13,7 +13,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
-import wiw.tasks.imagenav
+import wiw.tasks.navigation
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
 from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
 from wiw.evaluation.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
@@ -291,7 +291,7 @@ def test_a_run_is_resumed_with_the_renderer_it_was_begun_with(tmp_path, two_room
     begun_with = log.store.config["task"]["backend"]
     assert begun_with in ("cpu", "gpu") and log.store.info["task"]["options"]["backend"] == begun_with
     now = {"auto": {"cpu": "gpu", "gpu": "cpu"}[begun_with], begun_with: begun_with}
-    monkeypatch.setattr(wiw.tasks.imagenav, "resolve_backend", now.get)
+    monkeypatch.setattr(wiw.tasks.navigation, "resolve_backend", now.get)
     assert resume_run(tmp_path / "run", progress=False).complete
     with pytest.raises(StoreError, match="backend"):
         evaluate(task, AgentRecipe("heuristic"), 1, out=tmp_path / "run", resume=True, progress=False)

@@ -20,7 +20,7 @@ FACES = {"types", "errors", "registry", "panorama", "scenes", "render", "nav", "
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "metrics"},
+    {"datasets", "metrics", "perception"},
     {"envs", "policies", "world_models"},
     {"tasks", "loop"},
     {"evaluation"},

@@ -44,8 +44,9 @@ def episodes(
     options = {"scenes": scenes, "seed": seed, "backend": backend}
     made = TASKS.make(task, **options if per_scene is None else {**options, "per_scene": per_scene})
     found = made.episodes(episodes)
+    choices = {"categories": list(made.choices)} if getattr(made, "choices", ()) else {}
     try:
-        save(out, found, task, seed=seed, scenes=scenes)
+        save(out, found, task, seed=seed, scenes=scenes, **choices)
     except OSError as error:
         raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
     places = len({episode.scene for episode in found})

@@ -53,6 +53,8 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
 
 
 def _foreign(body: Any, path: str | Path) -> list[Episode]:
+    if habitat.is_active_recognition(body):
+        return habitat.read_active_recognition(body, str(path))
     if habitat.is_habitat(body):
         return habitat.read_habitat(body, str(path))
     if habitat.is_world_in_world(body):

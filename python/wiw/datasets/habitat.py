@@ -103,6 +103,43 @@ def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
         raise FileError(f"{where}: not a World-in-World ImageNav item ({type(error).__name__}: {error})") from error
 
 
+def is_active_recognition(body: Any) -> bool:
+    """Whether a parsed file has the layout of World-in-World's published Active Recognition episodes."""
+    return isinstance(body, Mapping) and bool(body.get("episodes")) and "target_id" in body["episodes"][0]
+
+
+def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]:
+    """Episodes of the published AR file (`start_rotation` in order wxyz, the category's key misspelt).
+
+    Scene paths are those of the authors' disk, so that only folder and file name are kept, relative to the scene
+    folder. The place of a target is known by its instance alone; until the scene tells, the goal's position is NaN.
+    """
+    return [_active_recognition(item, f"{path}: episode {i}") for i, item in enumerate(body["episodes"])]
+
+
+def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
+    try:
+        return Episode(
+            episode_id=str(item["episode_id"]),
+            scene="/".join(str(item["scene_id"]).split("/")[-2:]),
+            start_position=_point(item["start_position"]),
+            start_yaw=yaw_of(item["start_rotation"], "wxyz", where),
+            goal_position=(float("nan"),) * 3,
+            goal_yaw=0.0,
+            geodesic=float("nan"),
+            info={
+                "source": "world-in-world",
+                "target": int(item["target_id"]),
+                "category": str(item["target_categrory"]),
+                "difficulty": int(item["difficulty"]),
+            },
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(
+            f"{where}: not a World-in-World Active Recognition episode ({type(error).__name__}: {error})"
+        ) from error
+
+
 def heading_of(name: str) -> float:
     """A heading in [0, 2 pi) that is a function of an episode's id, the same on every machine and in every process."""
     return float(2 * np.pi * core.uniform(core.fold_key(list(name.encode())), 1)[0])

@@ -11,9 +11,21 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, drawn, known, observation_space, outputs, start
+from wiw.envs.trip import (
+    PRIMITIVES,
+    NavigationTask,
+    Trip,
+    action_space,
+    declared,
+    drawn,
+    known,
+    observation_space,
+    observed,
+    outputs,
+    start,
+)
 from wiw.errors import ArgumentError
-from wiw.types import Episode, Goal, Key, Observation, Truth
+from wiw.types import Answer, Episode, Goal, Key, Observation, Truth
 
 
 @dataclass(frozen=True)
@@ -33,8 +45,10 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
     """An agent that sees a panorama and a front view and moves by 0.2 m or turns by 22.5 degrees.
 
     Observations are dicts: "panorama" uint8 [576, 1024, 3], "front" uint8 [480, 480, 3] (HFOV 90), "odometry"
-    float64 [3], and "depth" float32 [576, 1024] where asked for. The reward is 1 on reaching the goal. Where the agent
-    truly is stays in `truth()`, outside observation and info.
+    float64 [3], and "depth" float32 [576, 1024] where asked for. Where the task points something out, its box is drawn
+    on the images, with "panorama_box" and "front_box" float32 [4] (-1 where it is out of sight), and the actions after
+    the primitives are final answers, one for each of `goal.choices`. The reward is 1 on reaching the goal, or for the
+    right answer. Where the agent truly is stays in `truth()`, outside observation and info.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
@@ -42,9 +56,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
     def __init__(self, task: NavigationTask, depth: bool = False) -> None:
         self.task = task
         self.render_mode = "rgb_array"
-        self.outputs = outputs(depth)
-        self.action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))  # type: ignore[assignment]
-        self.observation_space = observation_space(depth)
+        self.outputs = outputs(task, depth)
+        self.action_space = action_space(task)  # type: ignore[assignment]
+        self.observation_space = observation_space(task, depth)
         self._core: Any = None
         self._trip: Trip | None = None
         self._goal: Goal | None = None
@@ -72,18 +86,22 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         return observation.as_dict(), {"key": self._key}
 
     def step(self, action: int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Carries out one primitive: 0 forward, 1 turn left, 2 turn right, 3 stop."""
+        """Carries out one primitive: 0 forward, 1 turn left, 2 turn right, 3 stop; from 4 on: a final answer."""
         if not self.action_space.contains(action):
-            raise ArgumentError(f"step: expected an action from 0 to {len(PRIMITIVES) - 1}, got {action!r}")
-        segment = self._carry_out([PRIMITIVES[action]])
+            most = len(PRIMITIVES) + len(self.task.choices) - 1
+            raise ArgumentError(f"step: expected an action from 0 to {most}, got {action!r}")
+        answer = declared(self.task, int(action))
+        if answer is not None:
+            self.trip.hear(self.task, answer, final=True)
+        segment = self._carry_out([PRIMITIVES[action]] if answer is None else [])
         info: dict[str, Any] = {"key": segment.key}
         if segment.terminated or segment.truncated:
             info["result"] = self.result()
         return segment.observation.as_dict(), float(self.trip.success), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
-        """The front view."""
-        return self._seen.front
+        """The front view, as the observation shows it."""
+        return self.observation.as_dict()["front"]
 
     # -- the loop ------------------------------------------------------------------------------------------------------
 
@@ -92,25 +110,35 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         self._core, self._trip, self._goal = start(self.task, episode)
         return self._observe()
 
-    def run(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
-        """Carries out one decision's primitives, as far as the episode goes on; observes once, at the end."""
+    def run(self, actions: Sequence[int] | NDArray[np.int8], answer: Answer | None = None) -> Segment:
+        """Carries out one decision's primitives, as far as the episode goes on; observes once, at the end.
+
+        Where the goal has choices, `answer` comes first, and nothing is carried out after the last one.
+
+        Raises:
+            ArgumentError: the goal has choices and no answer is given.
+        """
         self.trip.decisions += 1
-        return self._carry_out(actions)
+        if answer is None and self.task.choices:
+            raise ArgumentError("run: the goal has choices; give the decision's answer too, run(actions, answer)")
+        over = answer is not None and self.trip.hear(self.task, answer)
+        return self._carry_out([] if over else actions)
 
     def _carry_out(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
         trip, executed = self.trip, []
         first = len(trip.positions) - 1
-        done = False
         for i, action in enumerate(actions):
             self._core.step(int(action))
             executed.append(int(action))
-            done = trip.note(self.task, int(action), self._core.position, at_decision=i + 1 == len(actions))
-            if done:
+            trip.note(self.task, int(action), self._core.position, at_decision=i + 1 == len(actions))
+            if trip.ended:
                 break
         path = np.stack(trip.positions[first:])
         self._key = self._key.at(self._key.decision + 1)
-        over = trip.spent(self.task) and not done
-        return Segment(self._observe(), np.array(executed, np.int8), path, done, over, self._key)
+        observation = self._observe()
+        trip.look(self.task, observation)
+        over = trip.spent(self.task) and not trip.ended
+        return Segment(observation, np.array(executed, np.int8), path, trip.ended, over, self._key)
 
     @property
     def goal(self) -> Goal:
@@ -118,6 +146,13 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         self._require_episode()
         assert self._goal is not None
         return self._goal
+
+    @property
+    def observation(self) -> Observation:
+        """What the agent perceives now: plain images, and the target apart, as agents and world models are given it."""
+        self._require_episode()
+        assert self._observation is not None
+        return self._observation
 
     def fork(self) -> Any:
         """The simulator as it stands, to be run ahead by the oracle; this environment does not move."""
@@ -143,14 +178,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    @property
-    def _seen(self) -> Observation:
-        self._require_episode()
-        assert self._observation is not None
-        return self._observation
-
     def _observe(self) -> Observation:
-        self._observation = Observation(**self._core.observe(self.outputs), odometry=self._core.odometry)
+        images = self._core.observe(self.outputs)
+        self._observation = observed(self.task, images, self._core.odometry, self.trip)
         return self._observation
 
     def _require_episode(self) -> None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 import gymnasium
@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from wiw._core import env as _env
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.worlds import World, world
+from wiw.envs.pointing import IDS, Pointing
 from wiw.errors import ArgumentError
-from wiw.types import Episode, Goal, Truth
+from wiw.types import Answer, Episode, Goal, Observation, Truth
 
 PRIMITIVES = (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)
-"""What the discrete action space counts: `env.step(0)` goes forward."""
+"""What the discrete action space counts: `env.step(0)` goes forward. The goal's choices, if any, come after them."""
 
 
 class NavigationTask(Protocol):
@@ -28,6 +29,10 @@ class NavigationTask(Protocol):
     rules: Any
 
     @property
+    def pointing(self) -> Pointing | None: ...
+    @property
+    def choices(self) -> tuple[str, ...]: ...
+    @property
     def motion(self) -> str: ...
     @property
     def budget(self) -> int: ...
@@ -35,6 +40,8 @@ class NavigationTask(Protocol):
     def size(self) -> int | None: ...
     def episode(self, index: int) -> Episode: ...
     def goal(self, world: World, episode: Episode) -> Goal: ...
+    def goal_position(self, world: World, episode: Episode) -> NDArray[np.float64]: ...
+    def sure(self, trip: Trip) -> bool: ...
     def succeeded(self, trip: Trip) -> bool: ...
     def result(self, trip: Trip) -> dict[str, float]: ...
 
@@ -46,7 +53,7 @@ class Trip:
     episode: Episode
     world: World
     goal_position: NDArray[np.float64]
-    """On the floor, as the positions are."""
+    """As the distances to it are measured: on the floor, as the positions are."""
     positions: list[NDArray[np.float64]]
     """After each primitive, beginning with the start."""
     decisions: int = 0
@@ -55,6 +62,10 @@ class Trip:
     """Whether the agent stands at the end of an executed segment."""
     stopped: bool = False
     success: bool = False
+    ended: bool = False
+    """By success, by stopping, by an answer that was sure enough, or for want of a target."""
+    answers: list[Answer] = field(default_factory=list)
+    """What the agent believed, decision by decision."""
 
     @property
     def actions(self) -> int:
@@ -79,12 +90,29 @@ class Trip:
         """Where the agent truly is, heading `yaw` radians."""
         return Truth(self.positions[-1], yaw, self.distance_to_goal(), self.geodesic_to_goal())
 
-    def note(self, task: NavigationTask, action: int, position: NDArray[np.float64], at_decision: bool) -> bool:
-        """Records where a primitive led; True when the episode has ended by success or by stopping."""
+    def note(self, task: NavigationTask, action: int, position: NDArray[np.float64], at_decision: bool) -> None:
+        """Records where a primitive led."""
         self.positions.append(position)
         self.stopped, self.at_decision = action == STOP, at_decision
+        self.ended = self.stopped
         self.success = task.succeeded(self)
-        return self.success or self.stopped
+        self.ended = self.ended or self.success
+
+    def hear(self, task: NavigationTask, answer: Answer, final: bool = False) -> bool:
+        """Takes in what the agent believes; True where that is its last word, after which nothing is carried out.
+
+        It is when the task says that it is sure enough, with the last decision, and when the agent calls it `final`.
+        """
+        self.answers.append(answer)
+        self.ended = final or task.sure(self)
+        self.success = task.succeeded(self)
+        return self.ended or self.spent(task)
+
+    def look(self, task: NavigationTask, observation: Observation) -> None:
+        """Takes in what is seen now."""
+        if task.pointing is not None and task.pointing.ends(observation.target):
+            self.ended = True
+            self.success = task.succeeded(self)
 
     def spent(self, task: NavigationTask) -> bool:
         """Whether the decisions are used up, or the primitives where they are given one by one, without decisions."""
@@ -113,16 +141,34 @@ def start(task: NavigationTask, episode: Episode) -> tuple[Any, Trip, Goal]:
     config = _env.NavigationConfig(motion=_env.Motion.__members__[task.motion])
     core = _env.NavigationEnv(place.renderer.core, place.navmesh, place.ground, config)
     core.reset(np.asarray(episode.start_position), episode.start_yaw)
-    goal_position = place.ground.put_down(episode.goal_position).astype(np.float64)
+    goal_position = task.goal_position(place, episode)
     return core, Trip(episode, place, goal_position, [core.position]), task.goal(place, episode)
 
 
-def outputs(depth: bool) -> list[str]:
-    """Images of an observation, by the simulator's names."""
-    return ["panorama", "front", *(["depth"] if depth else [])]
+def outputs(task: NavigationTask, depth: bool) -> list[str]:
+    """Images that the simulator is asked for, by its names."""
+    return ["panorama", "front", *(["depth"] if depth else []), *([] if task.pointing is None else IDS)]
 
 
-def observation_space(depth: bool) -> gymnasium.spaces.Dict:
+def observed(task: NavigationTask, images: dict[str, Any], odometry: NDArray[np.float64], trip: Trip) -> Observation:
+    """What the agent is given of what the simulator showed."""
+    if task.pointing is not None:
+        images = task.pointing.split(images, int(trip.episode.info["target"]))
+    return Observation(**images, odometry=odometry)
+
+
+def declared(task: NavigationTask, action: int) -> Answer | None:
+    """The final answer that an action of the discrete space stands for, if it is none of the primitives."""
+    choice = action - len(PRIMITIVES)
+    return None if choice < 0 else Answer(task.choices, np.eye(len(task.choices))[choice])
+
+
+def action_space(task: NavigationTask) -> gymnasium.spaces.Discrete:
+    """The primitives, and a final answer for each of the choices that the task gives."""
+    return gymnasium.spaces.Discrete(len(PRIMITIVES) + len(task.choices))
+
+
+def observation_space(task: NavigationTask, depth: bool) -> gymnasium.spaces.Dict:
     """What an environment shows; the shapes that `wiw.types.Observation` documents."""
     box = gymnasium.spaces.Box
     spaces: dict[str, gymnasium.Space[Any]] = {
@@ -130,4 +176,9 @@ def observation_space(depth: bool) -> gymnasium.spaces.Dict:
         "front": box(0, 255, (480, 480, 3), np.uint8),
         "odometry": box(-1e4, 1e4, (3,), np.float64),
     }
-    return gymnasium.spaces.Dict({**spaces, "depth": box(0, 1e4, (576, 1024), np.float32)} if depth else spaces)
+    if depth:
+        spaces["depth"] = box(0, 1e4, (576, 1024), np.float32)
+    if task.pointing is not None:
+        spaces["panorama_box"] = box(-1, 1024, (4,), np.float32)
+        spaces["front_box"] = box(-1, 480, (4,), np.float32)
+    return gymnasium.spaces.Dict(spaces)

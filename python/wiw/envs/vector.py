@@ -13,9 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import env as _env
 from wiw.action import NULL
-from wiw.envs.trip import PRIMITIVES, NavigationTask, Trip, drawn, known, observation_space, outputs, start
+from wiw.envs.trip import (
+    PRIMITIVES,
+    NavigationTask,
+    Trip,
+    action_space,
+    declared,
+    drawn,
+    known,
+    observation_space,
+    observed,
+    outputs,
+    start,
+)
 from wiw.errors import ArgumentError
-from wiw.types import Goal, Key, Truth
+from wiw.types import Answer, Goal, Key, Truth
 
 
 class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], NDArray[Any]]):
@@ -35,9 +47,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         if num_envs < 1:
             raise ArgumentError(f"VectorEnv: expected num_envs of at least 1, got {num_envs}")
         self.task, self.num_envs, self.render_mode = task, num_envs, "rgb_array"
-        self.outputs = outputs(depth)
-        self.single_observation_space = observation_space(depth)
-        self.single_action_space = gymnasium.spaces.Discrete(len(PRIMITIVES))
+        self.outputs = outputs(task, depth)
+        self.single_observation_space = observation_space(task, depth)
+        self.single_action_space = action_space(task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._core: Any = None
@@ -74,9 +86,9 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Carries out one primitive each: 0 forward, 1 turn left, 2 turn right, 3 stop."""
+        """Carries out one primitive each: 0 forward, 1 turn left, 2 turn right, 3 stop; from 4 on: a final answer."""
         self._require_episodes()
-        primitives = self._primitives(actions)
+        primitives, answers = self._understood(actions)
         infos: dict[str, Any] = {}
         for place in np.flatnonzero(self._over):
             self._add_info(infos, self._start_over(int(place)), int(place))
@@ -84,14 +96,20 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
         for place in np.flatnonzero(~self._over):
-            trip, action = self._trips[place], int(primitives[place])
-            terminated[place] = trip.note(self.task, action, self._core[place].position, at_decision=True)
-            truncated[place] = not terminated[place] and trip.spent(self.task)
+            trip, answer = self._trips[place], answers[place]
+            if answer is None:
+                trip.note(self.task, int(primitives[place]), self._core[place].position, at_decision=True)
+            else:
+                trip.hear(self.task, answer, final=True)
+        observation = self._observe()
+        for place in np.flatnonzero(~self._over):
+            trip = self._trips[place]
+            terminated[place], truncated[place] = trip.ended, not trip.ended and trip.spent(self.task)
             rewards[place] = trip.success
             if terminated[place] or truncated[place]:
                 self._add_info(infos, {"result": self.result(int(place))}, int(place))
         self._over = terminated | truncated
-        return self._observe(), rewards, terminated, truncated, infos
+        return observation, rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
         """The front views."""
@@ -136,20 +154,34 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
 
     def _observe(self) -> dict[str, Any]:
         images = self._core.observe(self.outputs)
-        self._front = images["front"]
-        return {**images, "odometry": np.stack([self._core[place].odometry for place in range(self.num_envs)])}
+        odometry = np.stack([self._core[place].odometry for place in range(self.num_envs)])
+        shown = {**images, "odometry": odometry}
+        if self.task.pointing is not None:
+            each = [self._pointed_out(images, odometry, place) for place in range(self.num_envs)]
+            shown = {name: np.stack([values[name] for values in each]) for name in each[0]}
+        self._front = shown["front"]
+        return shown
 
-    def _primitives(self, actions: ArrayLike) -> NDArray[np.int8]:
-        given = np.asarray(actions)
-        if given.shape != (self.num_envs,) or given.dtype.kind not in "iu" or not self._in_range(given):
-            raise ArgumentError(
-                f"step: expected {self.num_envs} actions from 0 to {len(PRIMITIVES) - 1}, got {actions!r}"
-            )
-        return np.array(PRIMITIVES, np.int8)[given]
+    def _pointed_out(self, images: dict[str, Any], odometry: NDArray[np.float64], place: int) -> dict[str, Any]:
+        """One place's observation, with its target's boxes."""
+        own, trip = {name: image[place] for name, image in images.items()}, self._trips[place]
+        observation = observed(self.task, own, odometry[place], trip)
+        if not self._over[place]:
+            trip.look(self.task, observation)
+        return observation.as_dict()
 
-    def _in_range(self, actions: NDArray[Any]) -> bool:
-        return bool(((actions >= 0) & (actions < len(PRIMITIVES))).all())
+    def _understood(self, actions: ArrayLike) -> tuple[NDArray[np.int8], list[Answer | None]]:
+        """The primitives to carry out, none where a final answer is given, and the answers."""
+        given, count = np.asarray(actions), len(PRIMITIVES) + len(self.task.choices)
+        if given.shape != (self.num_envs,) or given.dtype.kind not in "iu" or not _in_range(given, count):
+            raise ArgumentError(f"step: expected {self.num_envs} actions from 0 to {count - 1}, got {actions!r}")
+        table = np.array([*PRIMITIVES, *[NULL] * (count - len(PRIMITIVES))], np.int8)
+        return table[given], [declared(self.task, int(action)) for action in given]
 
     def _require_episodes(self) -> None:
         if self._core is None:
             raise ArgumentError("the environment has no episodes yet; call reset() first")
+
+
+def _in_range(actions: NDArray[Any], count: int) -> bool:
+    return bool(((actions >= 0) & (actions < count)).all())

@@ -54,8 +54,8 @@ class Agent:
         candidates: plans per decision (M); None means the number of the task that the agent is evaluated on, else 3.
         horizon: primitives per plan (L); None means the task's own number, else 5.
         execute: primitives carried out before the next decision; None means the task's own number, or L - 2, as in the
-            paper's ImageNav, where `horizon` is given. A negative number leaves that many of the plan's first `horizon`
-            undone, but carries out at least one.
+            paper's ImageNav, where `horizon` is given. 0 carries out all of the plan; a negative number leaves that
+            many of the plan's first `horizon` undone, but carries out at least one.
         depth: levels of the beam search. At 1, the paper's, the proposals are what is chosen from; each further level
             extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
             Without a model nothing is imagined, and there is one level.
@@ -91,13 +91,9 @@ class Agent:
         self.horizon = 5 if horizon is None else horizon
         self.execute = max(1, self.horizon - 2) if execute is None else execute
         self.depth, self.width = depth, self.candidates if width is None else width
-        if (
-            min(self.candidates, self.depth, self.width) < 1
-            or self.horizon < 1
-            or not 1 <= abs(self.execute) <= self.horizon
-        ):
+        if min(self.candidates, self.depth, self.width) < 1 or self.horizon < 1 or abs(self.execute) > self.horizon:
             raise ArgumentError(
-                f"Agent: expected candidates, depth and width >= 1 and execute from 1 to horizon or below 0, got "
+                f"Agent: expected candidates, depth and width >= 1 and execute from -horizon to horizon, got "
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
             )
@@ -117,8 +113,14 @@ class Agent:
         return tuple(sorted({*self.policy.needs, *self.revision.needs, *model}))
 
     def decide(self, observation: Any, goal: Goal, key: Key, simulator: Any = None) -> Decision:
-        """One decision for one episode; `observation` is an Observation or the environment's dict."""
+        """One decision for one episode; `observation` is an Observation or the environment's dict.
+
+        Raises:
+            ArgumentError: a dict whose images have boxes drawn on them, which no world model is to see.
+        """
         if isinstance(observation, dict):
+            if "panorama_box" in observation:
+                raise ArgumentError("decide: these images have the target's box drawn on them; pass env.observation")
             observation = Observation(**observation)
         return self.decide_batch([Query(observation, goal, key, simulator)])[0]
 
@@ -271,7 +273,7 @@ class Agent:
 
 
 def settled_numbers(given: Mapping[str, int], defaults: Mapping[str, int]) -> dict[str, int]:
-    """A task's numbers where none is given; the primitives carried out belong to the horizon they were chosen for."""
-    if "horizon" in given and defaults.get("execute", 0) > 0:
+    """A task's numbers where none is given; several primitives carried out belong to the horizon chosen for them."""
+    if "horizon" in given and defaults.get("execute", 0) > 1:
         defaults = {name: value for name, value in defaults.items() if name != "execute"}
     return {**defaults, **given}

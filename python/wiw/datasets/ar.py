@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active Recognition episodes: things hardly seen at the start, and clearly from somewhere within the budget.
+
+A thing is hardly seen when most of it is hidden, or when it is so far away or so foreshortened that little is to be
+seen, a small part of what a good view shows; both are measured in rendered instance ids (`wiw.datasets.visibility`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import core
+from wiw.action import ActionSpace
+from wiw.datasets import episodes as episode_file
+from wiw.datasets.visibility import COARSE, alone, seen
+from wiw.datasets.worlds import World
+from wiw.errors import ArgumentError, FileError
+from wiw.types import Episode
+
+CATEGORIES = (
+    "bathtub",
+    "bed",
+    "bin",
+    "bookshelf",
+    "chair",
+    "coffee table",
+    "desk",
+    "dining table",
+    "dresser",
+    "floor lamp",
+    "laundry basket",
+    "microwave",
+    "nightstand",
+    "plant",
+    "refrigerator",
+    "shoe rack",
+    "shower",
+    "sink",
+    "sofa",
+    "stool",
+    "stove",
+    "table lamp",
+    "television",
+    "toilet",
+    "wardrobe",
+    "washing machine",
+)
+"""What targets are and answers are chosen from, unless told otherwise: as many as there are letters."""
+
+ALIASES = {
+    "carpet": "rug",
+    "couch": "sofa",
+    "fridge": "refrigerator",
+    "kitchen table": "dining table",
+    "night stand": "nightstand",
+    "portrait": "picture",
+    "rangehood": "range hood",
+    "reading desk": "desk",
+    "trash": "bin",
+    "tv": "television",
+    "tv cabinet": "tv stand",
+}
+"""Other scenes' words for the apartments' categories."""
+
+HIDDEN = (0.4, 0.2)
+"""Visible shares at the start below which an episode is of difficulty 1 and 2."""
+
+
+@dataclass(frozen=True)
+class EpisodeRules:
+    """What makes a target and a start worth an episode. Lengths in metres, sizes in steradians."""
+
+    nearest: float = 0.7
+    """Least horizontal distance from the start to the target's centre."""
+    farthest: float = 5.0
+    seen: float = 0.0025
+    """Least size of what is seen of the target at the start: 75 pixels of the panorama at eye level."""
+    hidden: float = HIDDEN[0]
+    """Heavily occluded: at most this share of the target is visible ..."""
+    small: float = 0.25
+    """... or an extreme viewpoint: it fills at most this part of what it fills in the best view ..."""
+    tiny: float = 0.008
+    """... and is no larger than this, 5 degrees across."""
+    clear: float = 0.7
+    """Least visible share in the best view."""
+    large: float = 0.02
+    """Least size of the best view: 8 degrees across."""
+    gain: float = 2.5
+    """How much larger than at the start the target must be seen there, at least."""
+    budget: int = 8
+    """Most primitives from the start to the best view; the paper's 10 decisions leave 9 to carry out."""
+    turned: float = 67.5
+    """Most degrees between the start's heading and the target."""
+    survey: int = 250
+    """Places looked at in a scene."""
+    places: int = 30
+    """Of those near a target, places where its visible share is measured."""
+    attempts: int = 6
+    """Starts tried for a target."""
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What is seen from where in one scene."""
+
+    points: NDArray[np.float64]
+    """float64 [N, 3], on the floor."""
+    sizes: NDArray[np.float64]
+    """float64 [N, instances + 1] steradians, roughly."""
+
+
+def category_of(instance: Mapping[str, Any]) -> str:
+    """An instance's category in the apartments' words."""
+    return ALIASES.get(instance["category"], instance["category"])
+
+
+def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
+    """The middle of an instance's bounds, world metres.
+
+    Raises:
+        ArgumentError: the scene has no such instance; names `where`.
+    """
+    things = world.scene.instances
+    if not 1 <= instance <= len(things):
+        raise ArgumentError(f"{where}: target {instance} is no instance of {world.name}, which has 1 to {len(things)}")
+    return np.asarray(things[instance - 1]["bounds"], np.float64).mean(axis=0)
+
+
+def generate(
+    world: World,
+    count: int,
+    seed: int,
+    categories: Sequence[str] = CATEGORIES,
+    rules: EpisodeRules = EpisodeRules(),
+    *,
+    first: int = 0,
+    before: Iterable[str] = (),
+) -> list[Episode]:
+    """Episodes `first` to `first + count - 1` of one scene.
+
+    Categories take turns: those that are rarest among `before`, the targets of the episodes made so far, come first.
+    Otherwise the episodes are a function of (scene, seed, `first`).
+
+    Raises:
+        ArgumentError: the scene holds nothing of `categories`, or too few targets and starts satisfy `rules`.
+    """
+    key = core.fold_key([seed, first, 0xA12])
+    things = _targets(world, categories)
+    points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
+    survey = Survey(points, seen(world, points, COARSE))
+    made: list[Episode] = []
+    tally = Counter(before)
+    for round_ in range(count):
+        for number, category in enumerate(_order(things, tally, core.fold_key([key, round_]))):
+            episode = _episode(world, survey, things[category], core.fold_key([key, round_, number]), rules)
+            if episode is not None:
+                made.append(episode)
+                tally[category] += 1
+            if len(made) == count:
+                return [_numbered(episode, first + i) for i, episode in enumerate(made)]
+    raise ArgumentError(
+        f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
+    )
+
+
+def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[str, Any]]]:
+    """Instances by category."""
+    things: dict[str, list[Mapping[str, Any]]] = {}
+    for instance in world.scene.instances:
+        if category_of(instance) in categories:
+            things.setdefault(category_of(instance), []).append(instance)
+    if not things:
+        raise ArgumentError(
+            f"{world.name}: holds nothing of the categories {', '.join(categories)}; it has "
+            f"{', '.join(sorted(world.scene.categories)) or 'none at all'}: name those wanted (categories=[...])"
+        )
+    return things
+
+
+def _order(things: Mapping[str, Any], tally: Counter[str], key: int) -> list[str]:
+    """Categories of a scene, the rarest so far first, otherwise at random."""
+    names = sorted(things)
+    draws = dict(zip(names, core.uniform(key, len(names)), strict=True))
+    return sorted(names, key=lambda name: (tally[name], draws[name]))
+
+
+def _episode(
+    world: World, survey: Survey, instances: Sequence[Mapping[str, Any]], key: int, rules: EpisodeRules
+) -> Episode | None:
+    """An episode with one of the instances as target, if one has a start that is hard and can be mended."""
+    draws = core.uniform(key, 2)
+    instance = instances[int(draws[0] * len(instances))]
+    name, centre = int(instance["id"]), np.asarray(instance["bounds"], np.float64).mean(axis=0)
+    for start, size, share in _starts(world, survey, name, centre, core.fold_key([key, 1]), rules):
+        ahead = np.arctan2(-(centre - start)[0], -(centre - start)[2])
+        yaw = float(ahead + np.radians(rules.turned) * (2 * draws[1] - 1)) % (2 * np.pi)
+        best = _best_view(world, start, yaw, name, rules)
+        if best is None or best.size < rules.gain * size:
+            continue
+        if share > rules.hidden and (size > rules.small * best.size or size > rules.tiny):
+            continue
+        return Episode(
+            episode_id="",
+            scene=world.name,
+            start_position=_triple(start),
+            start_yaw=yaw,
+            goal_position=_triple(centre),
+            goal_yaw=0.0,
+            geodesic=float(world.navmesh.geodesic_distance(start, best.position)),
+            info={
+                "target": name,
+                "category": category_of(instance),
+                "difficulty": sum(share < bound for bound in HIDDEN),
+                "visible": round(share, 4),
+                "best_position": _triple(best.position),
+                "best_primitives": best.primitives,
+                "best_visible": round(best.share, 4),
+            },
+        )
+    return None
+
+
+def _starts(
+    world: World, survey: Survey, instance: int, centre: NDArray[np.float64], key: int, rules: EpisodeRules
+) -> Iterator[tuple[NDArray[np.float64], float, float]]:
+    """Places from which the target is seen, though perhaps not much of it, with its size and visible share there."""
+    away = np.hypot(*(survey.points - centre)[:, [0, 2]].T)
+    near = np.flatnonzero((away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0))
+    if not len(near):
+        return
+    points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
+    sizes = seen(world, points)[:, instance]
+    points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
+    shares = np.minimum(1.0, sizes / np.maximum(alone(world, points, instance), 1e-9))
+    # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
+    for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
+        yield points[i], float(sizes[i]), float(shares[i])
+
+
+@dataclass(frozen=True)
+class _View:
+    position: NDArray[np.float64]
+    primitives: int
+    size: float
+    share: float
+
+
+def _best_view(
+    world: World, start: NDArray[np.float64], yaw: float, instance: int, rules: EpisodeRules
+) -> _View | None:
+    """Where within the budget the target is seen largest, among places where it is seen clearly."""
+    ends, primitives = _reachable(world, start, yaw, rules.budget)
+    rough = seen(world, ends, COARSE)[:, instance]
+    largest = np.argsort(-rough, kind="stable")[:6]
+    largest = largest[rough[largest] >= rules.large / 2]
+    if not len(largest):
+        return None
+    sizes = seen(world, ends[largest])[:, instance]
+    shares = sizes / np.maximum(alone(world, ends[largest], instance), 1e-9)
+    fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
+    if not len(fit):
+        return None
+    best = fit[sizes[fit].argmax()]
+    end = largest[best]
+    return _View(ends[end], int(primitives[end]), float(sizes[best]), min(1.0, float(shares[best])))
+
+
+def _reachable(
+    world: World, start: NDArray[np.float64], yaw: float, budget: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Places that a turn and then some steps lead to, every other step of each way, and the primitives to get there."""
+    step = ActionSpace().forward_m
+    found, spent = [start], [0]
+    half = round(np.pi / ActionSpace().turn_rad)
+    for turns in range(1 - half, half + 1):
+        angle = yaw + turns * ActionSpace().turn_rad
+        steps = np.arange(1, max(0, budget - abs(turns)) + 1)
+        way = start + step * steps[:, None] * np.array([-np.sin(angle), 0.0, -np.cos(angle)])
+        free = np.cumprod(world.navmesh.is_navigable(way)) if len(way) else np.zeros(0)
+        for count in steps[: int(free.sum())][::-1][::2]:
+            found.append(way[count - 1])
+            spent.append(abs(turns) + int(count))
+    return world.ground.put_down(np.stack(found)).astype(np.float64), np.array(spent)
+
+
+def _numbered(episode: Episode, index: int) -> Episode:
+    return replace(episode, episode_id=f"{index:04d}")
+
+
+def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
+
+
+def load(
+    path: str | Path, scenes: str | Path = "", categories: Sequence[str] | None = None
+) -> tuple[list[Episode], tuple[str, ...]]:
+    """Episodes of a file and what their answers are chosen from: `categories`, else what the file's header names, else
+    the built-in list where it holds all targets, else the targets' own categories.
+
+    Raises:
+        FileError: see `wiw.datasets.episodes.load`; a target or category is missing or not among the choices. Names
+            file, episode and field.
+    """
+    found = episode_file.load(path, scenes)
+    for i, episode in enumerate(found):
+        _check_fields(episode, f"{path}: episode {i}")
+    named = categories or _header(path)
+    present = {episode.info["category"] for episode in found}
+    if named is None:
+        named = CATEGORIES if present <= set(CATEGORIES) else sorted(present)
+    for i, episode in enumerate(found):
+        if episode.info["category"] not in named:
+            raise FileError(
+                f"{path}: episode {i}: info.category '{episode.info['category']}' is none of the categories "
+                f"{', '.join(named)}; mend the file, or name it too (categories=[...])"
+            )
+    return found, tuple(named)
+
+
+def _header(path: str | Path) -> list[str] | None:
+    body = episode_file.read_json(path)
+    named = body.get("categories") if isinstance(body, Mapping) else None
+    if named is not None and (not isinstance(named, list) or not all(isinstance(name, str) for name in named)):
+        raise FileError(f"{path}: categories: expected a list of names, got {named!r}")
+    return named
+
+
+def _check_fields(episode: Episode, where: str) -> None:
+    if not isinstance(episode.info, Mapping):
+        raise FileError(f"{where}: info: expected an object with target and category, got {episode.info!r}")
+    target, category = episode.info.get("target"), episode.info.get("category")
+    if isinstance(target, bool) or not isinstance(target, int) or target < 1:
+        raise FileError(f"{where}: info.target: expected the id of an instance (1, 2, ...), got {target!r}")
+    if not isinstance(category, str) or not category:
+        raise FileError(f"{where}: info.category: expected what the target is, got {category!r}")

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active Recognition: say what the boxed thing is, moving where that helps (paper, appendix "Active Recognition")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets import ar
+from wiw.datasets.visibility import visible_share
+from wiw.datasets.worlds import World, world
+from wiw.envs.pointing import Pointing
+from wiw.envs.trip import Trip
+from wiw.errors import ArgumentError
+from wiw.tasks.navigation import NavigationTask
+from wiw.types import Answer, Episode, Goal
+
+
+@dataclass(frozen=True)
+class ARRules:
+    """Budget, stop rule and variants; their values are in the presets (`wiw/configs`)."""
+
+    decisions: int
+    """K; nothing is carried out after the last one."""
+    candidates: int
+    """M, plans imagined per decision."""
+    horizon: int
+    """L, primitives per plan."""
+    execute: Literal["primitive", "sequence"]
+    """Whether the first primitive of the chosen plan is carried out before the next decision, or all of it."""
+    confidence: float
+    """An answer more probable than this ends the episode at once."""
+    prediction: Literal["last", "surest"]
+    """Which answer is the final one; of equally confident ones the earliest."""
+    lost: Literal["continue", "stop"]
+    """Whether the episode goes on when neither panorama nor front view shows the target."""
+    box_scale: float
+    """The target's box about its centre."""
+    box_part: Literal["all", "largest"]
+    """Whether the box holds all visible pixels of the target or their largest piece."""
+    motion: Literal["refuse", "slide"]
+
+    def __post_init__(self) -> None:
+        if min(self.decisions, self.candidates, self.horizon) < 1 or self.box_scale <= 0:
+            raise ArgumentError(f"ar: decisions, candidates, horizon and box_scale must be positive, got {self}")
+        if not 0 <= self.confidence <= 1:
+            raise ArgumentError(f"ar: confidence: expected a probability from 0 to 1, got {self.confidence}")
+
+
+class AR(NavigationTask):
+    """The task: what is to be recognised, when an episode ends, and what is measured.
+
+    `NavigationTask` documents the other arguments.
+
+    Args:
+        categories: what targets are and answers are chosen from; None means the built-in list
+            (`wiw.datasets.ar.CATEGORIES`), or, with an episode file, the file's own.
+    """
+
+    name = "ar"
+    metrics = ("success", "mean_trajectory")
+    rules_class = ARRules
+
+    def __init__(self, *args: Any, categories: Sequence[str] | None = None, **options: Any) -> None:
+        super().__init__(*args, **options)
+        if categories is not None and (isinstance(categories, str) or len(set(categories)) != len(categories)):
+            raise ArgumentError(f"ar: categories: expected different names, got {categories!r}")
+        self.choices = tuple(categories or ar.CATEGORIES)
+        self._named = categories
+        if self.episode_file:
+            self._episodes = self.of_file()
+
+    @property
+    def defaults(self) -> dict[str, int]:
+        """Options for `wiw.Agent` that the task prescribes."""
+        return {**super().defaults, "execute": 1 if self.rules.execute == "primitive" else 0}
+
+    @property
+    def pointing(self) -> Pointing:
+        """How the target is boxed."""
+        return Pointing(self.rules.box_scale, self.rules.box_part, self.rules.lost)
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity: what must be equal for two runs to be comparable."""
+        return {**super().describe(), "categories": list(self.choices)}
+
+    def goal(self, place: World, episode: Episode) -> Goal:
+        """The choices; what is to be recognised is pointed out in the observations."""
+        return Goal(self.name, choices=self.choices)
+
+    def goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
+        """Beside the target: the nearest place to its centre where an agent can stand, if there is one near by."""
+        centre = ar.centre_of(place, int(episode.info["target"]), f"episode {episode.episode_id}")
+        below = np.array([centre[0], episode.start_position[1], centre[2]])
+        nearest = place.navmesh.snap(below)
+        return np.asarray(below if nearest is None or not np.isfinite(nearest).all() else nearest, np.float64)
+
+    def sure(self, trip: Trip) -> bool:
+        """Whether the last answer is above the confidence that ends the episode."""
+        return trip.answers[-1].confidence > self.rules.confidence
+
+    def succeeded(self, trip: Trip) -> bool:
+        """Whether the episode has ended with the right answer."""
+        final = self.final(trip)
+        return trip.ended and final is not None and final.label == trip.episode.info["category"]
+
+    def final(self, trip: Trip) -> Answer | None:
+        """The answer that counts, of those given so far."""
+        if not trip.answers:
+            return None
+        surest = max(trip.answers, key=lambda answer: answer.confidence)
+        return surest if self.rules.prediction == "surest" else trip.answers[-1]
+
+    def result(self, trip: Trip) -> dict[str, float]:
+        """Metrics of one finished episode.
+
+        `success` 0 or 1; `actions` carried out before the final answer; its `confidence` (0 without an answer);
+        `visible_start` and `visible_end`, the shares of the target in sight there; `category` and `predicted`, numbers
+        of the choices (`predicted` is -1 without an answer).
+        """
+        final, target = self.final(trip), int(trip.episode.info["target"])
+        category = trip.episode.info["category"]
+        return {
+            "success": float(final is not None and final.label == category),
+            "actions": float(trip.actions),
+            "confidence": 0.0 if final is None else final.confidence,
+            "visible_start": visible_share(trip.world, trip.positions[0], target),
+            "visible_end": visible_share(trip.world, trip.positions[-1], target),
+            "category": float(self.choices.index(category)),
+            "predicted": -1.0 if final is None else float(self.choices.index(final.label)),
+        }
+
+    def of_file(self) -> list[Episode]:
+        """The file's episodes; where it gives no place of the target, the scene does."""
+        assert self.episode_file is not None
+        loaded, self.choices = ar.load(self.episode_file, self.scene_folder, self._named)
+        return [self._placed(episode, f"{self.episode_file}: episode {i}") for i, episode in enumerate(loaded)]
+
+    def of_scene(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
+        """Targets hardly seen at the start, of the categories that are rarest so far."""
+        taken = [episode.info["category"] for episode in before]
+        return ar.generate(place, self.per_scene, self.seed, self.choices, first=first, before=taken)
+
+    def _placed(self, episode: Episode, where: str) -> Episode:
+        if np.isfinite(episode.goal_position).all():
+            return episode
+        centre = ar.centre_of(world(episode.scene, self.backend), int(episode.info["target"]), where)
+        return replace(episode, goal_position=(float(centre[0]), float(centre[1]), float(centre[2])))

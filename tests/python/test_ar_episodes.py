@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active Recognition episodes: measured visibility, what is generated, and what is read."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.datasets import ar, visibility
+from wiw.datasets import episodes as episode_file
+from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError, FileError
+from wiw.render import Renderer
+from wiw.scenes import Scene
+from wiw.tasks.ar import AR
+from wiw.types import Episode
+
+RULES = ar.EpisodeRules(hidden=0.75, gain=1.2, small=0.6, tiny=1.0, survey=150)
+"""Two bare rooms have little that hides anything."""
+CHOICES = ("chest", "picture", "shelf", "table")
+
+
+def only(scene: Any, instance: int) -> Scene:
+    """A scene that holds one instance alone."""
+    vertices, triangles, names = scene.world_triangles()
+    return Scene.from_arrays([{"positions": vertices, "triangles": triangles[names == instance]}])
+
+
+def test_alone_is_what_a_scene_of_that_instance_alone_shows(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    points = place.ground.put_down(place.navmesh.sample(6, 3)).astype(float)
+    before = visibility.seen(place, points)
+    for instance in (7, 8, 10):
+        bare = Renderer(only(place.scene, instance), "cpu")
+        poses = [visibility.camera_pose(point, 0.0) for point in points]
+        ids = bare.panorama(np.stack(poses), visibility.SIZE, outputs=("instance",))["instance"]
+        sine = np.sin(np.linspace(np.pi / 2, -np.pi / 2, visibility.SIZE[0] + 1))
+        expected = ((ids > 0).sum(axis=2) * -np.diff(sine)).sum(axis=1) * 2 * np.pi / visibility.SIZE[1]
+        np.testing.assert_allclose(visibility.alone(place, points, instance), expected, rtol=0.02, atol=2e-4)
+        assert (before[:, instance] <= expected * 1.02 + 2e-4).all()
+    np.testing.assert_array_equal(visibility.seen(place, points), before)  # all is back in its place
+    np.testing.assert_allclose(before.sum(axis=1), 4 * np.pi)
+
+
+def test_a_share_is_none_behind_a_wall_and_all_in_plain_sight(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    table = next(int(thing["id"]) for thing in place.scene.instances if thing["name"] == "table")
+    assert visibility.visible_share(place, np.array([2.0, 0, -1.0]), table) == 0
+    assert visibility.visible_share(place, np.array([-1.0, 0, -1.0]), table) == pytest.approx(1)
+
+
+def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    made = ar.generate(place, 4, 1, CHOICES, RULES)
+    assert made == ar.generate(place, 4, 1, CHOICES, RULES)
+    assert [episode.episode_id for episode in made] == ["0000", "0001", "0002", "0003"]
+    for episode in made:
+        info, start = episode.info, np.asarray(episode.start_position)
+        thing = place.scene.instances[info["target"] - 1]
+        assert thing["category"] == info["category"]
+        np.testing.assert_allclose(episode.goal_position, np.asarray(thing["bounds"]).mean(axis=0), atol=1e-5)
+        share = visibility.visible_share(place, start, info["target"])
+        assert share == pytest.approx(info["visible"], abs=1e-3)
+        assert info["difficulty"] == (share < 0.4) + (share < 0.2)
+        best = np.asarray(info["best_position"])
+        now, then = visibility.seen(place, np.stack([start, best]))[:, info["target"]]
+        assert now >= RULES.seen
+        assert then >= max(RULES.large, RULES.gain * now)
+        assert share <= RULES.hidden or now <= RULES.small * then
+        assert visibility.visible_share(place, best, info["target"]) >= RULES.clear - 1e-3
+        assert info["best_primitives"] <= RULES.budget
+
+
+def test_the_best_view_is_as_many_primitives_away_as_it_says(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    start, yaw = np.array([-2.0, 0.0, 0.5]), 0.4
+    ends, primitives = ar._reachable(place, start, yaw, 6)
+    turns = np.arange(-7, 9) * np.pi / 8
+    for end, spent in zip(ends[1:], primitives[1:], strict=True):
+        way = (end - start)[[0, 2]]
+        heading = np.arctan2(-way[0], -way[1])
+        off = np.abs((heading - yaw - turns + np.pi) % (2 * np.pi) - np.pi)
+        assert off.min() < 1e-3
+        assert spent == round(abs(turns[off.argmin()]) / (np.pi / 8)) + round(float(np.hypot(*way)) / 0.2)
+        assert spent <= 6
+    assert len(ends) > 12
+
+
+def test_categories_take_turns(two_rooms: str) -> None:
+    place = world(two_rooms, "cpu")
+    before = ["chest", "chest", "picture", "picture", "shelf"]
+    first = ar.generate(place, 1, 1, CHOICES, RULES, before=before)
+    assert first[0].info["category"] == "table"
+    things = Counter(episode.info["category"] for episode in ar.generate(place, 4, 2, CHOICES, RULES))
+    assert max(things.values()) - min(things[name] for name in things) <= 1
+
+
+def test_too_few_are_said_to_be(two_rooms: str) -> None:
+    with pytest.raises(ArgumentError, match="only 0 of 1"):
+        ar.generate(world(two_rooms, "cpu"), 1, 1, CHOICES, ar.EpisodeRules(gain=1e6, survey=40, attempts=1))
+
+
+def a_file(path: Path, scene: str, **info: Any) -> Path:
+    episode = Episode("0", scene, (0, 0, 0), 0, (1, 0, 0), 0, 1, {"target": 8, "category": "table", **info})
+    episode_file.save(path, [episode], "ar", categories=list(CHOICES))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("info", "message"),
+    [
+        ({"target": None}, r"episode 0: info\.target: expected the id of an instance .* got None"),
+        ({"target": 0}, r"info\.target"),
+        ({"category": ""}, r"episode 0: info\.category: expected what the target is, got ''"),
+        ({"category": "sofa"}, r"episode 0: info\.category 'sofa' is none of the categories chest, .*categories=\["),
+    ],
+)
+def test_bad_fields_are_named(tmp_path: Path, two_rooms: str, info: dict[str, Any], message: str) -> None:
+    with pytest.raises(FileError, match=message) as error:
+        AR(episode_file=a_file(tmp_path / "bad.json", two_rooms, **info))
+    assert "bad.json" in str(error.value)
+
+
+def test_a_scene_that_is_not_there_is_named(tmp_path: Path) -> None:
+    task = AR(episode_file=a_file(tmp_path / "ar.json", "/nowhere/house.glb"))
+    with pytest.raises(FileError, match=r"/nowhere/house\.glb: no such file"):
+        task.require(task.episodes(1))
+
+
+def test_a_target_that_the_scene_has_not_is_named(tmp_path: Path, two_rooms: str) -> None:
+    task = AR(episode_file=a_file(tmp_path / "ar.json", two_rooms, target=99))
+    with pytest.raises(ArgumentError, match=r"target 99 is no instance of .*which has 1 to 11"):
+        task.environment().begin(task.episode(0))
+
+
+def test_a_file_brings_its_choices_unless_they_are_given(tmp_path: Path, two_rooms: str) -> None:
+    path = a_file(tmp_path / "ar.json", two_rooms)
+    assert AR(episode_file=path).choices == CHOICES
+    assert AR(episode_file=path, categories=["door", "table"]).choices == ("door", "table")
+    body = json.loads(path.read_text())
+    for named, message in (([1], "categories: expected a list of names"), ("table", "categories")):
+        path.write_text(json.dumps({**body, "categories": named}))
+        with pytest.raises(FileError, match=message):
+            AR(episode_file=path)
+
+
+def test_the_published_files_schema_is_read(tmp_path: Path, two_rooms: str) -> None:
+    item = {
+        "scene_id": f"/home/authors/data/{Path(two_rooms).parent.name}/{Path(two_rooms).name}",
+        "episode_id": 12,
+        "start_position": [-1.2, 0.0, -1.2],
+        "start_rotation": [np.cos(0.2), 0.0, np.sin(0.2), 0.0],
+        "target_id": 8,
+        "target_categrory": "table",
+        "difficulty": 2,
+    }
+    path = tmp_path / "episodes_AR.json.gz"
+    path.write_bytes(gzip.compress(json.dumps({"episodes": [item]}).encode()))
+    task = AR(episode_file=path, scene_folder=Path(two_rooms).parents[1])
+    episode = task.episode(0)
+    assert (episode.episode_id, episode.scene, episode.start_yaw) == ("12", two_rooms, pytest.approx(0.4))
+    assert episode.info == {"source": "world-in-world", "target": 8, "category": "table", "difficulty": 2}
+    centre = np.asarray(world(two_rooms).scene.instances[7]["bounds"]).mean(axis=0)
+    np.testing.assert_allclose(episode.goal_position, centre, atol=1e-5)
+    assert task.choices == ("table",)
+    assert task.environment().begin(episode).target.mask.any()
+    del item["target_categrory"]
+    path.write_bytes(gzip.compress(json.dumps({"episodes": [item]}).encode()))
+    with pytest.raises(FileError, match=r"episodes_AR\.json\.gz: episode 0: .*target_categrory"):
+        AR(episode_file=path)
