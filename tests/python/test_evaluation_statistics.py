@@ -10,8 +10,8 @@ from rich.console import Console
 from scipy import stats
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.intervals import agresti_min, clustered_bootstrap, student, wilson
-from wiw.evaluation.statistics import HEADLINES, compare, estimate_difference, estimate_mean, mcnemar
+from wiw.evaluation.intervals import agresti_min, clustered_bootstrap, clustered_t, student, wilson
+from wiw.evaluation.statistics import HEADLINES, compare, estimate_difference, estimate_mean, holm, mcnemar
 from wiw.evaluation.summary import notes, show_estimate, summarise
 
 SR, SPL, TRAJ = HEADLINES
@@ -206,3 +206,45 @@ def test_arms_say_what_they_are():
     summary = summarise(["none", "geometric", "warp"], [], episodes=3, policies=["none", "geometric"])
     roles = [line.role for line in summary.arms]
     assert roles == ["the policy alone", "another policy, alone", "world model"]
+
+
+def test_t_over_scenes_is_the_cluster_robust_interval_of_statsmodels():
+    sm = pytest.importorskip("statsmodels.api")
+    rng = np.random.default_rng(5)
+    scenes = np.repeat(np.arange(12), 4)
+    data = rng.normal(0, 1, 12)[scenes] + rng.normal(0, 1, 48)
+    fit = sm.OLS(data, np.ones(48)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
+    half = stats.t.ppf(0.975, 11) * fit.bse[0]
+    assert clustered_t(data, scenes, "length") == pytest.approx((data.mean() - half, data.mean() + half))
+
+
+def test_t_over_scenes_is_students_where_every_episode_is_its_own_scene():
+    data = np.random.default_rng(6).normal(40, 9, 23)
+    assert clustered_t(data, np.arange(23), "length") == pytest.approx(student(data))
+
+
+def test_made_up_episodes_by_hand():
+    scenes = np.repeat(np.arange(5), 4)
+    assert clustered_t(np.zeros(20), scenes, "rate") == pytest.approx(
+        (0.0, 1 / 22 + stats.t.ppf(0.975, 4) * math.sqrt((1 / 22 - 1 / 22**2) / 22))
+    )
+    high = clustered_t(np.zeros(20), scenes, "difference")[1]
+    assert high == pytest.approx(stats.t.ppf(0.975, 4) / 22)
+    with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
+        clustered_t(np.zeros(4), np.zeros(4), "rate")
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=9))
+def test_holm_is_statsmodels(p_values):
+    multitest = pytest.importorskip("statsmodels.stats.multitest")
+    assert holm(p_values) == pytest.approx(multitest.multipletests(p_values, method="holm")[1])
+
+
+def test_arms_of_one_table_are_one_family_of_tests():
+    wins = {"none": 0, "copy": 1, "warp": 6, "oracle": 9}
+    outcomes = [outcome(arm, i, float(i < wins[arm])) for arm in wins for i in range(12)]
+    summary = summarise(list(wins), outcomes, episodes=12)
+    found = [summary.difference(arm, "none") for arm in ("copy", "warp", "oracle")]
+    assert [d.p_value for d in found] == pytest.approx([1.0, 2 / 2**6, 2 / 2**9])
+    assert [d.p_adjusted for d in found] == pytest.approx([1.0, 2 * 2 / 2**6, 3 * 2 / 2**9])
+    assert summary.difference("warp", "copy").p_adjusted == pytest.approx(2 * 2 / 2**5 / 2)  # two arms, the larger p

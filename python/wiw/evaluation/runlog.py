@@ -84,13 +84,20 @@ class RunLog:
         return numbers
 
     def table(self) -> Records:
-        """The table of arms as plain values: one dict an arm, with `<metric>`, `<metric>_low` and `<metric>_high`."""
+        """The table of arms as plain values: one dict an arm, with `<metric>`, `<metric>_low` and `<metric>_high`.
+
+        "utility" and its ends are there for arms between floor and ceiling, nan where not identifiable.
+        """
+        numbers = self.numbers()
+        utilities = {found.arm: found for found in numbers.utilities}
         lines = []
-        for arm in self.numbers().arms:
+        for arm in numbers.arms:
             line: dict[str, Any] = {"arm": arm.name, "role": arm.role}
             line |= {"n": arm.done, "asked": arm.asked, "failed": arm.failed}
             for metric, estimate in arm.estimates.items():
                 line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
+            if found := utilities.get(arm.name):
+                line |= {"utility": found.value, "utility_low": found.low, "utility_high": found.high}
             lines.append(line)
         return Records(lines)
 

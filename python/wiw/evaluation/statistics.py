@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from wiw.evaluation.intervals import Interval, agresti_min, clustered_bootstrap, student, wilson
-
-Kind = Literal["rate", "length"]
+from wiw.evaluation.intervals import Interval, Kind, agresti_min, clustered_bootstrap, clustered_t, student, wilson
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,7 @@ class Headline:
     metric: str
     """Name in `EpisodeResult.metrics`."""
     label: str
-    kind: Kind
+    kind: Literal["rate", "length"]
     """"rate": episode values in [0, 1], shown as percent. "length": any number."""
     higher_is_better: bool
 
@@ -56,6 +54,8 @@ class Estimate:
     """Episodes."""
     scenes: int
     method: str
+    bootstrap: Interval | None = None
+    """A second opinion: the bootstrap over scenes, too narrow where they are few; None for one scene."""
 
     @property
     def excludes_zero(self) -> bool:
@@ -77,24 +77,22 @@ class Difference:
     losses: int
     p_value: float | None
     """Exact McNemar test, for 0/1 metrics."""
+    p_adjusted: float | None = None
+    """The same, adjusted by Holm for all arms that are compared with this base."""
 
 
 def estimate_mean(values: ArrayLike, scenes: Sequence[str], headline: Headline, *, seed: int = 0) -> Estimate:
-    """Mean over episodes with the wider of two 95 % intervals: clustered by scene, and over episodes (`intervals`)."""
+    """Mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
     data = np.asarray(values, np.float64)
-    if headline.kind == "rate":
-        return _estimate(data, scenes, headline, ("Wilson", wilson(float(data.mean()), len(data))), seed)
-    return _estimate(data, scenes, headline, ("Student t", student(data)), seed)
+    return _estimate(data, scenes, headline, "rate" if headline.kind == "rate" else "length", seed)
 
 
 def estimate_difference(
     arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], headline: Headline, *, seed: int = 0
 ) -> Estimate:
-    """Mean of paired differences, arm minus base, with the wider of two 95 % intervals (`intervals`)."""
+    """Mean of paired differences, arm minus base, with a 95 % interval over scenes; `seed` is the bootstrap's."""
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
-    if headline.kind == "rate":
-        return _estimate(data, scenes, headline, ("Agresti-Min", agresti_min(data)), seed)
-    return _estimate(data, scenes, headline, ("Student t", student(data)), seed)
+    return _estimate(data, scenes, headline, "difference" if headline.kind == "rate" else "length", seed)
 
 
 def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
@@ -102,6 +100,29 @@ def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
     wins, differing = int((data > 0).sum()), int((data != 0).sum())
     return 1.0 if differing == 0 else float(stats.binomtest(wins, differing).pvalue)
+
+
+def holm(p_values: ArrayLike) -> NDArray[np.float64]:
+    """P values adjusted for being several (Holm 1979): the smallest times their number, the next times one less, ...
+
+    Rejecting where the adjusted value is at most 0.05 keeps the chance of any false rejection at 5 %.
+    """
+    given = np.asarray(p_values, np.float64)
+    order = np.argsort(given)
+    adjusted = np.empty_like(given)
+    adjusted[order] = np.maximum.accumulate(given[order] * np.arange(len(given), 0, -1)).clip(max=1.0)
+    return adjusted
+
+
+def adjusted(differences: Sequence[Difference]) -> tuple[Difference, ...]:
+    """The same differences with their p values adjusted, each metric for itself: one family of tests."""
+    found = list(differences)
+    for metric in {difference.metric for difference in found}:
+        family = [i for i, d in enumerate(found) if d.metric == metric and d.p_value is not None]
+        p_values = np.array([found[i].p_value for i in family], np.float64)
+        for i, p_value in zip(family, holm(p_values), strict=True):
+            found[i] = replace(found[i], p_adjusted=float(p_value))
+    return tuple(found)
 
 
 def compare(
@@ -135,14 +156,21 @@ def compare(
     )
 
 
-def _estimate(
-    data: NDArray[np.float64], scenes: Sequence[str], headline: Headline, plain: tuple[str, Interval], seed: int
-) -> Estimate:
-    name, (low, high) = plain
-    groups = len(set(scenes))
+_OVER_EPISODES: dict[Kind, tuple[str, Callable[[NDArray[np.float64]], Interval]]] = {
+    "rate": ("Wilson", lambda data: wilson(float(data.mean()), len(data))),
+    "difference": ("Agresti-Min", agresti_min),
+    "length": ("Student t", student),
+}
+
+
+def _estimate(data: NDArray[np.float64], scenes: Sequence[str], headline: Headline, kind: Kind, seed: int) -> Estimate:
+    groups, scale = len(set(scenes)), headline.scale
+    second = None
     if groups > 1:
-        clustered = clustered_bootstrap(data, list(scenes), seed=seed)
-        low, high = np.nanmin([low, clustered[0]]), np.nanmax([high, clustered[1]])
-        name = f"wider of {name} and bootstrap over {groups} scenes"
-    scale = headline.scale
-    return Estimate(scale * float(data.mean()), scale * float(low), scale * float(high), len(data), groups, name)
+        name, (low, high) = f"t over {groups} scenes", clustered_t(data, list(scenes), kind)
+        bootstrap = clustered_bootstrap(data, list(scenes), seed=seed)
+        second = scale * bootstrap[0], scale * bootstrap[1]
+    else:
+        name, interval = _OVER_EPISODES[kind]
+        low, high = interval(data)
+    return Estimate(scale * float(data.mean()), scale * low, scale * high, len(data), groups, name, second)

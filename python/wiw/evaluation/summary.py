@@ -8,7 +8,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from wiw.evaluation.statistics import HEADLINES, Difference, Estimate, Headline, compare, estimate_mean
+from wiw.evaluation.statistics import HEADLINES, Difference, Estimate, Headline, adjusted, compare, estimate_mean
+from wiw.evaluation.utility import CEILING, FLOOR, Utility, utility
 
 ROLES = {
     "none": "the policy alone",
@@ -16,6 +17,17 @@ ROLES = {
     "oracle": "the ceiling, the true future",
 }
 """What the reference arms stand for; any other arm is a world model under test, or a policy without one."""
+PLACEBOS = {
+    "placebo-shuffled": "placebo, futures of shuffled actions",
+    "placebo-swapped": "placebo, futures of another episode",
+}
+"""Arms that cost what a world model costs and know nothing of the plan; perhaps followed by ":" and its name."""
+TELLS = {
+    "none": "What imagination adds to the policy alone",
+    "copy": "What it adds over a world where nothing moves",
+}
+"""What a difference to these arms tells."""
+WORLD_MODEL, ANOTHER_POLICY = "world model", "another policy, alone"
 
 MOST_FAILED = 0.01
 """Share of an arm's episodes whose infrastructure may fail before the run counts as invalid."""
@@ -48,6 +60,19 @@ class ArmSummary:
 
 
 @dataclass(frozen=True)
+class Group:
+    """One table of differences."""
+
+    title: str
+    heading: str
+    """What it tells, for the report."""
+    corner: str
+    """Which minus which."""
+    rows: Mapping[str, Mapping[str, Difference]]
+    """By label of the row, then by metric."""
+
+
+@dataclass(frozen=True)
 class Summary:
     """What `RunLog.summary()` returns; shows itself as a table in a terminal and in Jupyter."""
 
@@ -56,6 +81,30 @@ class Summary:
     """Each arm minus "none" and minus "copy", on the episodes that both have finished."""
     same_episodes: bool
     """Whether all arms have finished the same episodes, so that their lines can be compared as they stand."""
+    utilities: tuple[Utility, ...] = ()
+    """Where each arm stands between "copy" and "oracle", if the run has both."""
+
+    def groups(self) -> tuple[Group, ...]:
+        """The differences as tables, one for each base."""
+        bases = dict.fromkeys(difference.base for difference in self.differences)
+        return tuple(
+            Group(f"Difference to {base}, paired by episode", TELLS[base], f"Arm minus {base}", self._rows(base))
+            for base in bases
+        )
+
+    def _rows(self, base: str) -> dict[str, dict[str, Difference]]:
+        rows: dict[str, dict[str, Difference]] = {}
+        for difference in self.differences:
+            if difference.base == base:
+                rows.setdefault(difference.arm, {})[difference.metric] = difference
+        return rows
+
+    def utility(self, arm: str) -> Utility:
+        """Where an arm stands between floor and ceiling."""
+        for found in self.utilities:
+            if found.arm == arm:
+                return found
+        raise KeyError(f"no utility of '{arm}' in this run: it needs episodes that arm, copy and oracle have finished")
 
     @property
     def invalid(self) -> tuple[str, ...]:
@@ -108,7 +157,6 @@ def summarise(
         seed: of the bootstrap.
         policies: arms that have no world model and differ from "none" by their policy.
     """
-    roles = dict.fromkeys(policies, "another policy, alone") | ROLES
     done: dict[str, dict[int, Mapping[str, Any]]] = {arm: {} for arm in arms}
     failed = dict.fromkeys(arms, 0)
     for outcome in outcomes:
@@ -116,15 +164,41 @@ def summarise(
             done[outcome["arm"]][outcome["episode"]] = outcome
         else:
             failed[outcome["arm"]] += 1
-    lines = tuple(_line(arm, roles.get(arm, "world model"), done[arm], failed[arm], episodes, seed) for arm in arms)
+    lines = tuple(_line(arm, role_of(arm, policies), done[arm], failed[arm], episodes, seed) for arm in arms)
     differences = tuple(
-        difference
-        for base in ("none", "copy")
-        for arm in arms
-        for headline in _headlines(done)
-        if base in arms and arm not in (base, "none") and (difference := compare(arm, base, done, headline, seed))
+        difference for base in ("none", FLOOR) if base in arms for difference in _against(base, arms, done, seed)
     )
-    return Summary(lines, differences, len({frozenset(ended) for ended in done.values()}) == 1)
+    same = len({frozenset(ended) for ended in done.values()}) == 1
+    return Summary(lines, differences, same, _utilities(lines, done))
+
+
+def role_of(arm: str, policies: Collection[str] = ()) -> str:
+    """What an arm stands for, by its name; `policies` name those without a world model."""
+    if arm in ROLES:
+        return ROLES[arm]
+    placebo = PLACEBOS.get(arm.partition(":")[0])
+    return placebo or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
+
+
+def _against(
+    base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int
+) -> tuple[Difference, ...]:
+    others = [arm for arm in arms if arm not in (base, "none")]
+    found = [compare(arm, base, done, headline, seed) for arm in others for headline in _headlines(done)]
+    return adjusted([difference for difference in found if difference is not None])
+
+
+def _utilities(lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> tuple[Utility, ...]:
+    if FLOOR not in done or CEILING not in done:
+        return ()
+    others = [line for line in lines if line.name not in (FLOOR, CEILING)]
+    found = [utility(line.name, done, reference=not _under_test(line)) for line in others]
+    return tuple(one for one in found if one is not None)
+
+
+def _under_test(line: ArmSummary) -> bool:
+    """A world model with this run's policy; `warp` is what geometry alone gives."""
+    return line.role == WORLD_MODEL and line.name != "warp" and "+" not in line.name
 
 
 def _headlines(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Headline]:
@@ -153,13 +227,7 @@ def notes(summary: Summary) -> list[str]:
     if summary.invalid:
         found.insert(0, f"INVALID RUN, not to be quoted: {' '.join(summary.invalid)} `wiw resume --retry-failed`.")
     found += [_missing(line) for line in summary.arms if line.done < line.asked]
-    first = next((estimate for line in summary.arms for estimate in line.estimates.values()), None)
-    if first is not None:
-        found.append(
-            f"95 % intervals: the wider of a bootstrap over {first.scenes} scenes and an interval over episodes."
-            if first.scenes > 1
-            else f"95 % intervals over episodes of one scene ({first.method})."
-        )
+    found += [*_about_intervals(summary), *_about_differences(summary), *_about_utility(summary)]
     widest = max(
         (line.estimates["success"] for line in summary.arms if "success" in line.estimates),
         key=lambda estimate: estimate.high - estimate.low,
@@ -184,10 +252,39 @@ def _missing(line: ArmSummary) -> str:
     return f"{said}; over all {line.asked}, SR would lie between {least:.1f} and {most:.1f} %."
 
 
+def _about_intervals(summary: Summary) -> list[str]:
+    first = next((estimate for line in summary.arms for estimate in line.estimates.values()), None)
+    if first is None:
+        return []
+    if first.scenes == 1:
+        return [f"95 % intervals over episodes of one scene ({first.method}); they say nothing about other scenes."]
+    few = " So few leave them wide: add scenes, not episodes of the same." if first.scenes < 5 else ""
+    return [f"95 % intervals: Student's t over {first.scenes} scenes.{few}"]
+
+
+def _about_differences(summary: Summary) -> list[str]:
+    tested = [difference for difference in summary.differences if difference.p_adjusted is not None]
+    return ["p: exact McNemar test of SR, adjusted by Holm for the arms of its table."] if tested else []
+
+
+def _about_utility(summary: Summary) -> list[str]:
+    if not summary.utilities:
+        return []
+    found = ["U: 0 is as good as copy, 1 as good as oracle; Fieller's interval, paired by episode."]
+    if any(not one.identifiable for one in summary.utilities):
+        found.append("Not identifiable: the interval of oracle - copy holds 0; there is no share to measure.")
+    return found
+
+
 def show_estimate(estimate: Estimate, signed: bool = False) -> str:
     """E.g. "46.3 [38.9, 54.0]", or "+21.3 [12.8, 29.9]" for a difference."""
     interval = "[?]" if math.isnan(estimate.low) else f"[{estimate.low:.1f}, {estimate.high:.1f}]"
     return f"{estimate.value:{'+.1f' if signed else '.1f'}} {interval}"
+
+
+def show_utility(found: Utility) -> str:
+    """E.g. "0.75 [0.58, 0.93]"."""
+    return f"{found.value:.2f} [{found.low:.2f}, {found.high:.2f}]" if found.identifiable else "not identifiable"
 
 
 def show_p(p_value: float | None) -> str:

@@ -6,12 +6,23 @@ from __future__ import annotations
 from typing import Any
 
 from rich import box
-from rich.console import Console, Group
+from rich.console import Console
+from rich.console import Group as Lines
 from rich.table import Table
 from rich.text import Text
 
 from wiw.evaluation.statistics import Estimate
-from wiw.evaluation.summary import ArmSummary, Summary, column_title, notes, show_estimate, show_p, shown_headlines
+from wiw.evaluation.summary import (
+    ArmSummary,
+    Group,
+    Summary,
+    column_title,
+    notes,
+    show_estimate,
+    show_p,
+    show_utility,
+    shown_headlines,
+)
 
 COUNTS = (("n", "judged", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
@@ -30,10 +41,11 @@ def print_summary(summary: Summary) -> None:
 def summary_tables(summary: Summary, width: int) -> Any:
     """Something that rich can print into so many columns."""
     parts: list[Any] = [_arms(summary)]
-    for base in dict.fromkeys(d.base for d in summary.differences):
-        parts.append(_differences(summary, base, " " if width >= ROOMY else "\n"))
+    if summary.utilities:
+        parts.append(_utilities(summary))
+    parts += [_differences(summary, group, " " if width >= ROOMY else "\n") for group in summary.groups()]
     styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
-    return Group(*parts, *styled)
+    return Lines(*parts, *styled)
 
 
 def _table(title: str) -> Table:
@@ -66,18 +78,31 @@ def _add_arm_column(table: Table, names: list[str]) -> None:
     table.add_column("arm", style="bold", min_width=min(16, max(map(len, names), default=0)))
 
 
-def _differences(summary: Summary, base: str, gap: str) -> Table:
+def _utilities(summary: Summary) -> Table:
+    table = _table("Utility U = (SR - copy) / (oracle - copy), on the episodes that all three have finished")
+    _add_arm_column(table, [found.arm for found in summary.utilities])
+    for title in ("U ↑", "n"):
+        table.add_column(title, justify="right")
+    table.add_column("")
+    for found in summary.utilities:
+        style = "" if found.identifiable and not found.reference else "dim"
+        shown = Text(show_utility(found), style=style)
+        table.add_row(found.arm, shown, str(found.n), Text("reference" if found.reference else "", style="dim"))
+    return table
+
+
+def _differences(summary: Summary, group: Group, gap: str) -> Table:
     """`gap` stands between an estimate and its interval."""
-    table = _table(f"Difference to {base}, paired by episode")
-    _add_arm_column(table, [line.name for line in summary.arms])
+    table = _table(group.title)
+    _add_arm_column(table, list(group.rows))
     for headline in shown_headlines(summary):
         table.add_column(column_title(headline), justify="right")
     for title in ("W/L", "p"):
         table.add_column(title, justify="right", min_width=5)
-    for arm in dict.fromkeys(d.arm for d in summary.differences if d.base == base):
-        found = [summary.difference(arm, base, headline.metric) for headline in shown_headlines(summary)]
+    for label, row in group.rows.items():
+        found = [row[headline.metric] for headline in shown_headlines(summary)]
         score = f"{found[0].wins}/{found[0].losses}"
-        table.add_row(arm, *(_signed(d.estimate, gap) for d in found), score, show_p(found[0].p_value))
+        table.add_row(label, *(_signed(d.estimate, gap) for d in found), score, show_p(found[0].p_adjusted))
     return table
 
 

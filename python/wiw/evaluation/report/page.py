@@ -98,12 +98,12 @@ def _found(summary: Summary, arm: str, base: str) -> Difference | None:
 
 
 def _common(summary: Summary) -> dict[str, Any]:
-    bases = dict.fromkeys(difference.base for difference in summary.differences)
     return {
         "summary": summary,
         "headlines": shown_headlines(summary),
         "notes": notes(summary),
-        "bases": {base: dict.fromkeys(d.arm for d in summary.differences if d.base == base) for base in bases},
+        "groups": summary.groups(),
+        "utilities": {found.arm: found for found in summary.utilities},
         "colors": plots.arm_colors([line.name for line in summary.arms]),
         "reach": _reach(summary.differences),
     }
@@ -153,9 +153,17 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"column": column_title, "p": show_p, "asset": _asset, "signed": signed}
+    environment.filters |= {"column": column_title, "p": show_p, "asset": _asset, "signed": signed, "how": _how}
     environment.tests["binding"] = _binding
     return environment
+
+
+def _how(estimate: Estimate) -> str:
+    """How an interval was made, and the second opinion on it."""
+    if estimate.bootstrap is None:
+        return estimate.method
+    low, high = estimate.bootstrap
+    return f"{estimate.method}; bootstrap over scenes: {low:.1f} to {high:.1f}"
 
 
 def _binding(estimate: Estimate) -> bool:
