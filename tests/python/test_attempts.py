@@ -58,7 +58,7 @@ def test_a_call_that_fails_is_made_again(failures: int) -> None:
     model = Scripted(*[ConnectionError("gone")] * failures, GOOD)
     asked = Attempts(model, 5.0)
     np.testing.assert_array_equal(asked(OBSERVATIONS, CONTROLS, SEEDS), GOOD)
-    assert (model.calls, asked.retries) == (failures + 1, failures)
+    assert (model.calls, asked.tally["retries"], asked.tally["rows"]) == (failures + 1, failures, 2 * (failures + 1))
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,8 @@ def run(
     live: Count = 4,
     keep_images: Count = 2,
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
+    cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -82,6 +84,9 @@ def run(
         keep_images: Episodes that keep pictures for the report.
         deadline: Most seconds for a call of the world model, 600 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
+        cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
+            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
+        cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
         report: Whether to write report.html at the end.
     """
     from wiw.evaluation.evaluate import evaluate
@@ -101,6 +106,7 @@ def run(
         return evaluate(
             recipe, agent, episodes, seed, folder, workers,
             arms=names, live=live, keep_images=keep_images, deadline=deadline,
+            cache=cache, cache_gb=cache_gb,
         )  # fmt: skip
 
     return finish(stoppable(work, folder), report)

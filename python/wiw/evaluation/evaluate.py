@@ -38,6 +38,8 @@ def evaluate(
     keep_images: int = 2,
     resume: bool = False,
     deadline: float | None = None,
+    cache: str | Path | None = None,
+    cache_gb: float | None = None,
     **task_options: Any,
 ) -> RunLog:
     """Runs an agent on the first `episodes` episodes of a task.
@@ -63,6 +65,9 @@ def evaluate(
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
             600 unless it was given another.
+        cache: where rollouts are kept and found: a folder, "off", or "auto" (those of models that declare themselves
+            `cacheable`, in `~/.cache/wiw/rollouts`); None means the agent's own, "auto" unless it was given another.
+        cache_gb: most gigabytes of that folder.
         task_options: options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
@@ -71,7 +76,7 @@ def evaluate(
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
     """
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline, cache, cache_gb)
     return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
 
 
@@ -88,9 +93,11 @@ def run_arms(
     keep_images: int = 2,
     resume: bool = False,
     deadline: float | None = None,
+    cache: str | Path | None = None,
+    cache_gb: float | None = None,
 ) -> RunLog:
     """Runs several named agents on the same episodes; see `evaluate` for the rest."""
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline, cache, cache_gb)
     return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
 
 
@@ -150,17 +157,25 @@ class _Options:
     keep_images: int
     resume: bool
     deadline: float | None
+    cache: str | Path | None
+    cache_gb: float | None
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
             _at_least(name, getattr(self, name), least)
         if self.deadline is not None and not self.deadline > 0:
             raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
+        if self.cache_gb is not None and not self.cache_gb > 0:
+            raise ArgumentError(f"evaluate: expected a cache_gb above 0, got {self.cache_gb}")
 
     @property
     def limits(self) -> dict[str, Any]:
         """What every agent is built with beyond its own recipe."""
-        return {} if self.deadline is None else {"deadline": min(self.deadline, FOR_EVER)}
+        deadline = None if self.deadline is None else min(self.deadline, FOR_EVER)
+        named = self.cache is None or str(self.cache) in ("auto", "off")
+        cache = self.cache if named else str(Path(str(self.cache)).expanduser().resolve())
+        limits = {"deadline": deadline, "cache": cache, "cache_gb": self.cache_gb}
+        return {name: value for name, value in limits.items() if value is not None}
 
 
 def _at_least(name: str, value: int, least: int) -> None:

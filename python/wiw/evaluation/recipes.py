@@ -63,7 +63,7 @@ class AgentRecipe:
     def build(self, defaults: Mapping[str, Any], limits: Mapping[str, Any] = NO_LIMITS) -> Any:
         """The agent; what is None is taken from the task's defaults (M, L and the executed primitives).
 
-        `limits` are what a run gives every agent beyond its identity: its `deadline`.
+        `limits` are what a run gives every agent beyond its identity: `deadline`, `cache`, `cache_gb`.
         """
         from wiw.loop.agent import Agent
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.contract import check_model, check_proposals, checked_answers, checked_plan, checked_scores
 from wiw.loop.imagine import Imagination, imagine
+from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
 from wiw.types import Decision, Goal, Key, Observation, Rollout
@@ -61,6 +63,9 @@ class Agent:
             Without a model nothing is imagined, and there is one level.
         width: plans of an episode that are kept and extended; None means `candidates`.
         deadline: seconds that a call of the world model may take before it counts as failed (`wiw.loop.attempts`).
+        cache: "auto" keeps the rollouts of models that declare themselves `cacheable` in `~/.cache/wiw/rollouts`, a
+            folder keeps those of any model there, "off" keeps none (`wiw.loop.rollout_cache`).
+        cache_gb: most gigabytes of that folder; what was not used for longest goes first.
 
     Raises:
         ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
@@ -79,6 +84,8 @@ class Agent:
         depth: int = 1,
         width: int | None = None,
         deadline: float = DEADLINE,
+        cache: str | Path = "auto",
+        cache_gb: float = BUDGET_GB,
     ) -> None:
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
@@ -97,10 +104,10 @@ class Agent:
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
             )
-        self._deadline = deadline
-        self._ask: Attempts | None = None
+        self._limits = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb}
+        self._ask: Asking | None = None
         if self.model is not None:
-            self._ask = Attempts(self.model, deadline)
+            self._ask = remember(Attempts(self.model, deadline), cache, cache_gb)
             check_model(self.model, self.horizon * self.depth)
             if self.depth > 1:
                 self._check_depth(self.model)
@@ -163,8 +170,7 @@ class Agent:
     def but(self, **changes: Any) -> Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
-        parts["deadline"] = self._deadline
-        return Agent(**{**parts, **self.given, **changes})
+        return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, int]) -> Agent:
         """The same agent with a task's numbers where it was given none."""
@@ -184,7 +190,12 @@ class Agent:
         }
 
     def _look_ahead(
-        self, ask: Attempts, queries: Sequence[Query], revising: Sequence[Situation], beams: Beams, clock: Clock
+        self,
+        ask: Asking,
+        queries: Sequence[Query],
+        revising: Sequence[Situation],
+        beams: Beams,
+        clock: Clock,
     ) -> tuple[Imagination, list[NDArray[np.float64]]]:
         """Imagines and scores the plans of one level."""
         imagined = imagine(ask, queries, beams.proposals, beams.origins, self.revision.frames, clock)

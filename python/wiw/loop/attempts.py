@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
@@ -47,8 +48,9 @@ class Attempts:
         if not deadline > 0:
             raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
         self.model, self.deadline = model, deadline
-        self.retries = 0
-        """Tries so far that gave nothing and were followed by another."""
+        self.tally: Counter[str] = Counter()
+        """What was asked so far: `calls` that the model has answered or not, their `rows` and `frames` (padding and
+        frames that other rows answer left out), and `retries`, calls that repeat one that gave nothing."""
         self._helper: _Helper | None = None
 
     def __reduce__(self) -> Any:
@@ -65,6 +67,7 @@ class Attempts:
         """
         said: list[str] = []
         for attempt in range(TRIES):
+            self._count(controls)
             try:
                 return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
             except Exception as error:
@@ -72,9 +75,14 @@ class Attempts:
                 hopeless = isinstance(error, ContractError) and said.count(said[-1]) > 1
                 if attempt + 1 == TRIES or hopeless:
                     raise self._failure(error, said) from error
-                self.retries += 1
+                self.tally["retries"] += 1
                 time.sleep(PAUSES[attempt])
         raise AssertionError("unreachable")
+
+    def _count(self, controls: Sequence[Control]) -> None:
+        self.tally["calls"] += 1
+        self.tally["rows"] += len(controls)
+        self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
         kind = getattr(error, "kind", "contract") if isinstance(error, ContractError | _LateError) else "raised"

@@ -23,6 +23,12 @@ class Clock:
         finally:
             self.seconds[stage] += time.perf_counter() - begin
 
+    def move(self, seconds: float, origin: str, target: str) -> None:
+        """Books part of a stage's time under another."""
+        if seconds:
+            self.seconds[origin] -= seconds
+            self.seconds[target] += seconds
+
     def share(self, count: int) -> dict[str, float]:
         """Seconds by stage, divided over `count` episodes that shared the work."""
         return {stage: seconds / count for stage, seconds in self.seconds.items()}

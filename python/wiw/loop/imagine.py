@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw._core import core, planner
 from wiw.errors import ArgumentError
-from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
+from wiw.loop.rollout_cache import Asking
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout
 from wiw.world_models.base import Accepts
@@ -46,7 +46,7 @@ class Imagination:
 
 
 def imagine(
-    ask: Attempts,
+    ask: Asking,
     queries: Sequence[Any],
     proposals: Sequence[Sequence[Proposal]],
     origins: Sequence[Sequence[int]],
@@ -69,7 +69,9 @@ def imagine(
             observations = _at_start(conditioning, part, answers, accepts)
             controls = _controls(accepts, part)
         with clock("world_model"):
+            before = ask.tally["cache_seconds"]
             answers.append(ask(observations, controls, seeds[part.rows]))
+        clock.move(ask.tally["cache_seconds"] - before, "world_model", "cache")
     with clock("platform"):
         kind = "perspective" if accepts.view == "perspective" else "panorama"
         view = "front" if kind == "perspective" else frames.view

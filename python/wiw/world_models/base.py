@@ -35,6 +35,7 @@ class Accepts:
     vocabulary: dict[int, Any] | None
     null_first: bool
     template: TextTemplate | None
+    cacheable: bool = False
 
 
 def accepts(
@@ -50,6 +51,7 @@ def accepts(
     vocabulary: dict[int, Any] | None = None,
     null_first: bool = False,
     template: TextTemplate | None = None,
+    cacheable: bool = False,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
@@ -65,6 +67,8 @@ def accepts(
         vocabulary: primitive id to the model's own id or vector, for control "action"; default: primitive ids.
         null_first: the model wants a null token for frame 0 in front of the actions.
         template: words of the prompt, for control "text"; see `wiw.action.TextTemplate`.
+        cacheable: keep rollouts on disk and never ask twice. Say so for a model that takes long and whose answer is a
+            function of what it is handed: not for one that draws without the seeds, nor for a server that may change.
 
     Raises:
         ArgumentError: a value is not one of the above.
@@ -85,7 +89,18 @@ def accepts(
         raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
     size = (int(size[0]), int(size[1]))
     return Accepts(
-        control, space, view, size, frames, tuple(needs), causal, best_batch, vocabulary, null_first, template
+        control,
+        space,
+        view,
+        size,
+        frames,
+        tuple(needs),
+        causal,
+        best_batch,
+        vocabulary,
+        null_first,
+        template,
+        cacheable,
     )
 
 
@@ -129,6 +144,20 @@ class WorldModel(ABC):
         public = {name: value for name, value in vars(self).items() if not name.startswith("_") and _is_plain(value)}
         options = {name: str(value) if isinstance(value, Path) else value for name, value in public.items()}
         return {"name": type(self).__name__, **options}
+
+    def fingerprint(self) -> str:
+        """Text that changes with everything the answers depend on beside what the model is handed; names cached
+        rollouts.
+
+        Default: a digest of the class, its source file, `describe()` and all attributes, arrays and torch networks by
+        content. Override it where that takes long, or where an attribute is of another kind.
+
+        Raises:
+            ArgumentError: an attribute's content cannot be told; names it.
+        """
+        from wiw.world_models.fingerprint import fingerprint
+
+        return fingerprint(self)
 
 
 def _is_plain(value: Any) -> bool:

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rollouts on disk, so that the same question is put to a world model once.
+
+An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: code, options, weights,
+precision), the observation's bytes, the control and the seed. It holds the frames of one row, raw: a panorama is read
+in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under their names whole, so
+any number of processes may share a folder. When it outgrows its budget, what was not used for longest goes first.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import struct
+import time
+import uuid
+import zlib
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.loop.attempts import Attempts
+from wiw.types import Conditioning, Control
+
+_log = logging.getLogger("wiw.rollouts")
+_HEADER = struct.Struct("<8s6I")
+"""Magic, first frame, frames, height, width, CRC-32 of the frames, CRC-32 of the header so far."""
+_MAGIC = b"wiwroll1"
+_CHANNELS = 3
+BUDGET_GB = 20.0
+"""Most gigabytes of a folder unless the user says otherwise; a panorama takes 1.8 MB, a front view 0.7 MB."""
+
+
+def default_folder() -> Path:
+    """Where rollouts are kept: `$WIW_CACHE/rollouts`, or `~/.cache/wiw/rollouts`. Deleting it is always safe."""
+    root = os.environ.get("WIW_CACHE")
+    return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "rollouts"
+
+
+class RolloutCache:
+    """A folder of rollouts.
+
+    Args:
+        folder: where; made when the first entry is written.
+        budget_gb: most gigabytes that it may take.
+    """
+
+    def __init__(self, folder: str | Path, budget_gb: float = BUDGET_GB) -> None:
+        if not budget_gb > 0:
+            raise ArgumentError(f"cache: expected a budget above 0 GB, got {budget_gb}")
+        self.folder, self.budget = Path(folder).expanduser(), int(budget_gb * 2**30)
+        self._known: int | None = None
+        """Bytes at the last look; what other processes have written since is not in it."""
+        self._written = 0
+        self._writing = True
+
+    def get(self, key: str, first: int, frames: NDArray[np.uint8]) -> bool:
+        """Fills `frames` [K, H, W, 3] with frames `first`... of an entry; False where there is none that will do."""
+        path = self._path(key)
+        try:
+            with path.open("rb", buffering=0) as file:
+                found = self._read(file, first, frames)
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        except (OSError, ValueError) as error:
+            _log.warning("cached rollout %s is damaged (%s); it is dropped and imagined anew", path, error)
+            with suppress(OSError):
+                path.unlink()
+            return False
+        if found:
+            with suppress(OSError):
+                os.utime(path)  # last use
+        return found
+
+    def put(self, key: str, first: int, frames: NDArray[np.uint8]) -> None:
+        """Keeps frames `first`... of a row; where that fails a warning says so, and no more is written."""
+        data = np.ascontiguousarray(frames)
+        size = _HEADER.size + data.nbytes
+        if not self._writing or size > self.budget:
+            return
+        start = struct.pack("<8s5I", _MAGIC, first, *data.shape[:3], zlib.crc32(data))
+        path = self._path(key)
+        draft = path.with_suffix(f".{uuid.uuid4().hex}.draft")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with draft.open("wb") as file:
+                file.write(start + struct.pack("<I", zlib.crc32(start)))
+                file.write(data.data)
+            draft.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                draft.unlink(missing_ok=True)
+            self._writing = False
+            _log.warning("rollouts are not kept any more: %s; make room or name another folder with --cache", error)
+            return
+        self._written += size
+        if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
+            self._trim()
+
+    def _path(self, key: str) -> Path:
+        return self.folder / key[:2] / f"{key[2:]}.frames"
+
+    def _read(self, file: Any, first: int, frames: NDArray[np.uint8]) -> bool:
+        """Raises ValueError where the file is not what was written."""
+        header = file.read(_HEADER.size)
+        if len(header) != _HEADER.size or zlib.crc32(header[:-4]) != _HEADER.unpack(header)[-1]:
+            raise ValueError("its header is cut off or altered")
+        magic, begin, count, height, width, checksum, _ = _HEADER.unpack(header)
+        if magic != _MAGIC or os.fstat(file.fileno()).st_size != _HEADER.size + count * height * width * _CHANNELS:
+            raise ValueError("it has another size than it was written with")
+        if begin > first or begin + count != first + len(frames) or (height, width) != frames.shape[1:3]:
+            return False
+        data = frames if begin == first else np.empty((count, height, width, _CHANNELS), np.uint8)
+        view = memoryview(data).cast("B")
+        while len(view) and (taken := file.readinto(view)):
+            view = view[taken:]
+        if len(view) or zlib.crc32(data) != checksum:
+            raise ValueError("its checksum differs")
+        if data is not frames:
+            frames[:] = data[first - begin :]
+        return True
+
+    def _trim(self) -> None:
+        """Looks how large the folder is, and makes it a tenth smaller than its budget where it has outgrown it."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / ".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            entries = self._entries()
+            total = sum(size for _, size, _ in entries)
+            for _, size, path in sorted(entries) if total > self.budget else ():
+                if total <= 0.9 * self.budget:
+                    break
+                with suppress(OSError):
+                    Path(path).unlink()
+                total -= size
+        self._known, self._written = total, 0
+
+    def _entries(self) -> list[tuple[int, int, str]]:
+        """Last use, bytes and path of each file; drafts that a dead process left behind go after an hour."""
+        found = []
+        for folder in os.scandir(self.folder):
+            for file in os.scandir(folder.path) if folder.is_dir() else ():
+                with suppress(FileNotFoundError):  # another process has dropped it
+                    state = file.stat()
+                    if file.name.endswith(".draft") and state.st_mtime < time.time() - 3600:
+                        Path(file.path).unlink()
+                    else:
+                        found.append((state.st_mtime_ns, state.st_size, file.path))
+        return found
+
+
+class Remembered:
+    """Asks a world model only for rows that the cache does not hold. Stands in for the `Attempts` it wraps."""
+
+    def __init__(self, ask: Attempts, cache: RolloutCache) -> None:
+        self.model, self.cache = ask.model, cache
+        self._ask = ask
+        self._identity = f"{ask.model.fingerprint()} {ask.model.accepts}".encode()
+
+    @property
+    def tally(self) -> Counter[str]:
+        """What the model was asked, and `cached_rows` that it was not."""
+        return self._ask.tally
+
+    def __call__(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Frames as `WorldModel.rollout` promises them; those that nobody reads may be left unwritten."""
+        begin = time.perf_counter()
+        keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
+        shape = (len(controls), 1 + len(controls[0].actions), *self.model.accepts.size, _CHANNELS)
+        frames = np.empty(shape, np.uint8)
+        frames[:, 0] = observations.image
+        own = [(1 + control.shared, 1 + control.length) for control in controls]
+        missing = [
+            row
+            for row, (key, (first, end)) in enumerate(zip(keys, own, strict=True))
+            if first < end and not self.cache.get(key, first, frames[row, first:end])
+        ]
+        self.tally["cached_rows"] += len(controls) - len(missing)
+        self.tally["cache_seconds"] += time.perf_counter() - begin
+        if missing:
+            fresh = self._ask(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
+            begin = time.perf_counter()
+            for answer, row in zip(fresh, missing, strict=True):
+                first, end = own[row]
+                self.cache.put(keys[row], first, answer[first:end])
+                frames[row, first:end] = answer[first:end]
+            self.tally["cache_seconds"] += time.perf_counter() - begin
+        return frames
+
+
+Asking = Attempts | Remembered
+"""What the loop asks for frames."""
+
+
+def remember(ask: Attempts, cache: str | Path, budget_gb: float = BUDGET_GB) -> Asking:
+    """The model behind a cache: with "auto" where it declares itself `cacheable`, never with "off", else in a folder.
+
+    A model that is handed the simulator is never cached: its answer depends on a whole scene, which no key can hold.
+
+    Raises:
+        ArgumentError: the model's content cannot be told; see `WorldModel.fingerprint`.
+    """
+    accepts = ask.model.accepts
+    if cache == "off" or "simulator" in accepts.needs or (cache == "auto" and not accepts.cacheable):
+        return ask
+    return Remembered(ask, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
+
+
+def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:
+    digest = blake2b(identity, digest_size=20)
+    parts: list[Any] = [observations.image[row], control.actions, control.trajectory, control.viewpoints, seeds[row]]
+    optional = (observations.depth, observations.semantic, observations.history)
+    parts += [values[row] for values in optional if values is not None]
+    if control.ids is not None:
+        parts.append(control.ids)
+    for part in parts:
+        array = np.ascontiguousarray(part)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.data)
+    digest.update(f"{control.length}{control.text}".encode())
+    return digest.hexdigest()
+
+
+def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
+    """Some rows of a batch; the batch itself where it is all of them."""
+    if len(rows) == len(whole):
+        return whole
+    index = list(rows)
+    depth = None if whole.depth is None else whole.depth[index]
+    semantic = None if whole.semantic is None else whole.semantic[index]
+    history = None if whole.history is None else [whole.history[row] for row in index]
+    return Conditioning(whole.image[index], depth=depth, semantic=semantic, history=history)

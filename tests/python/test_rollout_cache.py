@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rollout cache: the same question is put to a world model once, and never answered by another one's frames."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.errors import ArgumentError
+from wiw.evaluation.recipes import TaskRecipe
+from wiw.loop.attempts import Attempts
+from wiw.loop.rollout_cache import Remembered, RolloutCache, default_folder, remember
+from wiw.types import Conditioning, Control
+
+H, W = 8, 16
+
+
+class Counting(wiw.WorldModel):
+    """A small image in which everything that it was asked can be read; counts the rows of all instances."""
+
+    accepts = wiw.accepts(control="trajectory", size=(H, W), causal=True, cacheable=True)
+    rows: ClassVar[int] = 0
+
+    def __init__(self, weights: float = 1.0) -> None:
+        self.weights = np.full(3, weights, np.float32)
+
+    def rollout(self, observations, controls, seeds):
+        Counting.rows += len(controls)
+        frames = np.empty((len(controls), len(controls[0].actions) + 1, H, W, 3), np.uint8)
+        for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
+            for k in range(frames.shape[1]):
+                said = int(observations.image[row, 0, 0, 0]) + 31 * int(seed) + 7 * control.actions[:k].sum()
+                frames[row, k] = (said * int(self.weights[0]) + 13 * k) % 256
+        return frames
+
+
+def question(*plans, image=5, seeds=None, shared=0):
+    length = max(map(len, plans))
+    controls = [
+        Control(
+            np.array([*plan, *[0] * (length - len(plan))], np.int8), np.zeros((length, 3)), np.zeros((length, 4, 4)),
+            length=len(plan), shared=shared if row else 0,
+        )
+        for row, plan in enumerate(plans)
+    ]  # fmt: skip
+    images = np.full((len(plans), H, W, 3), image, np.uint8)
+    return (
+        Conditioning(images),
+        controls,
+        np.arange(len(plans), dtype=np.uint64) if seeds is None else np.array(seeds, np.uint64),
+    )
+
+
+def asked(ask, *given):
+    before = Counting.rows
+    frames = ask(*given)
+    return frames, Counting.rows - before
+
+
+def make(folder, model=None, **options):
+    return Remembered(Attempts(model or Counting()), RolloutCache(folder, **options))
+
+
+def own(frames, controls):
+    return [frames[row, 1 + control.shared : 1 + control.length] for row, control in enumerate(controls)]
+
+
+FF, FL = [FORWARD, FORWARD], [FORWARD, TURN_LEFT]
+
+
+def test_a_question_is_put_once_also_by_another_process_and_in_other_company(tmp_path) -> None:
+    given = question(FF, FL)
+    fresh, rows = asked(make(tmp_path), *given)
+    assert rows == 2
+    again, rows = asked(make(tmp_path), *given)
+    assert rows == 0
+    for mine, theirs in zip(own(fresh, given[1]), own(again, given[1]), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    more, rows = asked(make(tmp_path), *question(FL, FF, [TURN_LEFT, FORWARD], seeds=[1, 0, 9]))
+    assert rows == 1
+    np.testing.assert_array_equal(more[0, 1:], fresh[1, 1:])
+    np.testing.assert_array_equal(more[2, 1:], Counting().rollout(*question([TURN_LEFT, FORWARD], seeds=[9]))[0, 1:])
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        question(FL),
+        question(FF, image=6),
+        question(FF, seeds=[1]),
+        (replace(question(FF)[0], depth=np.ones((1, H, W), np.float32)), *question(FF)[1:]),
+        (question(FF)[0], [replace(question(FF)[1][0], text="go")], question(FF)[2]),
+        (question(FF)[0], [replace(question(FF)[1][0], ids=np.array([1, 2]))], question(FF)[2]),
+        (question(FF)[0], [replace(question(FF)[1][0], trajectory=np.ones((2, 3)))], question(FF)[2]),
+    ],
+    ids=["plan", "image", "seed", "depth", "text", "ids", "trajectory"],
+)
+def test_another_question_is_another_entry(tmp_path, other) -> None:
+    asked(make(tmp_path), *question(FF))
+    assert asked(make(tmp_path), *question(FF))[1] == 0
+    assert asked(make(tmp_path), *other)[1] == 1
+
+
+def test_another_model_is_another_entry(tmp_path) -> None:
+    class Other(Counting):
+        pass
+
+    asked(make(tmp_path), *question(FF))
+    for model in (Counting(2.0), Other()):
+        frames, rows = asked(make(tmp_path, model), *question(FF))
+        assert rows == 1
+        np.testing.assert_array_equal(frames[:, 1:], model.rollout(*question(FF))[:, 1:])
+
+
+def test_an_entry_serves_rows_that_need_less_of_it(tmp_path) -> None:
+    short = question(FF, FF, seeds=[0, 0], shared=1)
+    whole, _ = asked(make(tmp_path), *question(FF))
+    frames, rows = asked(make(tmp_path), *short)
+    assert rows == 0
+    np.testing.assert_array_equal(frames[1, 2], whole[0, 2])
+    asked(make(tmp_path / "b"), *question([TURN_LEFT], FF, seeds=[4, 0], shared=1))
+    assert asked(make(tmp_path / "b"), *question(FF))[1] == 1  # its first frame was another row's
+
+
+@pytest.mark.parametrize("harm", ["truncate", "frames", "header", "longer", "empty"])
+def test_a_damaged_entry_is_dropped_named_and_imagined_anew(tmp_path, caplog, harm) -> None:
+    fresh, _ = asked(make(tmp_path), *question(FF))
+    (path,) = tmp_path.rglob("*.frames")
+    data = bytearray(path.read_bytes())
+    if harm in ("frames", "header"):
+        data[-5 if harm == "frames" else 9] ^= 1
+    path.write_bytes({"truncate": data[:-7], "longer": data + b"x", "empty": b""}.get(harm, data))
+    with caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        again, rows = asked(make(tmp_path), *question(FF))
+    assert rows == 1 and path.name in caplog.text
+    np.testing.assert_array_equal(fresh[:, 1:], again[:, 1:])
+    assert asked(make(tmp_path), *question(FF))[1] == 0
+
+
+def test_the_least_recently_used_goes_when_the_budget_is_spent(tmp_path) -> None:
+    size = 32 + 2 * H * W * 3
+    ask = make(tmp_path, budget_gb=10 * size / 2**30)
+    for image in range(10):
+        asked(ask, *question(FF, image=image))
+    assert asked(ask, *question(FF, image=0))[1] == 0  # used again: no longer the oldest
+    for image in range(10, 13):
+        asked(ask, *question(FF, image=image))
+    assert sum(path.stat().st_size for path in tmp_path.rglob("*.frames")) <= 10 * size
+    assert asked(ask, *question(FF, image=0))[1] == 0 and asked(ask, *question(FF, image=12))[1] == 0
+    assert asked(ask, *question(FF, image=1))[1] == 1
+    with pytest.raises(ArgumentError, match="budget"):
+        RolloutCache(tmp_path, 0)
+
+
+def test_where_nothing_can_be_written_the_run_goes_on_and_says_so_once(tmp_path, caplog) -> None:
+    (tmp_path / "file").write_text("")
+    ask = make(tmp_path / "file" / "cache")
+    with caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        assert asked(ask, *question(FF))[1] == 1 and asked(ask, *question(FF, image=9))[1] == 1
+    assert caplog.text.count("not kept any more") == 1
+
+
+def test_many_writers_and_readers_agree(tmp_path) -> None:
+    """Threads with caches of their own stand for processes: they share nothing but the folder."""
+    right = {image: Counting().rollout(*question(FF, image=image)) for image in range(8)}
+    wrong = []
+
+    def work(seed):
+        order = np.random.default_rng(seed).permutation(np.repeat(np.arange(8), 8))
+        ask = make(tmp_path, budget_gb=6 * (32 + 2 * H * W * 3) / 2**30)
+        wrong.extend(i for i in order if (ask(*question(FF, image=i))[0, 1:] != right[i][0, 1:]).any())
+
+    threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong and not list(tmp_path.rglob("*.draft"))
+
+
+def test_who_is_cached(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path))
+    kept = remember(Attempts(Counting()), "auto")
+    assert isinstance(kept, Remembered) and kept.cache.folder == default_folder() == tmp_path / "rollouts"
+    warp, oracle = Attempts(wiw.world_model("warp")), Attempts(wiw.world_model("oracle"))
+    assert remember(warp, "auto") is warp and isinstance(remember(warp, tmp_path / "x"), Remembered)
+    assert remember(oracle, tmp_path / "x") is oracle
+    assert not isinstance(remember(Attempts(Counting()), "off"), Remembered)
+
+
+def test_a_model_whose_content_cannot_be_told_says_so(tmp_path) -> None:
+    model = Counting()
+    model.session = object()
+    with pytest.raises(ArgumentError, match=r"Counting\.session.*def fingerprint"):
+        make(tmp_path, model)
+    model.fingerprint = lambda: "mine"
+    make(tmp_path, model)
+
+
+def test_networks_count_by_content() -> None:
+    torch = pytest.importorskip("torch")
+
+    def model(fill, dtype=torch.float32):
+        made = Counting()
+        made.net = torch.nn.Linear(2, 2)
+        torch.nn.init.constant_(made.net.weight, fill)
+        torch.nn.init.constant_(made.net.bias, 0)
+        made.net.to(dtype)
+        return made.fingerprint()
+
+    prints = [model(1), model(1), model(2), model(1, torch.bfloat16)]
+    assert prints[0] == prints[1] and len(set(prints)) == 3
+
+
+MODEL = """
+from pathlib import Path
+
+import numpy as np
+import wiw
+
+
+class Logged(wiw.WorldModel):
+    accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective", cacheable=True)
+
+    def rollout(self, observations, controls, seeds):
+        with Path(__file__).with_suffix(".log").open("a") as log:
+            log.write("asked\\n")
+        fill = np.array([int(seed) % 251 for seed in seeds], np.uint8)
+        return np.broadcast_to(fill[:, None, None, None, None], (len(fill), len(controls[0].actions) + 1, 64, 64, 3))
+"""
+
+
+def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
+    (tmp_path / "logged.py").write_text(MODEL)
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
+    agent = wiw.evaluation.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", revision="matcher")
+
+    def run(name, **options):
+        log = wiw.evaluate(task, agent, 3, out=tmp_path / name, progress=False, cache=tmp_path / "cache", **options)
+        lines = (tmp_path / "logged.log").read_text().count("asked")
+        facts = [(row["episode"], row["decision"], row["scores"], row["executed"]) for row in log.decisions]
+        return facts, lines
+
+    first, calls = run("a")
+    again, after = run("b", live=1)
+    assert calls > 0 and after == calls and again == first
+    uncached = wiw.evaluate(task, agent, 3, out=tmp_path / "c", progress=False, cache="off")
+    assert [(r["episode"], r["decision"], r["scores"], r["executed"]) for r in uncached.decisions] == first
+    assert (tmp_path / "logged.log").read_text().count("asked") > calls
