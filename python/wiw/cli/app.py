@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from collections.abc import Callable, Sequence
-from types import FrameType
 from typing import Any
 
 import tyro
@@ -19,6 +17,7 @@ from wiw.cli.names import list_names
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scenes import scenes
+from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
 from wiw.errors import Error
 
 DESCRIPTION = """Does a world model help an agent succeed, and by how much?
@@ -27,7 +26,10 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
   $ wiw run imagenav --world-model warp --episodes 50     one world model
   $ wiw run imagenav --world-model my_model.py:MyModel    your own
 
-`wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error."""
+`wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
+
+Exit codes: 0 done, 1 nothing could be judged, 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM, within 5 seconds;
+after both of these everything recorded is kept and `wiw resume` goes on."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
@@ -40,12 +42,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
 )
 
-EXIT_ERROR, EXIT_INTERRUPTED, EXIT_RESUME = 2, 130, 75
-"""75 is EX_TEMPFAIL: whoever stopped the run by SIGTERM, such as a batch system, may start `wiw resume`."""
-
-
-class Terminated(BaseException):
-    """SIGTERM has come; raised so that everything is closed on the way out."""
+EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,9 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given == ["--version"]:
         print(f"wiw {wiw.__version__}")
         return 0
-    before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        return _dispatch(given) or 0
+        with terminable():
+            return _dispatch(given) or 0
     except Error as error:
         if debug:
             raise
@@ -71,8 +68,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # e.g. `wiw list | head -1`
         sys.stderr.close()
         return 0
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _dispatch(arguments: Sequence[str]) -> Any:
@@ -82,7 +77,3 @@ def _dispatch(arguments: Sequence[str]) -> Any:
         app.command(name=name, help=None if named else line)(function)  # None: the function's own docstring
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
     return app.cli(prog="wiw", description=DESCRIPTION, args=arguments or ["--help"], config=config)
-
-
-def _terminate(number: int, frame: FrameType | None) -> None:
-    raise Terminated

@@ -26,7 +26,8 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     Args:
         out: Folder of the run; runs/demo-TIME if not given.
     """
-    from wiw.cli.run import finish, stoppable
+    from wiw.cli.run import finish
+    from wiw.cli.stop import stoppable
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 

@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
+
+from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
@@ -56,7 +57,7 @@ def run(
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
 
-    Ctrl-C or SIGTERM stops a run without loss; `wiw resume` goes on with it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
 
     Args:
         task: See `wiw list`.
@@ -133,18 +134,6 @@ def resume(
     from wiw.evaluation.evaluate import resume_run
 
     return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
-
-
-def stoppable(work: Callable[[], Any], folder: Path) -> Any:
-    """Does the work; when it is stopped, says how to go on with it."""
-    from wiw.evaluation.store import store_path
-
-    try:
-        return work()
-    except BaseException as stop:
-        if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
-            print(f"\nstopped; everything so far is kept. Go on with:  wiw resume {folder}", file=sys.stderr)
-        raise
 
 
 def finish(log: Any, report: bool) -> int:

@@ -20,6 +20,7 @@ from typing import Any
 
 import wiw
 from wiw.errors import StoreError
+from wiw.evaluation.faults import explained, remedy
 from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
@@ -67,9 +68,9 @@ class RunStore:
             raise StoreError(
                 f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
             ) from error
-        store = cls(path, _connect(path), _lock(path))
-        with _explained(path), store._connection as connection:
-            connection.execute("BEGIN IMMEDIATE")
+        lock = _lock(path)
+        store = cls(path, _connect(path, lock), lock)
+        with store._closed_on_error(), store._writing() as connection:
             for statement in _SCHEMA.read_text().split(";\n"):
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -100,20 +101,15 @@ class RunStore:
         path = store_path(run)
         lock = _lock(path) if path.exists() else None
         store = cls._open(path, lock)
-        if store.wiw_version != wiw.__version__:
-            raise StoreError(
-                f"{path} was begun by wiw {store.wiw_version}, this is {wiw.__version__}: results of two versions "
-                "must not be mixed; install that version or start a new run"
-            )
-        if config is not None:
-            _require_same(path, store.config, json.loads(to_json(config)))
-        with _explained(path), store._connection as connection:
-            connection.execute("BEGIN IMMEDIATE")
-            for table in ("decision", "image"):
-                connection.execute(
-                    f"DELETE FROM {table} AS d WHERE NOT EXISTS "
-                    "(SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)"
+        with store._closed_on_error():
+            if store.wiw_version != wiw.__version__:
+                raise StoreError(
+                    f"{path} was begun by wiw {store.wiw_version}, this is {wiw.__version__}: results of two versions "
+                    "must not be mixed; install that version or start a new run"
                 )
+            if config is not None:
+                _require_same(path, store.config, json.loads(to_json(config)))
+            store._discard_partial()
         return store
 
     def require_task(self, task: dict[str, Any]) -> None:
@@ -145,19 +141,30 @@ class RunStore:
     def _open(cls, path: Path, lock: Any) -> RunStore:
         if not path.is_file():
             raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
-        with _explained(path):
-            connection = _connect(path, read_only=lock is None)
-            (application,) = connection.execute("PRAGMA application_id").fetchone()
-            (version,) = connection.execute("PRAGMA user_version").fetchone()
-            if application != APPLICATION_ID:
-                raise StoreError(
-                    f"{path} is no run store of wiw (application id {application:#x}); was its creation cut off?"
-                )
-            if version != SCHEMA_VERSION:
-                raise StoreError(
-                    f"{path} has schema version {version}, this wiw reads {SCHEMA_VERSION}; use the wiw that wrote it"
-                )
-            return cls(path, connection, lock)
+        store = cls(path, _connect(path, lock), lock)
+        with store._closed_on_error():
+            store._require_whole()
+            store._require_readable()
+        return store
+
+    def _require_whole(self) -> None:
+        """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
+        pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
+        if self.path.stat().st_size < pages * size and not _has_log(self.path):
+            raise StoreError(f"{self.path}: the file is cut short; {remedy(self.path, 'malformed')}")
+
+    def _require_readable(self) -> None:
+        application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
+        if application != APPLICATION_ID:
+            raise StoreError(
+                f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
+                f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
+            )
+        if version != SCHEMA_VERSION:
+            raise StoreError(
+                f"{self.path} was written by wiw {self.wiw_version} with schema version {version}; this is wiw "
+                f"{wiw.__version__}, which reads version {SCHEMA_VERSION}: use the one that wrote it, or run anew"
+            )
 
     # -- what the run is -------------------------------------------------------------------------------------------
 
@@ -310,14 +317,30 @@ class RunStore:
 
     # -- inside ----------------------------------------------------------------------------------------------------
 
+    def _discard_partial(self) -> None:
+        with self._writing() as connection:
+            for table in ("decision", "image"):
+                connection.execute(
+                    f"DELETE FROM {table} AS d WHERE NOT EXISTS "
+                    "(SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)"
+                )
+
+    @contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        with _explained(self.path), self._connection as connection:
+        with explained(self.path), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[dict[str, Any]]:
-        with _explained(self.path):
+        with explained(self.path):
             return [dict(row) for row in self._connection.execute(query, values)]
 
     def _value(self, column: str) -> Any:
@@ -327,23 +350,51 @@ class RunStore:
         return rows[0][column]
 
 
-def _connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
-    with _explained(path):
-        mode = "ro" if read_only else "rwc"
-        uri = f"{path.absolute().as_uri()}?mode={mode}"
-        connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
-        connection.row_factory = sqlite3.Row
-        if not read_only:
-            connection.execute("PRAGMA journal_mode = WAL")
-            connection.execute("PRAGMA synchronous = NORMAL")
-            connection.execute("PRAGMA foreign_keys = ON")
+def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
+    """A connection; one that may write is for whoever holds the lock, which is given up if there can be none."""
+    try:
+        with explained(path):
+            return _opened(path, writing=lock is not None)
+    except StoreError:
+        if lock is not None:
+            lock.close()
+        raise
+
+
+def _opened(path: Path, writing: bool) -> sqlite3.Connection:
+    uri = f"{path.absolute().as_uri()}?mode={'rwc' if writing else 'ro'}"
+    connection = _plain(uri)
+    if writing:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA foreign_keys = ON")
         return connection
+    try:
+        connection.execute("SELECT 1 FROM sqlite_master")
+    except sqlite3.OperationalError:
+        connection.close()
+        if _has_log(path):
+            raise
+        return _plain(uri + "&immutable=1")  # a reader makes a small file too, for which a full disk has no room
+    return connection
+
+
+def _plain(uri: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
+    connection.row_factory = sqlite3.Row
+    return connection
+
+
+def _has_log(path: Path) -> bool:
+    """Whether transactions lie in the log beside the file."""
+    log = path.with_name(path.name + "-wal")
+    return log.exists() and log.stat().st_size > 0
 
 
 def _blank(path: Path) -> bool:
     """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
-    with _explained(path):
-        connection = _connect(path)
+    with explained(path):
+        connection = _opened(path, writing=True)  # also where it was cut off with a log that only a writer takes in
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
         connection.close()
     return bool(tables == 0)
@@ -351,24 +402,19 @@ def _blank(path: Path) -> bool:
 
 def _lock(path: Path) -> Any:
     """An advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
-    handle = path.with_suffix(".lock").open("w")
+    try:
+        handle = path.with_suffix(".lock").open("w")
+    except OSError as error:
+        raise StoreError(
+            f"cannot write in the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
+            "write there: make room, or choose another with out= or --out"
+        ) from error
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError:
         handle.close()
         raise StoreError(f"{path} is being written by another process; wait for it to end or stop it") from None
     return handle
-
-
-@contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.DatabaseError as error:
-        raise StoreError(
-            f"{path}: {error}; expected a readable, undamaged run store with room to write "
-            "(check the disk's free space, or restore the file)"
-        ) from error
 
 
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:

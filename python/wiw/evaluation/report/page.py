@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from wiw.evaluation.faults import whole_file
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories
 from wiw.evaluation.statistics import Difference, Estimate
@@ -26,10 +27,11 @@ def write_report(log: RunLog, path: Path) -> Path:
     """Writes a run's report.
 
     Raises:
-        OSError: the file cannot be written.
+        FileError: the file cannot be written; what was there before is kept.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(render(log), encoding="utf-8")
+    page = render(log)
+    with whole_file(path) as draft:
+        draft.write_text(page, encoding="utf-8")
     return path
 
 

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SIGTERM: the run is closed within seconds, whatever it is doing, and the exit code says that it can be resumed."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+EXIT_RESUME = 75
+"""EX_TEMPFAIL: whoever stopped the run, such as a batch system, may start `wiw resume`."""
+GRACE = 4.0
+"""Seconds for closing everything in order; after that the process ends, for each record is on disk once it is made."""
+
+
+class Terminated(BaseException):
+    """SIGTERM has come; raised so that everything is closed on the way out."""
+
+
+@contextmanager
+def terminable() -> Iterator[None]:
+    """Raises `Terminated` at the first SIGTERM; ends the process where the work does not get to it, as inside a model.
+
+    Python runs signal handlers between two of its own instructions, so a thread, told through a pipe, watches over it.
+    """
+    watch, tell = os.pipe()
+    os.set_blocking(tell, False)
+    done = threading.Event()
+    guard = threading.Thread(target=_guard, args=(watch, done), daemon=True)
+    handler, earlier = signal.signal(signal.SIGTERM, _terminate), signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    guard.start()
+    try:
+        yield
+    finally:
+        done.set()
+        signal.set_wakeup_fd(earlier)
+        signal.signal(signal.SIGTERM, handler)
+        os.close(tell)
+        guard.join()
+        os.close(watch)
+
+
+def _terminate(number: int, frame: FrameType | None) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not disturb the closing
+    raise Terminated
+
+
+def _guard(watch: int, done: threading.Event) -> None:
+    while number := os.read(watch, 1):
+        if number[0] == signal.SIGTERM and not done.wait(GRACE):
+            for worker in multiprocessing.active_children():
+                worker.kill()
+            print("wiw: stopped at once; all that was recorded is kept. Go on with `wiw resume`", file=sys.stderr)
+            sys.stderr.flush()
+            os._exit(EXIT_RESUME)
+
+
+def stoppable(work: Callable[[], Any], folder: Path) -> Any:
+    """Does the work; when it is stopped, says how to go on with it."""
+    from wiw.evaluation.store import store_path
+
+    try:
+        return work()
+    except BaseException as stop:
+        if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
+            print(f"\nstopped; everything so far is kept. Go on with:  wiw resume {folder}", file=sys.stderr)
+        raise

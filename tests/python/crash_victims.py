@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Processes to be killed. A server imports everything once and forks a victim a job, so that jobs start at once.
+
+On its standard input the server reads a job a line, JSON {"what", "out", "kill_after", ...}; it kills the victim after
+so many seconds, or lets it end where none are given, and answers [exit code (negative: the signal), what went wrong].
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+HERE = Path(__file__).parent
+EPISODES = 8
+
+
+class Victims:
+    """The test's side."""
+
+    def __init__(self):
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), *sys.path]), "OPENBLAS_NUM_THREADS": "1"}
+        self._server = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
+        assert self._line() == "ready"
+
+    def run(self, what, out, **options):
+        self._server.stdin.write(json.dumps({"what": what, "out": str(out), **options}) + "\n")
+        self._server.stdin.flush()
+        code, self.said = json.loads(self._line())
+        return code
+
+    def _line(self):
+        line = self._server.stdout.readline().strip()
+        assert line, "the server of victims has died"
+        return line
+
+    def close(self):
+        self._server.stdin.close()
+        self._server.wait(20)
+
+
+def evaluate(out, episodes=EPISODES, reported=None, **_):
+    """Begins a run or goes on with it; names each episode in `reported` once the store has said that it is kept."""
+    from fakes import LineAgent, LineTask
+
+    from wiw.evaluation.evaluate import run_arms
+    from wiw.evaluation.rows import OutcomeRow
+    from wiw.evaluation.store import RunStore
+
+    if reported is not None:
+        log, write = os.open(reported, os.O_WRONLY | os.O_CREAT | os.O_APPEND), RunStore.write
+
+        def write_and_tell(store, row):
+            write(store, row)
+            if isinstance(row, OutcomeRow):
+                os.write(log, f"{row.arm} {row.result.episode}\n".encode())
+
+        RunStore.write = write_and_tell
+    arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
+    run_arms(LineTask(), arms, episodes, out=out, progress=False, resume=True)
+
+
+def report(out, target, **_):
+    from wiw.evaluation.runlog import load_run
+
+    load_run(out).report(target)
+
+
+WORK = {"evaluate": evaluate, "report": report}
+
+
+def live(job, said):
+    """The victim's whole life; what went wrong goes to the pipe `said`."""
+    if "most_bytes" in job:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (job["most_bytes"],) * 2)
+    try:
+        WORK[job["what"]](**job)
+    except BaseException as error:
+        os.write(said, f"{type(error).__name__}: {error}".encode())
+        os._exit(1)
+    os._exit(0)
+
+
+def serve():
+    import cv2
+
+    cv2.setNumThreads(1)
+    import fakes  # noqa: F401 - everything that victims need is imported before they are forked
+
+    import wiw.evaluation.evaluate
+    import wiw.evaluation.report.page
+    import wiw.loop.scheduler  # noqa: F401
+
+    print("ready", flush=True)
+    for line in sys.stdin:
+        job = json.loads(line)
+        heard, said = os.pipe()
+        victim = os.fork()
+        if victim == 0:
+            os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+            os.dup2(2, 1)
+            live(job, said)
+        os.close(said)
+        if "kill_after" in job:
+            time.sleep(job["kill_after"])
+            os.kill(victim, signal.SIGKILL)  # a victim that has ended is there until it is waited for
+        with os.fdopen(heard, "rb") as pipe:
+            message = pipe.read().decode()
+        _, status = os.waitpid(victim, 0)
+        print(json.dumps([os.waitstatus_to_exitcode(status), message]), flush=True)
+
+
+if __name__ == "__main__":
+    serve()

@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Nothing is lost: runs are killed at random moments, and the disk is full at each of their writes in turn."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from crash_victims import EPISODES, Victims, evaluate
+
+from wiw.errors import FileError, StoreError
+from wiw.evaluation.faults import whole_file, whole_folder
+from wiw.evaluation.runlog import load_run
+from wiw.evaluation.store import RunStore, store_path
+
+KILLS_OF_RUNS = 140
+HERE = Path(__file__).parent
+
+
+def facts(run):
+    """Everything a run found out, without how long it took."""
+    with RunStore.read(run) as store:
+        rows = [{k: v for k, v in row.items() if k != "seconds"} for row in [*store.outcomes(), *store.decisions()]]
+        keys = [(row["arm"], row["episode"], row["decision"]) for row in store.decisions()]
+        return rows, [store.images(*key) for key in keys], store.episodes(), store.config
+
+
+def whole(run):
+    """Whether SQLite finds nothing wrong; the episodes that have ended."""
+    with RunStore.read(run) as store:
+        (row,) = store._rows("PRAGMA integrity_check")
+        assert row == {"integrity_check": "ok"}
+        assert store._rows("PRAGMA foreign_key_check") == []
+        return {(row["arm"], row["episode"]) for row in store.outcomes()}
+
+
+@pytest.fixture(scope="module")
+def victims():
+    server = Victims()
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    out = tmp_path_factory.mktemp("reference") / "run"
+    evaluate(out)
+    return out
+
+
+def seconds(victims, what, out, **options):
+    begin = time.monotonic()
+    assert victims.run(what, out, **options) == 0
+    return time.monotonic() - begin
+
+
+def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference, tmp_path):
+    expected, draw, kills, runs = facts(reference), random.Random(0), 0, 0
+    whole_time = max(seconds(victims, "evaluate", tmp_path / f"warm{i}") for i in range(2))
+    while kills < KILLS_OF_RUNS:
+        out, reported = tmp_path / f"run{runs}", tmp_path / f"reported{runs}"
+        runs, left, here = runs + 1, 1.0, 0
+        while here < 7:
+            after = draw.uniform(0, left * whole_time)
+            if victims.run("evaluate", out, reported=str(reported), kill_after=after) == 0:
+                whole_time *= 0.9  # the machine has become faster
+                break
+            kills, here = kills + 1, here + 1
+            kept = whole(out) if RunStore.begun(out) else set()
+            told = {(a, int(e)) for a, e in map(str.split, reported.read_text().splitlines())} if kept else set()
+            assert told <= kept
+            left = max(0.15, 1 - len(kept) / (2 * EPISODES))
+        assert victims.run("evaluate", out) == 0
+        assert facts(out) == expected
+        shutil.rmtree(out)
+    assert runs >= KILLS_OF_RUNS / 7
+
+
+def test_a_full_disk_at_each_write_in_turn_is_said_and_mended(victims, tmp_path):
+    """The limit on file size makes the first write beyond it fail, and with it every later one, as a full disk does."""
+    evaluate(tmp_path / "whole", episodes=3)
+    expected, told, limit = facts(tmp_path / "whole"), set(), 0
+    for limit in range(0, 1 << 22, 4096):
+        out = tmp_path / "run"
+        if victims.run("evaluate", out, episodes=3, most_bytes=limit) == 0:
+            break
+        assert victims.said.startswith("StoreError: ") and str(out) in victims.said and "make room" in victims.said
+        if RunStore.begun(out):
+            told.add(len(whole(out)))
+        assert victims.run("evaluate", out, episodes=3) == 0
+        assert facts(out) == expected
+        shutil.rmtree(out)
+    assert limit > 10 * 4096 and told >= {0, 1, 2, 3, 4, 5}
+
+
+def test_a_full_disk_leaves_what_was_written_before_readable(victims, tmp_path):
+    """A file system of 300 kB, where the machine lets us make one."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", disk]
+    if subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("making a small file system needs root and the right to mount")
+    try:
+        assert victims.run("evaluate", disk / "run", episodes=40) == 1
+        assert "full" in victims.said and f"wiw resume {disk / 'run'}" in victims.said
+        kept = whole(disk / "run")
+        assert kept
+        subprocess.run(["mount", "-o", "remount,size=20m", disk], check=True)
+        assert victims.run("evaluate", disk / "run", episodes=40) == 0
+        assert kept < whole(disk / "run")
+    finally:
+        subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_report_that_does_not_fit_leaves_the_old_one(victims, reference, tmp_path):
+    (tmp_path / "report.html").write_text("old")
+    assert victims.run("report", reference, target=str(tmp_path / "report.html"), most_bytes=8192) == 1
+    assert victims.said.startswith("FileError: ") and "report.html: cannot be written" in victims.said
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"
+
+
+@pytest.mark.parametrize("share", [0.02, 0.1, 0.35, 0.6, 0.9, 0.999])
+def test_a_store_cut_short_is_named_with_what_to_do(reference, tmp_path, share):
+    data = store_path(reference).read_bytes()
+    path = tmp_path / "run.sqlite"
+    path.write_bytes(data[: int(share * len(data))])
+    for use in (load_run, RunStore.resume):
+        with pytest.raises(
+            StoreError, match=r"run\.sqlite.*(malformed|not a database|cut short).*bring back run\.sqlite"
+        ):
+            use(tmp_path)
+
+
+def test_a_store_of_another_version_says_which_wiw_wrote_it(reference, tmp_path):
+    shutil.copy(store_path(reference), tmp_path / "run.sqlite")
+    with sqlite3.connect(tmp_path / "run.sqlite") as other:
+        other.execute("PRAGMA user_version = 99")
+        other.execute("UPDATE run SET wiw_version = '9.9'")
+    with pytest.raises(StoreError, match=r"run\.sqlite was written by wiw 9\.9 with schema version 99.*use the one"):
+        load_run(tmp_path)
+    with pytest.raises(StoreError, match="schema version 99"):
+        RunStore.resume(tmp_path)
+
+
+def test_a_store_that_could_not_be_opened_is_not_held(reference, tmp_path):
+    """An error on the way leaves no lock behind, so that the next try may write."""
+    shutil.copy(store_path(reference), tmp_path / "run.sqlite")
+    with pytest.raises(StoreError, match="another configuration") as kept:
+        RunStore.resume(tmp_path, {"seed": 5})
+    RunStore.resume(tmp_path).close()
+    assert kept.value.__traceback__ is not None
+
+
+def test_files_are_whole_or_not_there(tmp_path):
+    target, folder = tmp_path / "a.txt", tmp_path / "tables"
+    (tmp_path / ".a.txt.999999999.part").write_text("of a writer that was killed")
+    with whole_file(target) as draft:
+        draft.write_text("first")
+        assert not target.exists()
+    with pytest.raises(ZeroDivisionError), whole_file(target) as draft:
+        draft.write_text("half")
+        raise ZeroDivisionError
+    with whole_folder(folder) as draft:
+        (draft / "x").write_text("x")
+        assert not folder.exists()
+    with pytest.raises(FileError, match=r"tables holds something already.*name another"), whole_folder(folder):
+        pass
+    assert target.read_text() == "first" and sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "tables"]
+
+
+STUCK = """
+import hashlib, sys
+sys.path.insert(0, {here!r})
+from fakes import LineEnv, LineTask
+
+class Env(LineEnv):
+    def run(self, actions):
+        if self.actions >= 6:  # some minutes of C code that no signal handler interrupts
+            open({mark!r}, "w").close()
+            hashlib.pbkdf2_hmac("sha256", b"", b"", 1_000_000_000)
+        return super().run(actions)
+
+class Stuck(LineTask):
+    def environment(self, depth=False):
+        return Env(self)
+
+def task(scenes="", seed=0, preset="", backend="", **rules):
+    return Stuck(seed=seed)
+"""
+
+
+def test_sigterm_ends_a_run_within_5_seconds_whatever_it_is_doing(tmp_path):
+    mark, out = tmp_path / "stuck", tmp_path / "run"
+    (tmp_path / "stuck.py").write_text(STUCK.format(here=str(HERE), mark=str(mark)))
+    command = [sys.executable, "-m", "wiw.cli", "run", f"{tmp_path / 'stuck.py'}:task", "--policy", "heuristic"]
+    process = subprocess.Popen(
+        [*command, "--out", out, "--episodes", "3", "--live", "1"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    while not mark.exists() and process.poll() is None:
+        time.sleep(0.02)
+    process.terminate()
+    begin = time.monotonic()
+    _, shown = process.communicate(timeout=30)
+    assert process.returncode == 75 and time.monotonic() - begin < 5.5, shown
+    assert "wiw resume" in shown and "Traceback" not in shown
+    assert whole(out) == set() and RunStore.begun(out)
