@@ -18,6 +18,7 @@ from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scenes import scenes
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
+from wiw.cli.view import view
 from wiw.errors import Error
 
 DESCRIPTION = """Does a world model help an agent succeed, and by how much?
@@ -37,6 +38,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
     (report, "report", "Table and HTML report of a run."),
+    (view, "view", "Pages to walk through a run, to every decision."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),

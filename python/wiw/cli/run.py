@@ -43,7 +43,7 @@ def run(
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     live: Count = 4,
-    keep_images: Count = 2,
+    keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2,
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
     cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
@@ -82,7 +82,7 @@ def run(
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
-        keep_images: Episodes that keep pictures for the report.
+        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`; all: every one, at 0.2 MB a decision.
         deadline: Most seconds for a call of the world model, 600 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare

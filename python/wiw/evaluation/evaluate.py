@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from wiw.errors import ArgumentError, Error, InfrastructureError, StoreError
 from wiw.evaluation.platform import describe_platform
@@ -35,7 +35,7 @@ def evaluate(
     arms: Sequence[str] | None = None,
     *,
     live: int = 4,
-    keep_images: int = 2,
+    keep_images: int | Literal["all"] = 2,
     resume: bool = False,
     deadline: float | None = None,
     cache: str | Path | None = None,
@@ -61,7 +61,7 @@ def evaluate(
         arms: world models to run on the same episodes with this agent's policies, or "policy+model" for one with
             another built-in policy, such as "heuristic+none"; None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
-        keep_images: how many episodes keep pictures for the report, spread evenly.
+        keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one.
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
             600 unless it was given another.
@@ -90,7 +90,7 @@ def run_arms(
     progress: bool = True,
     *,
     live: int = 4,
-    keep_images: int = 2,
+    keep_images: int | Literal["all"] = 2,
     resume: bool = False,
     deadline: float | None = None,
     cache: str | Path | None = None,
@@ -154,19 +154,25 @@ class _Options:
     workers: int
     progress: bool
     live: int
-    keep_images: int
+    keep_images: int | Literal["all"]
     resume: bool
     deadline: float | None
     cache: str | Path | None
     cache_gb: float | None
 
     def __post_init__(self) -> None:
-        for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
+        for name, least in (("episodes", 1), ("workers", 1), ("live", 1)):
             _at_least(name, getattr(self, name), least)
+        _at_least("keep_images", self.pictures, 0)
         if self.deadline is not None and not self.deadline > 0:
             raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
         if self.cache_gb is not None and not self.cache_gb > 0:
             raise ArgumentError(f"evaluate: expected a cache_gb above 0, got {self.cache_gb}")
+
+    @property
+    def pictures(self) -> int:
+        """How many episodes keep pictures."""
+        return self.episodes if self.keep_images == "all" else self.keep_images
 
     @property
     def limits(self) -> dict[str, Any]:
@@ -204,7 +210,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
-            "pictures": _spread(options.episodes, options.keep_images),
+            "pictures": _spread(options.episodes, options.pictures),
             "scenes": used,
             "live": options.live,
             "workers": options.workers,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -57,13 +57,17 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """The same for a folder, which is new: an empty one beside `path` that becomes `path` once all is in it.
+def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: False) -> Iterator[Path]:
+    """The same for a folder: an empty one beside `path` that becomes `path` once all is in it.
+
+    Args:
+        path: a folder that is not there yet, is empty, or that `replace` says may be replaced.
+        replace: told what `path` holds.
 
     Raises:
         FileError: `path` holds something already, or cannot be written.
     """
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+    if path.exists() and (not path.is_dir() or (any(path.iterdir()) and not replace(path))):
         raise FileError(f"{path} holds something already; expected a folder that is new or empty: name another")
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     with _written(path, draft):
@@ -71,10 +75,10 @@ def whole_folder(path: Path) -> Iterator[Path]:
         _sweep(path)
         draft.mkdir()
         yield draft
-        for file in sorted(draft.rglob("*")):
-            if file.is_file():
-                _sync(file)
+        if path.is_dir() and any(path.iterdir()):
+            path.rename(_old(path))
         draft.replace(path)
+        _remove(_old(path))
 
 
 @contextmanager
@@ -88,6 +92,11 @@ def _written(path: Path, draft: Path) -> Iterator[None]:
         ) from error
     finally:
         _remove(draft)
+
+
+def _old(path: Path) -> Path:
+    """Where a folder that is replaced stays until the new one is in its place."""
+    return path.with_name(f".{path.name}.old.{os.getpid()}.part")
 
 
 def _sweep(path: Path) -> None:

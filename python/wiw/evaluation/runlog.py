@@ -107,6 +107,12 @@ class RunLog:
 
         return write_report(self, Path(path) if path is not None else self.path / "report.html")
 
+    def view(self, folder: str | Path | None = None) -> Path:
+        """Writes pages to walk through all episodes and decisions; returns the one to open, `view/index.html`."""
+        from wiw.evaluation.view import write_view
+
+        return write_view(self, Path(folder) if folder is not None else self.path / "view").index
+
     def close(self) -> None:
         """Closes the run's file."""
         self.store.close()

@@ -35,7 +35,18 @@ BAND = (0.2, 0.8)
 """Rows of a panorama that are shown: 54 degrees up and down; the rest is ceiling and floor."""
 FRONT = (0.25, 0.75)
 """Columns of an imagined panorama that are shown: the front half, where the plan leads."""
-PANORAMA_WIDTH, FRAME_HEIGHT, GAP, QUALITY = 760, 104, 3, 68
+GAP = 3
+"""Pixels between the frames of a strip."""
+
+
+class Album:
+    """Where the pictures of a page go: into the page itself, as data URIs."""
+
+    panorama_width, frame_height, quality = 760, 104, 68
+
+    def put(self, name: str, kind: str, data: bytes) -> str:
+        """What an `src` attribute says of a picture; `name` tells it from the others of the run."""
+        return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
 
 @dataclass(frozen=True)
@@ -49,7 +60,9 @@ class Candidate:
     chosen: bool
     note: str
     strip: str | None
-    """Data URI."""
+    """What was imagined; as `Album.put` says."""
+    true: str | None
+    """What would really have been seen."""
     real_frames: int
     """How many leading frames are the real view turned."""
     frames: int
@@ -70,6 +83,7 @@ class Step:
     """Metres of shortest way to the goal; straight-line where there is no way."""
     note: str
     seconds: Mapping[str, float]
+    calls: Mapping[str, float]
 
     @property
     def gain(self) -> float:
@@ -121,7 +135,7 @@ class Story:
     @property
     def place(self) -> str:
         """The scene's name without its folders."""
-        return self.episode.scene if self.episode.scene.startswith("apartments:") else Path(self.episode.scene).name
+        return place(self.episode.scene)
 
     @property
     def way(self) -> str:
@@ -132,32 +146,48 @@ class Story:
 
 def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
     """The episodes that keep pictures and have ended, and the scene maps by id as data URIs."""
-    outcomes = {(row["arm"], row["episode"]): row for row in store.outcomes()}
-    episodes, pictures, told = store.episodes(), dict[str, str](), list[Story]()
-    for index in store.info["pictures"]:
-        ended = [arm for arm in arms if (arm, index) in outcomes]
-        if ended:
-            told.append(_story(store, index, episodes[index], {arm: outcomes[arm, index] for arm in ended}, pictures))
-    return told, pictures
+    outcomes = outcomes_by_episode(store, arms)
+    episodes, pictures = store.episodes(), dict[str, str]()
+    kept = [index for index in store.info["pictures"] if outcomes.get(index)]
+    return [tell(store, index, episodes[index], outcomes[index], pictures, Album()) for index in kept], pictures
 
 
-def _story(
-    store: RunStore, index: int, episode: Episode, outcomes: Mapping[str, Mapping[str, Any]], pictures: dict[str, str]
+def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
+    """How each episode ended, by arm in the order of `arms`; episodes that no arm has ended are left out."""
+    by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    found: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for index in sorted({episode for _, episode in by_arm}):
+        found[index] = {arm: by_arm[arm, index] for arm in arms if (arm, index) in by_arm}
+    return found
+
+
+def tell(
+    store: RunStore,
+    index: int,
+    episode: Episode,
+    outcomes: Mapping[str, Mapping[str, Any]],
+    pictures: dict[str, str],
+    album: Album,
 ) -> Story:
+    """One episode; its scene's map joins `pictures`."""
     decisions = {arm: store.decisions(arm, index) for arm in outcomes}
     kept = store.scene_map(episode.scene)
     if kept is not None:
         webp, matrix = kept
         frame = frame_of_picture(Image.open(io.BytesIO(webp)).size, matrix)
         picture = f"scene-{list(store_scenes(store)).index(episode.scene)}"
-        pictures[picture] = _uri("webp", webp)
+        pictures[picture] = album.put(picture, "webp", webp)
     else:
         frame = frame_of_points(all_points(episode, [row for rows in decisions.values() for row in rows]))
         picture = None
-    attempts = tuple(_attempt(store, frame, outcome, decisions[arm]) for arm, outcome in outcomes.items())
+    attempts = tuple(
+        _attempt(store, frame, outcome, decisions[arm], album, f"{index}-{number}")
+        for number, (arm, outcome) in enumerate(outcomes.items())
+    )
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
     start, end = start_and_goal(frame, episode)
-    return Story(index, episode, _uri("jpeg", goal) if goal else None, picture, frame, start, end, attempts)
+    shown = album.put(f"{index}-goal", "jpeg", goal) if goal else None
+    return Story(index, episode, shown, picture, frame, start, end, attempts)
 
 
 def store_scenes(store: RunStore) -> dict[str, None]:
@@ -165,25 +195,41 @@ def store_scenes(store: RunStore) -> dict[str, None]:
     return dict.fromkeys(episode.scene for episode in store.episodes())
 
 
-def _attempt(store: RunStore, frame: MapFrame, outcome: Mapping[str, Any], decisions: list[dict[str, Any]]) -> Attempt:
+def place(scene: str) -> str:
+    """A scene's name without its folders."""
+    return scene if scene.startswith("apartments:") else Path(scene).name
+
+
+def _attempt(
+    store: RunStore,
+    frame: MapFrame,
+    outcome: Mapping[str, Any],
+    decisions: list[dict[str, Any]],
+    album: Album,
+    name: str,
+) -> Attempt:
     arm = outcome["arm"]
-    steps = tuple(_step(row, store.images(arm, row["episode"], row["decision"])) for row in decisions)
+    steps = tuple(
+        _step(row, store.images(arm, row["episode"], row["decision"]), album, f"{name}-{row['decision']}")
+        for row in decisions
+    )
     return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None)
 
 
-def _step(row: Mapping[str, Any], images: Mapping[str, bytes]) -> Step:
+def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, name: str) -> Step:
     panorama = images.get("panorama")
     written_anew = row["chosen"] is None
     return Step(
         row["decision"] + 1,
         glyphs(row["executed"]),
-        _panorama(panorama) if panorama else None,
-        tuple(_candidates(row, images)),
+        _panorama(panorama, album, f"{name}-seen") if panorama else None,
+        tuple(_candidates(row, images, album, name)),
         glyphs(row["actions"]) if written_anew else "",
         _way(row, "before"),
         _way(row, "after"),
         row["note"],
         row["seconds"],
+        row["calls"],
     )
 
 
@@ -192,15 +238,20 @@ def _way(row: Mapping[str, Any], when: str) -> float:
     return geodesic if geodesic is not None and np.isfinite(geodesic) else row[f"{when}_distance"]
 
 
-def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes]) -> list[Candidate]:
+def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, name: str) -> list[Candidate]:
     proposals = row["proposals"]
     scores = row["scores"] or [None] * len(proposals)
     finite = [score for score in scores if score is not None]
     low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
     found = []
     for index, (proposal, score) in enumerate(zip(proposals, scores, strict=True)):
-        strip = images.get(f"imagined/{index}")
+        strips = {kind: images.get(f"{kind}/{index}") for kind in ("imagined", "true")}
         real = row["real_frames"][index] if row["real_frames"] else []
+        shown = {
+            kind: _strip(jpeg, len(real) or len(proposal["actions"]), album, f"{name}-{kind}-{index}")
+            for kind, jpeg in strips.items()
+            if jpeg
+        }
         share = (score - low) / (high - low) if score is not None and high > low else 1.0
         found.append(
             Candidate(
@@ -209,7 +260,8 @@ def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes]) -> list[Can
                 share,
                 index == row["chosen"],
                 proposal["note"],
-                _strip(strip, len(real)) if strip else None,
+                shown.get("imagined"),
+                shown.get("true"),
                 sum(real),
                 len(real),
             )
@@ -222,20 +274,20 @@ def glyphs(actions: Sequence[int]) -> str:
     return "".join(GLYPHS.get(action, f"({action})") for action in actions)
 
 
-def _panorama(jpeg: bytes) -> str:
+def _panorama(jpeg: bytes, album: Album, name: str) -> str:
     band = _part(decode_jpeg(jpeg), BAND, (0, 1))
-    return _jpeg(band, min(1.0, PANORAMA_WIDTH / band.shape[1]))
+    return _jpeg(band, min(1.0, album.panorama_width / band.shape[1]), album, name)
 
 
-def _strip(jpeg: bytes, frames: int) -> str:
-    """Imagined frames side by side; of panoramas only the part towards which the agent looks."""
+def _strip(jpeg: bytes, frames: int, album: Album, name: str) -> str:
+    """Frames side by side; of panoramas only the part towards which the agent looks."""
     image = decode_jpeg(jpeg)
     tiles = np.split(image, frames, axis=1)
     if tiles[0].shape[1] > 1.6 * tiles[0].shape[0]:
         tiles = [_part(tile, BAND, FRONT) for tile in tiles]
     gap = np.full((len(tiles[0]), GAP, 3), 255, np.uint8)
     spaced = np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1)
-    return _jpeg(spaced, min(1.0, FRAME_HEIGHT / len(spaced)))
+    return _jpeg(spaced, min(1.0, album.frame_height / len(spaced)), album, name)
 
 
 def _part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[float, float]) -> NDArray[np.uint8]:
@@ -245,11 +297,7 @@ def _part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[fl
     ]
 
 
-def _jpeg(image: NDArray[np.uint8], scale: float) -> str:
+def _jpeg(image: NDArray[np.uint8], scale: float, album: Album, name: str) -> str:
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    return _uri("jpeg", encode_jpeg(image, QUALITY))
-
-
-def _uri(kind: str, data: bytes) -> str:
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+    return album.put(name, "jpeg", encode_jpeg(image, album.quality))

@@ -6,18 +6,17 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from wiw.evaluation.faults import whole_file
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories
-from wiw.evaluation.statistics import Difference, Estimate
-from wiw.evaluation.summary import Summary, column_title, notes, show_p, shown_headlines
+from wiw.evaluation.report.templating import environment, signed
+from wiw.evaluation.statistics import Difference
+from wiw.evaluation.summary import Summary, notes, shown_headlines
 
 if TYPE_CHECKING:
     from wiw.evaluation.runlog import RunLog
@@ -40,7 +39,7 @@ def render(log: RunLog) -> str:
     summary, config, info = log.numbers(), log.store.config, log.store.info
     told, pictures = stories(log.store, log.arms)
     return (
-        _environment()
+        environment()
         .get_template("page.html.j2")
         .render(
             **_common(summary),
@@ -63,7 +62,7 @@ def render(log: RunLog) -> str:
 
 def summary_html(summary: Summary) -> str:
     """The tables alone, for Jupyter."""
-    return _environment().get_template("summary.html.j2").render(**_common(summary))
+    return environment().get_template("summary.html.j2").render(**_common(summary))
 
 
 def sentence(summary: Summary) -> str:
@@ -87,11 +86,6 @@ def _verdict(difference: Difference | None) -> str:
     if found.excludes_zero:
         return f", {against} ({interval})."
     return f", {against}; with so few episodes that may be chance ({interval})."
-
-
-def signed(value: float) -> str:
-    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
-    return f"{value:+.1f}".replace("-", "\u2212")
 
 
 def _found(summary: Summary, arm: str, base: str) -> Difference | None:
@@ -144,34 +138,3 @@ def _plots(log: RunLog, summary: Summary) -> list[tuple[str, str, Markup]]:
             ("Decisions to success", "How soon the goal is reached.", plots.decisions_to_success(done, budget))
         )
     return found
-
-
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("wiw.evaluation.report"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"column": column_title, "p": show_p, "asset": _asset, "signed": signed, "how": _how}
-    environment.tests["binding"] = _binding
-    return environment
-
-
-def _how(estimate: Estimate) -> str:
-    """How an interval was made, and the second opinion on it."""
-    if estimate.bootstrap is None:
-        return estimate.method
-    low, high = estimate.bootstrap
-    return f"{estimate.method}; bootstrap over scenes: {low:.1f} to {high:.1f}"
-
-
-def _binding(estimate: Estimate) -> bool:
-    return estimate.excludes_zero
-
-
-def _asset(name: str) -> Markup:
-    """A style sheet or script of this package, as it is."""
-    return Markup((Path(__file__).parent / "templates" / name).read_text(encoding="utf-8"))

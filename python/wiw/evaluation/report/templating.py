@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How templates of pages are filled: everything is escaped, and a name that is missing is an error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import files
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from wiw.evaluation.statistics import Estimate
+from wiw.evaluation.summary import column_title, show_p
+
+REPORT = "wiw.evaluation.report"
+
+
+@cache
+def environment(*packages: str) -> Environment:
+    """Templates of these packages, and of the report's for what several pages have in common."""
+    homes = tuple(dict.fromkeys([*packages, REPORT]))
+    made = Environment(
+        loader=ChoiceLoader([PackageLoader(home) for home in homes]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how}
+    made.filters["asset"] = lambda name: _asset(homes, name)
+    made.tests["binding"] = _binding
+    return made
+
+
+def signed(value: float) -> str:
+    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
+    return f"{value:+.1f}".replace("-", "\u2212")
+
+
+def _how(estimate: Estimate) -> str:
+    """How an interval was made, and the second opinion on it."""
+    if estimate.bootstrap is None:
+        return estimate.method
+    low, high = estimate.bootstrap
+    return f"{estimate.method}; bootstrap over scenes: {low:.1f} to {high:.1f}"
+
+
+def _binding(estimate: Estimate) -> bool:
+    return estimate.excludes_zero
+
+
+def _asset(homes: Sequence[str], name: str) -> Markup:
+    """A style sheet or script of the packages, as it is."""
+    found = next(path for home in homes if (path := files(home) / "templates" / name).is_file())
+    return Markup(found.read_text(encoding="utf-8"))

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes the list and the episodes' pages; pictures lie beside them, so that a page opens at once in a run of any size.
+
+The report is one file about the results, with a few episodes for example; this is for finding and opening any decision.
+Both draw an episode from the same values and template parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wiw.evaluation.faults import whole_folder
+from wiw.evaluation.report.episodes import Album, Story, outcomes_by_episode, place, tell
+from wiw.evaluation.report.plots import arm_colors
+from wiw.evaluation.report.templating import environment
+from wiw.types import Episode
+
+if TYPE_CHECKING:
+    from wiw.evaluation.runlog import RunLog
+
+
+class Beside(Album):
+    """Pictures as files of a folder, each written once."""
+
+    panorama_width, frame_height, quality = 1024, 132, 76
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._folder.mkdir()
+        self.count = self.size = 0
+
+    def put(self, name: str, kind: str, data: bytes) -> str:
+        """The picture's address, seen from an episode's page. Names are numbers and our own words, never the run's."""
+        file = self._folder / f"{name}.{'jpg' if kind == 'jpeg' else kind}"
+        if not file.exists():
+            file.write_bytes(data)
+            self.count, self.size = self.count + 1, self.size + len(data)
+        return f"../{self._folder.name}/{file.name}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How an episode ended in one arm, for the list."""
+
+    arm: str
+    state: str
+    """"reached", "missed", "failed" (infrastructure) or "open" (not run yet)."""
+    text: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """One episode in the list."""
+
+    index: int
+    episode: Episode
+    place: str
+    cells: tuple[Cell, ...]
+    pictures: bool
+
+    @property
+    def file(self) -> str:
+        """Its page's name."""
+        return f"{self.index:04d}.html"
+
+    @property
+    def told(self) -> bool:
+        """Whether there is a page: an arm has ended it."""
+        return any(cell.state != "open" for cell in self.cells)
+
+
+@dataclass(frozen=True)
+class Site:
+    """What was written."""
+
+    index: Path
+    """The page to open."""
+    episodes: int
+    pictures: int
+    size: int
+    """Bytes of pictures."""
+
+
+def write_view(log: RunLog, folder: Path) -> Site:
+    """Writes `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
+
+    Raises:
+        FileError: the folder holds something that is no view, or cannot be written.
+    """
+    with whole_folder(folder, replace=is_view) as draft:
+        album = Beside(draft / "images")
+        pages = draft / "episodes"
+        pages.mkdir()
+        lines = _lines(log)
+        common = _common(log)
+        (draft / "index.html").write_text(_index(log, lines, common), encoding="utf-8")
+        told = [line for line in lines if line.told]
+        outcomes = outcomes_by_episode(log.store, log.arms)
+        for number, line in enumerate(told):
+            scenes: dict[str, str] = {}
+            story = tell(log.store, line.index, line.episode, outcomes[line.index], scenes, album)
+            around = {"before": told[number - 1] if number else None, "after": (told[number + 1 :] or [None])[0]}
+            (pages / line.file).write_text(_episode(story, scenes, {**common, **around}), encoding="utf-8")
+    return Site(folder / "index.html", len(told), album.count, album.size)
+
+
+def is_view(folder: Path) -> bool:
+    """Whether a folder holds a view and nothing else, so that a new one may take its place."""
+    return (folder / "index.html").is_file() and {path.name for path in folder.iterdir()} <= {
+        "index.html",
+        "episodes",
+        "images",
+    }
+
+
+def _index(log: RunLog, lines: list[Line], common: Mapping[str, Any]) -> str:
+    template = environment("wiw.evaluation.view").get_template("index.html.j2")
+    return template.render(**common, lines=lines, scenes=list(dict.fromkeys(line.episode.scene for line in lines)))
+
+
+def _episode(story: Story, scenes: Mapping[str, str], values: Mapping[str, Any]) -> str:
+    template = environment("wiw.evaluation.view").get_template("episode_page.html.j2")
+    return template.render(**values, story=story, pictures=scenes)
+
+
+def _common(log: RunLog) -> dict[str, Any]:
+    task = log.store.config["task"]
+    return {
+        "title": f"{task.get('task', 'run')} · {log.path.name}",
+        "arms": log.arms,
+        "colors": arm_colors(log.arms),
+        "radius": task.get("radius"),
+        "place": place,
+    }
+
+
+def _lines(log: RunLog) -> list[Line]:
+    outcomes, pictures = outcomes_by_episode(log.store, log.arms), set(log.store.info["pictures"])
+    return [
+        Line(
+            index,
+            episode,
+            place(episode.scene),
+            tuple(_cell(arm, outcomes.get(index, {}).get(arm)) for arm in log.arms),
+            index in pictures,
+        )
+        for index, episode in enumerate(log.store.episodes())
+    ]
+
+
+def _cell(arm: str, outcome: Mapping[str, Any] | None) -> Cell:
+    if outcome is None:
+        return Cell(arm, "open", "to run")
+    if outcome["status"] == "failed":
+        return Cell(arm, "failed", "failed")
+    metrics = outcome["metrics"]
+    count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
+    if metrics.get("success"):
+        return Cell(arm, "reached", count)
+    left = f"{metrics['distance_to_goal']:.1f} m" if "distance_to_goal" in metrics else count
+    return Cell(arm, "missed", left)
