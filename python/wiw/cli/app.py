@@ -29,7 +29,7 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
-Exit codes: 0 done, 1 nothing could be judged, 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM, within 5 seconds;
+Exit codes: 0 done, 1 the run is invalid, 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM, within 5 seconds;
 after both of these everything recorded is kept and `wiw resume` goes on."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (

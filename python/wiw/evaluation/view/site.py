@@ -102,8 +102,9 @@ def write_view(log: RunLog, folder: Path) -> Site:
         for number, line in enumerate(told):
             scenes: dict[str, str] = {}
             story = tell(log.store, line.index, line.episode, outcomes[line.index], scenes, album)
-            around = {"before": told[number - 1] if number else None, "after": (told[number + 1 :] or [None])[0]}
-            (pages / line.file).write_text(_episode(story, scenes, {**common, **around}), encoding="utf-8")
+            common |= {"before": told[number - 1] if number else None}
+            common |= {"after": told[number + 1] if number + 1 < len(told) else None}
+            (pages / line.file).write_text(_episode(story, scenes, common), encoding="utf-8")
     return Site(folder / "index.html", len(told), album.count, album.size)
 
 
