@@ -33,6 +33,7 @@ __all__ = [
     "nav",
     "panorama",
     "policy",
+    "power",
     "registry",
     "render",
     "reproject",
@@ -53,6 +54,7 @@ _HOME = {
     "make": "wiw.registry",
     "make_vec": "wiw.registry",
     "policy": "wiw.registry",
+    "power": "wiw.evaluation.power",
     "show": "wiw.viz.show",
     "world_model": "wiw.registry",
 }
@@ -74,6 +76,7 @@ def __dir__() -> list[str]:
 if TYPE_CHECKING:
     from wiw import action, annotate, envs, errors, metrics, nav, panorama, registry, render, reproject, scenes, types
     from wiw.evaluation.evaluate import evaluate
+    from wiw.evaluation.power import power
     from wiw.evaluation.runlog import load_run
     from wiw.loop.agent import Agent
     from wiw.policies.base import Policy

@@ -14,6 +14,7 @@ from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.names import list_names
+from wiw.cli.power import power
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scenes import scenes
@@ -37,6 +38,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
+    (power, "power", "How many episodes a run needs to show a difference."),
     (report, "report", "Table and HTML report of a run."),
     (view, "view", "Pages to walk through a run, to every decision."),
     (doctor, "doctor", "What this machine can do, and what to mend."),

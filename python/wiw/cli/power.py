@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw power`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg
+
+if TYPE_CHECKING:
+    from wiw.evaluation.power import Power
+
+Number = Annotated[float, arg(metavar="X")]
+Count = Annotated[int, arg(metavar="N")]
+USUAL = (5.0, 10.0, 15.0, 20.0, 30.0)
+
+
+def power(
+    difference: Positional[Annotated[float | None, arg(metavar="POINTS")]] = None,
+    /,
+    *,
+    base: Number = 20.0,
+    losses: Number = 2.0,
+    correlation: Number = 0.03,
+    per_scene: Count = 5,
+    chance: Number = 0.8,
+    arms: Count = 1,
+) -> int:
+    """How many episodes a run needs to show that one arm succeeds more often than another.
+
+      $ wiw power                        # for differences from 5 to 30 points
+      $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
+      $ wiw power 10 --arms 4            # as one of four arms compared with the same base
+      $ wiw power -5 --base 50         # an arm that is 5 points worse
+
+    Two arms of a run meet on the same episodes, so only those count in which one succeeds and the other does not: won
+    or lost. 30 % won and 20 % lost are as many points as 12 % won and 2 % lost, and far weaker evidence, so --losses
+    matters as much as the difference. Scenes count more than episodes: with a correlation above 0, more episodes of
+    the same scenes soon stop helping.
+
+    The defaults are what 210 episodes in 42 generated apartments showed: 20 % without a world model; with the oracle
+    33 % won and 2 % lost; a correlation within apartments of at most 0.03.
+
+    Args:
+        difference: In points of success rate; a table of usual ones if not given.
+        base: Success rate of the arm compared with, percent.
+        losses: Percent of episodes that the better arm loses.
+        correlation: Between the differences of two episodes of a scene.
+        per_scene: Episodes in each scene.
+        chance: Of showing the difference if there is one.
+        arms: Compared with the same base, whose p values Holm adjusts.
+    """
+    from wiw.evaluation.power import power as plan
+
+    def planned(points: float) -> Power:
+        return plan(
+            points, base=base, losses=losses, correlation=correlation, per_scene=per_scene, chance=chance, arms=arms
+        )
+
+    if difference is not None:
+        print(planned(difference))
+        return 0
+    _table([planned(points) for points in USUAL if base + points + losses <= 100], chance)
+    return 0
+
+
+def _table(plans: Sequence[Power], chance: float) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(
+        title=f"Needed to show a difference with a chance of {100 * chance:g} %",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+    )
+    for column in ("points", "won/lost %", "scenes", "episodes", "by interval %", "by McNemar %"):
+        table.add_column(column, justify="right")
+    for one in plans:
+        table.add_row(
+            f"{one.difference:+g}",
+            f"{one.wins:g}/{one.losses:g}",
+            str(one.scenes),
+            str(one.episodes),
+            f"{100 * one.by_interval:.0f}",
+            f"{100 * one.by_test:.0f}",
+        )
+    Console().print(table)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Made-up runs, whose truth is known: to plan real ones, and to measure what intervals are worth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+def draw(
+    shares: ArrayLike, scenes: int, per_scene: int, correlation: float, runs: int, rng: np.random.Generator
+) -> NDArray[np.int64]:
+    """How many episodes of each scene end in each way, int64 [runs, scenes, ways].
+
+    Each scene has its own shares, drawn from a Dirichlet distribution around the true ones, so that any number made of
+    the ways (a success rate, a difference of arms) has the same correlation between episodes of a scene.
+
+    Args:
+        shares: float [ways], sum 1: how often an episode ends in each way, e.g. both arms succeed, only the first does.
+        scenes: in each run.
+        per_scene: episodes in each scene.
+        correlation: between two episodes of a scene, in [0, 1); 0: scenes are alike.
+        runs: how many.
+        rng: what is drawn from.
+    """
+    truth = np.asarray(shares, np.float64)
+    local = np.broadcast_to(truth, (runs, scenes, len(truth)))
+    if correlation > 0:
+        weights = rng.gamma((1 - correlation) / correlation * truth, size=local.shape)
+        local = weights / weights.sum(-1, keepdims=True)
+    return np.asarray(rng.multinomial(per_scene, local), np.int64)
+
+
+def total(counts: NDArray[np.int64], values: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums by scene, [runs, scenes], and sums of squares, [runs], of a number that each way of ending stands for."""
+    worth = np.asarray(values, np.float64)
+    return counts @ worth, (counts @ worth**2).sum(-1)
