@@ -171,6 +171,11 @@ POLICIES = Registry(
     "wiw.policies.base:Policy",
 )
 TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav", "ar": "wiw.tasks.ar:AR"})
+TRACKERS = Registry(
+    "tracker",
+    "",
+    {"reprojection": "wiw.perception.tracking:Reprojection", "sam2": "wiw.perception.sam2:Sam2"},
+)
 METRICS = Registry(
     "metric",
     "",

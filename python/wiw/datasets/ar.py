@@ -91,7 +91,9 @@ class EpisodeRules:
     clear: float = 0.7
     """Least visible share in the best view."""
     large: float = 0.02
-    """Least size of the best view: 8 degrees across."""
+    """Least size of the best view: 8 degrees across ..."""
+    enough: float = 0.3
+    """... and the size above which it gets no better: 31 degrees across."""
     gain: float = 2.5
     """How much larger than at the start the target must be seen there, at least."""
     budget: int = 8
@@ -255,10 +257,12 @@ class _View:
 def _best_view(
     world: World, start: NDArray[np.float64], yaw: float, instance: int, rules: EpisodeRules
 ) -> _View | None:
-    """Where within the budget the target is seen largest, among places where it is seen clearly."""
+    """Where within the budget the target is seen largest, among places where it is seen clearly; of those where it is
+    large enough, the one with the greatest visible share.
+    """
     ends, primitives = _reachable(world, start, yaw, rules.budget)
     rough = seen(world, ends, COARSE)[:, instance]
-    largest = np.argsort(-rough, kind="stable")[:6]
+    largest = np.argsort(-np.minimum(rough, rules.enough), kind="stable")[:6]
     largest = largest[rough[largest] >= rules.large / 2]
     if not len(largest):
         return None
@@ -267,7 +271,7 @@ def _best_view(
     fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
     if not len(fit):
         return None
-    best = fit[sizes[fit].argmax()]
+    best = max(fit, key=lambda i: (min(sizes[i], rules.enough), shares[i]))
     end = largest[best]
     return _View(ends[end], int(primitives[end]), float(sizes[best]), min(1.0, float(shares[best])))
 

@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the target is in imagined frames: trackers behind one interface, and the one that geometry alone gives."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import to_viewpoints
+from wiw.errors import ArgumentError
+from wiw.perception.boxes import box_of
+from wiw.reproject import warp
+from wiw.types import Box, Observation, Proposal, Rollout, Target
+
+FRONT_HFOV = 90.0
+"""Degrees; of every front view."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """A target through the K frames of one imagined plan."""
+
+    masks: NDArray[np.bool_]
+    """bool [K, H, W], in the frames' size; empty where the target is lost."""
+    boxes: tuple[Box | None, ...]
+    """K boxes in the frames' pixels, None where the target is lost; across a panorama's seam left > right."""
+
+    @property
+    def found(self) -> NDArray[np.bool_]:
+        """Bool [K]: where the target is in sight."""
+        return np.array([box is not None for box in self.boxes], bool)
+
+
+class Tracker(ABC):
+    """Follows the target of real observations into frames that were imagined from them."""
+
+    needs: tuple[str, ...] = ()
+    """"depth" where observations must carry it; a policy that tracks passes this on."""
+
+    @abstractmethod
+    def masks(
+        self,
+        observations: Sequence[Observation],
+        viewpoints: Sequence[NDArray[np.float64]],
+        frames: Sequence[NDArray[np.uint8]],
+        panoramic: bool,
+    ) -> list[NDArray[np.bool_]]:
+        """The target's visible pixels in each frame, bool [K, H, W] a plan; `track` documents the arguments."""
+
+    def track(
+        self,
+        observations: Sequence[Observation],
+        viewpoints: Sequence[NDArray[np.float64]],
+        frames: Sequence[NDArray[np.uint8]],
+        panoramic: bool = True,
+    ) -> list[Track]:
+        """Follows the targets of B observations into as many imagined plans.
+
+        Args:
+            observations: what each plan begins with; the same one may come several times.
+            viewpoints: float64 [K, 4, 4] each: T_start_camera of every frame (`wiw.action.to_viewpoints`).
+            frames: uint8 [K, H, W, 3] each, panoramas or, with `panoramic=False`, front views (HFOV 90).
+            panoramic: which of the two.
+
+        Raises:
+            ArgumentError: an observation without a target, or without what the tracker needs; arrays of other shapes.
+        """
+        _check(self, observations, viewpoints, frames)
+        found = [_without_specks(masks) for masks in self.masks(observations, viewpoints, frames, panoramic)]
+        return [Track(masks, tuple(box_of(mask, wraps=panoramic) for mask in masks)) for masks in found]
+
+
+def track_rollouts(
+    tracker: Tracker,
+    observations: Sequence[Observation],
+    proposals: Sequence[Sequence[Proposal]],
+    rollouts: Sequence[Sequence[Rollout]],
+) -> list[list[Track]]:
+    """Tracks [episode][candidate] for what a reviser is given; one call of the tracker for all of them.
+
+    Raises:
+        ArgumentError: rollouts in several views; ask for "panorama" or "front" (`Policy.frames`).
+    """
+    flat = [
+        (observation, proposal, rollout)
+        for observation, plans, futures in zip(observations, proposals, rollouts, strict=True)
+        for proposal, rollout in zip(plans, futures, strict=True)
+    ]
+    views = {rollout.view for _, _, rollout in flat}
+    if len(views) > 1 or not views <= {"panorama", "front"}:
+        raise ArgumentError(f"track_rollouts: expected frames all 'panorama' or all 'front', got {sorted(views)}")
+    tracks = iter(
+        tracker.track(
+            [observation for observation, _, _ in flat],
+            [to_viewpoints(proposal.actions) for _, proposal, _ in flat],
+            [rollout.frames for _, _, rollout in flat],
+            panoramic=views != {"front"},
+        )
+    )
+    return [[next(tracks) for _ in plans] for plans in proposals]
+
+
+class Reprojection(Tracker):
+    """Moves the target's mask with the depth mesh of the real panorama; needs no frames and no learning.
+
+    What is behind other surfaces in the new view is not marked, as the mesh is drawn with a depth test. Parts of the
+    target that the real observation did not show are not known to be its own: boxes hold what was seen of it.
+    """
+
+    needs = ("depth",)
+
+    def masks(
+        self,
+        observations: Sequence[Observation],
+        viewpoints: Sequence[NDArray[np.float64]],
+        frames: Sequence[NDArray[np.uint8]],
+        panoramic: bool,
+    ) -> list[NDArray[np.bool_]]:
+        """The warped mask, without what no observation showed."""
+        found: list[Any] = [None] * len(frames)
+        for rows in _grouped(observations, frames):
+            poses = np.concatenate([viewpoints[row] for row in rows])
+            moved = _moved(observations[rows[0]], poses, _size(frames[rows[0]]), panoramic)
+            parts = np.split(moved, np.cumsum([len(viewpoints[row]) for row in rows])[:-1])
+            for row, part in zip(rows, parts, strict=True):
+                found[row] = part
+        return found
+
+
+def _moved(
+    observation: Observation, poses: NDArray[np.float64], size: tuple[int, int], panoramic: bool
+) -> NDArray[np.bool_]:
+    """Bool [K, H, W]: the target's mask as seen from K poses."""
+    depth, mask = observation.depth, target_of(observation).mask
+    assert depth is not None
+    if not len(poses) or not mask.any():
+        return np.zeros((len(poses), *size), bool)
+    painted = np.repeat(mask[None, :, :, None], 3, axis=3).astype(np.uint8) * 255
+    hfov = None if panoramic else FRONT_HFOV
+    shown = warp(painted, depth[None], poses[None], size=size, target_hfov_deg=hfov, outputs=("color", "hole"))
+    return (shown["color"][0, ..., 0] > 127) & ~shown["hole"][0]
+
+
+def target_of(observation: Observation) -> Target:
+    """The observation's target.
+
+    Raises:
+        ArgumentError: nothing is pointed out in it.
+    """
+    if observation.target is None:
+        raise ArgumentError("expected an observation with a target; only tasks that point something out give one")
+    return observation.target
+
+
+def _grouped(observations: Sequence[Observation], frames: Sequence[NDArray[np.uint8]]) -> list[list[int]]:
+    """Rows that share an observation and a size, so that its mesh is built once."""
+    groups: dict[tuple[int, tuple[int, int]], list[int]] = {}
+    for row, (observation, images) in enumerate(zip(observations, frames, strict=True)):
+        groups.setdefault((id(observation), _size(images)), []).append(row)
+    return list(groups.values())
+
+
+def _size(frames: NDArray[np.uint8]) -> tuple[int, int]:
+    return int(frames.shape[1]), int(frames.shape[2])
+
+
+def _without_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The masks, emptied where nothing is two pixels wide and high: specks at the rims of things are no sight of it."""
+    wide = masks[:, :, :-1] & masks[:, :, 1:]
+    seen = (wide[:, :-1] & wide[:, 1:]).any(axis=(1, 2))
+    return masks & seen[:, None, None]
+
+
+def _check(
+    tracker: Tracker,
+    observations: Sequence[Observation],
+    viewpoints: Sequence[NDArray[np.float64]],
+    frames: Sequence[NDArray[np.uint8]],
+) -> None:
+    if not len(observations) == len(viewpoints) == len(frames):
+        raise ArgumentError(
+            f"track: expected one observation, one array of viewpoints and one of frames a plan, got "
+            f"{len(observations)}, {len(viewpoints)} and {len(frames)}"
+        )
+    for observation, poses, images in zip(observations, viewpoints, frames, strict=True):
+        target_of(observation)
+        if "depth" in tracker.needs and observation.depth is None:
+            raise ArgumentError(f"{type(tracker).__name__} needs depth: make the environment with depth=True")
+        if images.ndim != 4 or images.shape[3] != 3 or np.shape(poses) != (len(images), 4, 4):
+            raise ArgumentError(
+                f"track: expected frames [K, H, W, 3] and viewpoints [K, 4, 4], got {images.shape}, {np.shape(poses)}"
+            )

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""SAM 2 with tiny random weights: that videos are made, marked and read back as they should, not what it recognises."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.errors import ArgumentError
+from wiw.types import Observation, Target
+
+
+def test_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    from wiw.perception.sam2 import Sam2
+
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    with pytest.raises(ArgumentError, match="pip install torch transformers, or track by reprojection"):
+        Sam2("facebook/sam2.1-hiera-tiny")
+    with pytest.raises(ArgumentError, match="prompt: expected 'box' or 'mask'"):
+        Sam2("facebook/sam2.1-hiera-tiny", prompt="point")  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the weights of a network of about a million numbers, 64 pixels a side."""
+    torch = pytest.importorskip("torch", reason="torch is not installed: pip install wiw[torch]")
+    pytest.importorskip("transformers", reason="transformers is not installed: pip install wiw[torch]")
+    from transformers import Sam2HieraDetConfig, Sam2VideoConfig, Sam2VideoModel, Sam2VisionConfig
+
+    torch.manual_seed(0)
+    backbone = Sam2HieraDetConfig(
+        hidden_size=8,
+        num_attention_heads=1,
+        blocks_per_stage=[1, 2, 2, 1],
+        embed_dim_per_stage=[8, 16, 32, 64],
+        num_attention_heads_per_stage=[1, 2, 4, 8],
+        global_attention_blocks=[4],
+        window_size_per_stage=[8, 4, 4, 2],
+        image_size=[64, 64],
+        window_positional_embedding_background_size=[4, 4],
+    )
+    vision = Sam2VisionConfig(
+        backbone_config=backbone,
+        backbone_channel_list=[64, 32, 16, 8],
+        backbone_feature_sizes=[[16, 16], [8, 8], [4, 4]],
+        fpn_hidden_size=128,
+    )
+    config = Sam2VideoConfig(
+        vision_config=vision,
+        prompt_encoder_config={"hidden_size": 128, "image_size": 64},
+        mask_decoder_config={
+            "hidden_size": 128,
+            "mlp_dim": 32,
+            "num_attention_heads": 2,
+            "iou_head_hidden_dim": 32,
+        },
+        image_size=64,
+        memory_attention_hidden_size=128,
+        memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=32,
+        memory_attention_rope_feat_sizes=[4, 4],
+        memory_encoder_hidden_size=128,
+        memory_encoder_output_channels=64,
+        mask_downsampler_embed_dim=128,
+        memory_fuser_embed_dim=128,
+        memory_fuser_intermediate_dim=32,
+    )
+    folder = tmp_path_factory.mktemp("sam2")
+    Sam2VideoModel(config).save_pretrained(folder)
+    return folder
+
+
+def observation(across_the_seam: bool = False) -> Observation:
+    rng = np.random.default_rng(3)
+    mask = np.zeros((64, 128), bool)
+    mask[20:40, 60:76] = True
+    mask = np.roll(mask, 56, axis=1) if across_the_seam else mask
+    front = (10.0, 20.0, 30.0, 40.0)
+    target = Target(mask, (0, 0, 1, 1), front)
+    images = rng.integers(0, 255, (64, 128, 3), np.uint8), rng.integers(0, 255, (48, 48, 3), np.uint8)
+    return Observation(*images, np.zeros(3), None, target)
+
+
+def follow(tracker: Any, seen: Observation, panoramic: bool = True) -> Any:
+    frames = np.random.default_rng(4).integers(0, 255, (3, 64, 128, 3) if panoramic else (3, 40, 40, 3), np.uint8)
+    return tracker.track([seen], [np.tile(np.eye(4), (3, 1, 1))], [frames], panoramic=panoramic)[0]
+
+
+@pytest.mark.parametrize("prompt", ["box", "mask"])
+@pytest.mark.parametrize("panoramic", [True, False])
+def test_tracks_have_the_frames_shape_and_are_repeatable(weights: Path, prompt: Any, panoramic: bool) -> None:
+    from wiw.perception.sam2 import Sam2
+
+    tracker = Sam2(weights, prompt)
+    track, again = (follow(tracker, observation(), panoramic) for _ in range(2))
+    assert track.masks.shape == ((3, 64, 128) if panoramic else (3, 40, 40))
+    assert track.masks.dtype == bool
+    assert len(track.boxes) == 3
+    np.testing.assert_array_equal(track.masks, again.masks)
+
+
+def test_nothing_is_followed_from_where_nothing_is_seen(weights: Path) -> None:
+    from wiw.perception.sam2 import Sam2
+
+    gone = observation()
+    gone.target.mask[:] = False
+    assert follow(Sam2(weights), gone).boxes == (None, None, None)
+
+
+def test_a_panorama_is_turned_so_that_the_target_is_in_the_middle(weights: Path) -> None:
+    from wiw.perception.sam2 import Sam2
+
+    tracker, seen = Sam2(weights), []
+
+    def spy(start: Any, frames: Any, seed: Any, box: Any) -> Any:
+        seen.append((seed, box))
+        marked = np.zeros(frames.shape[:3], bool)
+        marked[:, 20:40, 56:72] = True
+        return marked
+
+    tracker._follow = spy
+    for across in (False, True):
+        view = observation(across)
+        track = follow(tracker, view)
+        np.testing.assert_array_equal(track.masks[0], view.target.mask)  # turned back
+    for seed, box in seen:
+        assert box == (56, 20, 72, 40)
+        np.testing.assert_array_equal(np.flatnonzero(seed.any(axis=0)), np.arange(56, 72))
+
+
+@pytest.mark.parametrize(("score", "found"), [(1.0, True), (-1.0, False)])
+def test_masks_are_read_back_and_lost_targets_left_out(
+    weights: Path, monkeypatch: pytest.MonkeyPatch, score: float, found: bool
+) -> None:
+    import torch
+
+    from wiw.perception.sam2 import Sam2
+
+    tracker = Sam2(weights)
+    logits = torch.full((1, 1, 16, 16), -5.0)
+    logits[..., 4:8, 8:12] = 5.0
+
+    def answer(session: Any, start_frame_idx: int) -> Any:
+        points = session.point_inputs_per_obj[0][0]["point_coords"]
+        np.testing.assert_allclose(points.numpy().ravel(), [28, 20, 36, 40])  # the box, of 64 pixels a side
+        for frame in range(session.num_frames):
+            yield type(
+                "Output",
+                (),
+                {"frame_idx": frame, "pred_masks": logits, "object_score_logits": torch.full((1, 1), score)},
+            )
+
+    monkeypatch.setattr(tracker._model, "propagate_in_video_iterator", answer)
+    track = follow(tracker, observation())
+    assert track.found.tolist() == [found] * 3
+    if found:
+        left, top, right, bottom = track.boxes[0]
+        shift = 4  # the target's middle is 4 columns right of the panorama's
+        np.testing.assert_allclose([left, top, right, bottom], [64 + shift, 16, 96 + shift, 32], atol=2)

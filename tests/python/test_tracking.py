@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trackers against true renders, boxes across the seam, and the views that are cut around them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_viewpoints
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.worlds import world
+from wiw.envs.pointing import Pointing
+from wiw.errors import ArgumentError
+from wiw.panorama import directions
+from wiw.perception.boxes import box_of, largest_part, scaled, width_of
+from wiw.perception.tracking import Reprojection, Tracker, _without_specks, track_rollouts
+from wiw.perception.views import target_views
+from wiw.registry import TRACKERS
+from wiw.types import Observation, Proposal, Rollout, Target
+
+PLAN = np.array([FORWARD, TURN_LEFT, FORWARD, FORWARD, TURN_RIGHT, FORWARD], np.int8)
+
+
+def look(place: Any, position: Any, yaw: float, name: str, poses: Any = None) -> tuple[Observation, Any, Any]:
+    """An observation that points a thing out, and true frames and masks from poses relative to it."""
+    thing = next(int(i["id"]) for i in place.scene.instances if i["name"] == name)
+    start = camera_pose(np.asarray(position, float), yaw)
+    cameras = np.concatenate([start[None], start @ (to_viewpoints(PLAN) if poses is None else poses)])
+    shown = place.renderer.panorama(cameras)
+    front = place.renderer.perspective(start[None], (480, 480), 90.0)
+    target = Pointing().target(shown["instance"][0], front["instance"][0], thing)
+    observation = Observation(shown["color"][0], front["color"][0], np.zeros(3), shown["depth"][0], target)
+    return observation, shown["color"][1:], shown["instance"][1:] == thing
+
+
+def overlap(a: Any, b: Any) -> float:
+    return float((a & b).sum() / max(1, (a | b).sum()))
+
+
+def boxed(box: Any, columns: int = 1024) -> Any:
+    """The box as a mask."""
+    filled = np.zeros((576, columns), bool)
+    left, top, right, bottom = (round(edge) for edge in box)
+    filled[top:bottom, (left + np.arange(round(width_of(box, columns)))) % columns] = True
+    assert right % columns == (left + round(width_of(box, columns))) % columns
+    return filled
+
+
+@pytest.mark.parametrize(
+    ("position", "yaw", "name"),
+    [((-1.2, 0, -1.0), 0.3, "table"), ((-1.2, 0, -1.0), 3.0, "table"), ((1.5, 0, 0.5), 0.0, "chest")],
+)
+def test_reprojected_boxes_are_where_true_ones_are(two_rooms: str, position: Any, yaw: float, name: str) -> None:
+    observation, frames, truth = look(world(two_rooms), position, yaw, name)
+    track = Reprojection().track([observation], [to_viewpoints(PLAN)], [frames])[0]
+    agreement = [
+        overlap(boxed(box), boxed(box_of(mask, wraps=True))) for box, mask in zip(track.boxes, truth, strict=True)
+    ]
+    assert min(agreement) > 0.7
+    assert np.median(agreement) > 0.85
+
+
+def test_what_is_hidden_in_the_new_view_is_not_marked(two_rooms: str) -> None:
+    place = world(two_rooms)
+    aside = np.tile(np.eye(4), (8, 1, 1))
+    aside[:, 0, 3] = -0.04 * np.arange(1, 9)  # to the left, behind the wall beside the door
+    observation, frames, truth = look(place, (-1.0, 0, 1.2), -np.pi / 2, "shelf", aside)
+    track = Reprojection().track([observation], [aside], [frames])[0]
+    seen = truth.reshape(8, -1).sum(axis=1)
+    assert observation.target.mask.sum() > 2 * seen[-1]  # it does get hidden
+    for marked, true in zip(track.masks, truth, strict=True):
+        assert (marked & ~true).sum() <= 80  # a column of pixels at the rim; the whole shelf has 1400
+    assert track.found[:3].all()
+    assert not track.found[seen == 0].any()
+
+
+def test_a_hairline_is_no_sight_of_a_target() -> None:
+    masks = np.zeros((3, 6, 8), bool)
+    masks[0, 1:5, 3] = masks[1, 2, 1:6] = masks[2, 1:5, 3:5] = True
+    np.testing.assert_array_equal(_without_specks(masks).any(axis=(1, 2)), [False, False, True])
+
+
+def test_a_lost_target_has_no_box(two_rooms: str) -> None:
+    observation, frames, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
+    gone = replace(observation, target=Target(np.zeros((576, 1024), bool), None, None))
+    track = Reprojection().track([gone], [to_viewpoints(PLAN)], [frames])[0]
+    assert track.boxes == (None,) * 6
+    assert not track.masks.any()
+    assert not track.found.any()
+
+
+def test_front_views_are_tracked_too(two_rooms: str) -> None:
+    place = world(two_rooms)
+    thing = next(int(i["id"]) for i in place.scene.instances if i["name"] == "table")
+    position, yaw = (-1.2, 0, -0.2), np.pi / 2 - 0.5
+    observation, _, _ = look(place, position, yaw, "table")
+    poses = to_viewpoints(PLAN[:3])
+    cameras = camera_pose(np.asarray(position, float), yaw) @ poses
+    shown = place.renderer.perspective(cameras, (384, 384), 90.0)
+    track = Reprojection().track([observation], [poses], [shown["color"]], panoramic=False)[0]
+    for marked, ids in zip(track.masks, shown["instance"], strict=True):
+        assert overlap(marked, ids == thing) > 0.7
+
+
+def test_rows_do_not_depend_on_what_else_is_tracked(two_rooms: str) -> None:
+    one, frames, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
+    other, _, _ = look(world(two_rooms), (1.5, 0, 0.5), 0.0, "chest")
+    plans = [Proposal(PLAN), Proposal(PLAN[:2])]
+    futures = [[Rollout(frames[: len(plan.actions)], np.zeros(1, bool), "panorama") for plan in plans]] * 2
+    tracks = track_rollouts(Reprojection(), [one, other], [plans, plans], futures)
+    for observation, row in zip((one, other), tracks, strict=True):
+        for plan, track in zip(plans, row, strict=True):
+            viewpoints = to_viewpoints(plan.actions)
+            alone = Reprojection().track([observation], [viewpoints], [frames[: len(viewpoints)]])[0]
+            np.testing.assert_array_equal(track.masks, alone.masks)
+            assert track.boxes == alone.boxes
+    with pytest.raises(ArgumentError, match="all 'panorama' or all 'front'"):
+        track_rollouts(Reprojection(), [one], [plans[:1]], [[Rollout(frames[:6, None], np.zeros(6, bool), "surround")]])
+
+
+def test_a_tracker_says_what_it_lacks(two_rooms: str) -> None:
+    observation, frames, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
+    viewpoints = to_viewpoints(PLAN)
+    for changed, message in (
+        (replace(observation, depth=None), "needs depth"),
+        (replace(observation, target=None), "an observation with a target"),
+    ):
+        with pytest.raises(ArgumentError, match=message):
+            Reprojection().track([changed], [viewpoints], [frames])
+    with pytest.raises(ArgumentError, match=r"viewpoints \[K, 4, 4\]"):
+        Reprojection().track([observation], [viewpoints[:2]], [frames])
+    assert isinstance(TRACKERS.make("reprojection"), Tracker)
+
+
+# -- boxes -------------------------------------------------------------------------------------------------------------
+
+columns_filled = st.lists(st.booleans(), min_size=1, max_size=24).map(np.array)
+
+
+@given(columns_filled)
+def test_the_box_on_a_circle_is_the_narrowest_that_holds_the_mask(filled: Any) -> None:
+    width = len(filled)
+    box = box_of(filled[None], wraps=True)
+    if not filled.any():
+        assert box is None
+        return
+    narrowest = min(
+        length
+        for left in range(width)
+        for length in range(1, width + 1)
+        if filled.sum() == filled[(left + np.arange(length)) % width].sum()
+    )
+    inside = (int(box[0]) + np.arange(int(width_of(box, width)))) % width
+    assert filled.sum() == filled[inside].sum()
+    assert len(inside) == narrowest
+    if box_of(filled[None])[2] - box_of(filled[None])[0] == narrowest:
+        assert box[0] < box[2]  # the seam is crossed only where that is narrower
+
+
+@given(st.integers(0, 63), st.integers(1, 63), st.floats(0.5, 3))
+def test_a_scaled_box_keeps_its_middle_on_the_circle(left: int, width: int, scale: float) -> None:
+    box = (float(left), 10.0, float((left + width - 1) % 64 + 1), 20.0)
+    grown = scaled(box, scale, (40, 64), wraps=True)
+    assert width_of(grown, 64) == pytest.approx(min(64, scale * width_of(box, 64)))
+    if scale * width_of(box, 64) < 64:
+        away = (grown[0] + width_of(grown, 64) / 2) - (box[0] + width_of(box, 64) / 2)
+        assert (away + 32) % 64 - 32 == pytest.approx(0, abs=1e-6)
+    assert (grown[1], grown[3]) == pytest.approx((max(0, 15 - 5 * scale), 15 + 5 * scale))
+    clipped = scaled((50.0, 10.0, 60.0, 20.0), 3, (40, 64))
+    assert clipped == (40.0, 0.0, 64.0, 30.0)
+
+
+def test_the_largest_part_hangs_together_over_the_seam() -> None:
+    mask = np.zeros((12, 40), bool)
+    mask[2:5, 36:] = mask[5:8, :3] = True  # they touch at a corner across the seam: 12 + 9
+    mask[2:10, 18:20] = True  # 16
+    expected = mask.copy()
+    expected[:, 18:20] = False
+    np.testing.assert_array_equal(largest_part(mask, wraps=True), expected)
+    np.testing.assert_array_equal(largest_part(mask), mask & ~expected)
+
+
+# -- views -------------------------------------------------------------------------------------------------------------
+
+
+def test_views_look_at_the_target_wherever_it_is() -> None:
+    rays = directions((288, 512))
+    masks, panoramas = [], []
+    for yaw, pitch in ((0, 0), (179.7, -20), (-100, 35), (60, -80)):
+        y, p = np.radians([yaw, pitch])
+        middle = np.array([-np.sin(y) * np.cos(p), np.sin(p), -np.cos(y) * np.cos(p)])
+        mask = rays @ middle > np.cos(np.radians(6))
+        masks.append(mask)
+        panoramas.append(np.where(mask[..., None], [0, 200, 0], [40, 40, 40]).astype(np.uint8))
+    masks.insert(2, np.zeros((288, 512), bool))
+    panoramas.insert(2, panoramas[0])
+    views = target_views(np.stack(panoramas), np.stack(masks), draw=False)
+    assert views.images.shape == (4, 384, 384, 3)
+    assert views.frames.tolist() == [0, 1, 3, 4]
+    assert views.boxless.tolist() == [2]
+    for image, (left, top, right, bottom) in zip(views.images, views.boxes, strict=True):
+        assert abs((left + right) / 2 - 192) < 8
+        assert abs((top + bottom) / 2 - 192) < 16
+        assert 36 < right - left < 48  # 12 degrees of 90 in the middle of the view
+        assert (image[192, 192] == [0, 200, 0]).all()
+    fitted = target_views(np.stack(panoramas), np.stack(masks), (128, 128), "fit")
+    assert fitted.hfov_deg.tolist()[:2] == [30, 30]
+    left, top, right, bottom = (int(edge) for edge in fitted.boxes[0])
+    assert (fitted.images[0, top - 1, left:right] == [220, 40, 40]).all()  # the line lies around the box
+    assert (fitted.images[0, (top + bottom) // 2, left + 2] == [0, 200, 0]).all()
+
+
+def test_no_frame_in_sight_gives_no_view() -> None:
+    views = target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((3, 64, 128), bool), (32, 32))
+    assert views.images.shape == (0, 32, 32, 3)
+    assert (views.boxes, views.frames.tolist(), views.boxless.tolist()) == ((), [], [0, 1, 2])
+    with pytest.raises(ArgumentError, match="masks"):
+        target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((2, 64, 128), bool))
