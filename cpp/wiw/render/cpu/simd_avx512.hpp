@@ -41,8 +41,8 @@ inline Ints look_up(const std::int32_t* table, Ints index) {
 
 /// The texel pairs of lanes a and b. Separate loads beat gather instructions, which are microcode on many processors.
 inline __m128i two_pairs(const std::uint32_t* texels, std::int32_t a, std::int32_t b) {
-  const __m128d low = _mm_load_sd(reinterpret_cast<const double*>(texels + a));
-  return _mm_castpd_si128(_mm_loadh_pd(low, reinterpret_cast<const double*>(texels + b)));
+  const __m128i low = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(texels + a));  // pairs lie at any texel
+  return _mm_castpd_si128(_mm_loadh_pd(_mm_castsi128_pd(low), reinterpret_cast<const double*>(texels + b)));
 }
 
 inline __m512i eight_pairs(const std::uint32_t* texels, const std::int32_t* index) {
