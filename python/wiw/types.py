@@ -200,12 +200,17 @@ class Decision:
     goal: Goal | None = None
     key: Key | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Wall time by stage: propose, platform, world_model, revise."""
+    """Wall time by stage: propose, platform, world_model, cache, revise, environment (carrying it out). Episodes that
+    were decided for at once share the time equally."""
     calls: Mapping[str, int] = field(default_factory=dict)
-    """Counts: rows and frames asked of the world model for this episode."""
+    """What this decision asked for, a function of the decision alone: consultations of the world model (0 or 1, one a
+    level of the beam search), and the rows and frames of its rollouts."""
     note: str = ""
     answer: Answer | None = None
     """What the agent believes now, where the goal has choices."""
+    spent: Mapping[str, float] = field(default_factory=dict)
+    """What answering took, an equal share of the batch's: calls of the world model with their rows and frames, retries
+    among the calls, cached_rows that needed none, vlm_tokens."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A run with a world model of 1 s a batch, and the same run again from the rollout cache.
 
-The first run does not sleep: each call of its model counts as `SECONDS`, which is exact and spares the wait. All else is
-CPU time, with rendering, proposing and scoring, which no cache saves. Target: the second run makes no call and takes at
-most 3 % of the time of the first.
+The first run does not sleep: each call of its model counts as `SECONDS`, which is exact and spares the wait. All else
+is CPU time, with rendering, proposing and scoring, which no cache saves. Target: the second run makes no call and
+takes at most 3 % of the time of the first.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ def test_a_decision_keeps_its_evidence(task: ImageNav) -> None:
     decision = record.decision
     assert len(decision.proposals) == len(decision.rollouts) == len(decision.scores) == 4
     assert decision.chosen == int(np.argmax(decision.scores))
-    assert set(decision.seconds) == {"propose", "platform", "world_model", "revise"}
+    assert set(decision.seconds) == {"propose", "platform", "world_model", "revise", "environment"}
     assert decision.calls["rows"] >= 1
     np.testing.assert_array_equal(record.executed, decision.actions[: len(record.executed)])
     assert [len(r.frames) for r in decision.rollouts] == [3, 2, 2, 1]

@@ -26,9 +26,11 @@ def report(
         run: The run's folder.
         out: Where to write; report.html in the run's folder if not given.
     """
+    from wiw.evaluation.costs import print_costs
     from wiw.evaluation.runlog import load_run
 
     log = load_run(run)
     log.summary()
+    print_costs(log)
     print(f"\nreport  {log.report(out)}")
     return 0

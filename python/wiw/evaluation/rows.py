@@ -99,6 +99,7 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "path": to_json(record.path),
         "seconds": to_json(dict(decision.seconds)),
         "calls": to_json(dict(decision.calls)),
+        "spent": to_json(dict(decision.spent)),
         **_truth("before", record.before),
         **_truth("after", record.after),
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.evaluation.costs import costs
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.summary import Summary, summarise
 
@@ -100,6 +101,10 @@ class RunLog:
                 line |= {"utility": found.value, "utility_low": found.low, "utility_high": found.high}
             lines.append(line)
         return Records(lines)
+
+    def costs(self) -> Records:
+        """What each arm cost: one dict an arm, totals and what a success took; see `wiw.evaluation.costs.Costs`."""
+        return Records(line.as_dict() for line in costs(self))
 
     def report(self, path: str | Path | None = None) -> Path:
         """Writes a self-contained HTML report and returns its path; default `report.html` in the run's folder."""

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 3 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 4 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -43,7 +43,8 @@ CREATE TABLE decision (
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
     seconds TEXT NOT NULL,          -- JSON: wall time by stage
-    calls TEXT NOT NULL,            -- JSON: rows and frames asked of the world model
+    calls TEXT NOT NULL,            -- JSON: consultations, rows and frames asked of the world model
+    spent TEXT NOT NULL,            -- JSON: share of calls, rows, frames, retries, cached_rows, vlm_tokens
     before_x REAL NOT NULL, before_y REAL NOT NULL, before_z REAL NOT NULL, before_yaw REAL NOT NULL,
     before_distance REAL, before_geodesic REAL,
     after_x REAL NOT NULL, after_y REAL NOT NULL, after_z REAL NOT NULL, after_yaw REAL NOT NULL,

@@ -19,13 +19,24 @@ from pathlib import Path
 from typing import Any
 
 import wiw
-from wiw.errors import StoreError
+from wiw.errors import ArgumentError, StoreError
 from wiw.evaluation.faults import explained, remedy
 from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 3
-DECISION_JSON = ("actions", "executed", "scores", "answer", "proposals", "real_frames", "path", "seconds", "calls")
+SCHEMA_VERSION = 4
+DECISION_JSON = (
+    "actions",
+    "executed",
+    "scores",
+    "answer",
+    "proposals",
+    "real_frames",
+    "path",
+    "seconds",
+    "calls",
+    "spent",
+)
 """Columns of table `decision` that hold JSON."""
 APPLICATION_ID = 0x77697721
 """Marks the file as a run store (SQLite's application_id)."""
@@ -211,6 +222,21 @@ class RunStore:
             for column in DECISION_JSON:
                 row[column] = None if row[column] is None else json.loads(row[column])
         return rows
+
+    def totals(self, column: str) -> dict[str, dict[str, float]]:
+        """Sums over the decisions of ended episodes of a column of named numbers ("seconds", "calls", "spent"), by arm,
+        with their number as "decisions".
+        """
+        if column not in ("seconds", "calls", "spent"):
+            raise ArgumentError(f"totals: expected seconds, calls or spent, got '{column}'")
+        found: dict[str, dict[str, float]] = {}
+        ended = "decision d JOIN outcome USING (arm, episode)"
+        for row in self._rows(f"SELECT arm, count(*) AS n FROM {ended} GROUP BY arm"):
+            found[row["arm"]] = {"decisions": float(row["n"])}
+        sums = f"SELECT arm, key, sum(value) AS total FROM {ended}, json_each(d.{column}) GROUP BY arm, key"
+        for row in self._rows(sums):
+            found[row["arm"]][row["key"]] = float(row["total"] or 0)
+        return found
 
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
         """JPEG by name, empty where no pictures were kept."""

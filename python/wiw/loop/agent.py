@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from wiw.loop.imagine import Imagination, imagine
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.types import Decision, Goal, Key, Observation, Rollout
+from wiw.types import Decision, Goal, Key, Observation, Proposal, Rollout
 from wiw.world_models.base import WorldModel
 
 
@@ -33,6 +34,17 @@ class Query:
     key: Key
     simulator: Any = None
     """Fork of the environment; only looked at when the world model declares that it needs one."""
+
+
+@dataclass(frozen=True)
+class _Future:
+    """What one episode has to choose from."""
+
+    proposals: Sequence[Proposal]
+    rollouts: Sequence[Rollout] | None
+    """None where nothing was imagined."""
+    scores: NDArray[np.float64]
+    calls: Mapping[str, int]
 
 
 @dataclass
@@ -133,7 +145,7 @@ class Agent:
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
         """One decision for each live episode; model and reviser see all candidates of all of them at once."""
-        clock = Clock()
+        clock, meter = Clock(), self._meter()
         proposing, revising = self._situations(queries)
         with clock("propose"):
             self.policy.observe(proposing)
@@ -141,26 +153,15 @@ class Agent:
                 self.revision.observe(revising)
             proposals = self.policy.propose(proposing, self.candidates, self.horizon)
             check_proposals(self.policy, proposals, len(queries), self.candidates, self.horizon)
-        if self._ask is None:
-            rollouts: list[list[Rollout] | None] = [None] * len(queries)
-            calls: list[dict[str, int]] = [{} for _ in queries]
-            scores = [np.array([proposal.prior for proposal in plans]) for plans in proposals]
-        else:
-            beams = Beams(proposing, proposals, self.width, self.depth)
-            imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
-            while beams.level < self.depth:
-                with clock("propose"):
-                    beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
-                imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
-            proposals, rollouts, calls = beams.proposals, [*imagined.rollouts], [dict(calls) for calls in beams.calls]
+        futures = self._futures(queries, proposing, revising, proposals, clock)
         with clock("revise"):
-            answers = checked_answers(self.revision, self.revision.answer(revising, proposals, rollouts), revising)
-        seconds = clock.share(len(queries))
+            shown = [future.proposals for future in futures], [future.rollouts for future in futures]
+            answers = checked_answers(self.revision, self.revision.answer(revising, *shown), revising)
+        spent = {name: (count - meter[name]) / len(queries) for name, count in self._meter().items()}
+        costs = {"seconds": clock.share(len(queries)), "spent": spent}
         return [
-            self._decision(query, situation, plans, rollout, score, answer, seconds, cost)
-            for query, situation, plans, rollout, score, answer, cost in zip(
-                queries, revising, proposals, rollouts, scores, answers, calls, strict=True
-            )
+            self._decision(query, situation, future, answer, costs)
+            for query, situation, future, answer in zip(queries, revising, futures, answers, strict=True)
         ]
 
     def forget(self, key: Key) -> None:
@@ -188,6 +189,34 @@ class Agent:
             "depth": self.depth,
             "width": self.width,
         }
+
+    def _meter(self) -> Counter[str]:
+        """What the agent's model and policies have been asked for so far."""
+        policies = [self.policy] if self.revision is self.policy else [self.policy, self.revision]
+        counts = Counter({"vlm_tokens": sum(policy.tokens for policy in policies)})
+        if self._ask is not None:
+            counts.update({name: count for name, count in self._ask.tally.items() if name != "cache_seconds"})
+        return counts
+
+    def _futures(
+        self,
+        queries: Sequence[Query],
+        proposing: Sequence[Situation],
+        revising: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        clock: Clock,
+    ) -> list[_Future]:
+        """What each episode has to choose from: imagined and scored, or with the proposer's own preference."""
+        if self._ask is None:
+            return [_Future(plans, None, np.array([plan.prior for plan in plans]), {}) for plans in proposals]
+        beams = Beams(proposing, proposals, self.width, self.depth)
+        imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
+        while beams.level < self.depth:
+            with clock("propose"):
+                beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
+            imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
+        rows = zip(beams.proposals, imagined.rollouts, scores, beams.calls, strict=True)
+        return [_Future(plans, rollouts, score, dict(calls)) for plans, rollouts, score, calls in rows]
 
     def _look_ahead(
         self,
@@ -250,30 +279,27 @@ class Agent:
         self,
         query: Query,
         situation: Situation,
-        proposals: Any,
-        rollouts: Any,
-        scores: Any,
+        future: _Future,
         answer: Any,
-        seconds: Any,
-        calls: Any,
+        costs: Mapping[str, Any],
     ) -> Decision:
-        actions, chosen = self.revision.revise(situation, proposals, scores)
+        actions, chosen = self.revision.revise(situation, future.proposals, future.scores)
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
         self._life(query).executed += actions[:execute].tolist()
         return Decision(
             actions=actions,
             execute=execute,
-            proposals=tuple(proposals),
-            rollouts=None if rollouts is None else tuple(rollouts),
-            scores=np.asarray(scores, np.float64),
+            proposals=tuple(future.proposals),
+            rollouts=None if future.rollouts is None else tuple(future.rollouts),
+            scores=np.asarray(future.scores, np.float64),
             chosen=chosen,
             answer=answer,
             observation=query.observation,
             goal=query.goal,
             key=query.key,
-            seconds=seconds,
-            calls=calls,
+            calls=future.calls,
+            **costs,
         )
 
     def _segment(self, length: int) -> int:

@@ -28,7 +28,7 @@ class Imagination:
     rollouts: list[list[Rollout]]
     """[episode][candidate]."""
     calls: list[dict[str, int]]
-    """What the batch cost each episode: rows asked and frames imagined."""
+    """What the batch cost each episode: a consultation, rows asked and frames imagined."""
     queries: Sequence[Any]
     batch: Any
     answers: list[NDArray[np.uint8]]
@@ -181,4 +181,4 @@ def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:
     """Rows asked of the world model for each episode and frames of them that no other row answers."""
     rows = np.bincount(batch.row_episode, minlength=episodes)
     frames = np.bincount(batch.row_episode, batch.row_length - batch.row_shared, minlength=episodes)
-    return [{"rows": int(r), "frames": int(f)} for r, f in zip(rows, frames, strict=True)]
+    return [{"consultations": 1, "rows": int(r), "frames": int(f)} for r, f in zip(rows, frames, strict=True)]

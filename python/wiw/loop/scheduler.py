@@ -7,7 +7,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, ContractError, RolloutError
@@ -50,7 +50,10 @@ class Trial:
         """Executes the decision's first segment and observes."""
         before = self.env.truth()
         plan = decision.actions[: decision.execute]
+        begin = time.perf_counter()
         outcome = self.env.run(plan) if decision.answer is None else self.env.run(plan, decision.answer)
+        seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
+        decision = replace(decision, seconds=seconds)
         record = DecisionRecord(
             self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path
         )

@@ -51,6 +51,8 @@ class Policy(ABC):
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
     """Name of the reviser that stands in where this policy only proposes."""
+    tokens: int = 0
+    """Tokens that the policy's language model has read and written so far, for the cost ledger; 0 without one."""
 
     def begin(self, goal: Goal, key: Key) -> Any:
         """Memory for a new episode; None for a policy that keeps none."""

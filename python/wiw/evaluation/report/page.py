@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from wiw.evaluation.costs import COLUMNS, costs
 from wiw.evaluation.faults import whole_file
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories
@@ -51,6 +52,8 @@ def render(log: RunLog) -> str:
             plots=_plots(log, summary),
             stories=told,
             pictures=pictures,
+            costs=[(line, line.cells()) for line in costs(log)],
+            cost_columns=COLUMNS,
             failures=[row for row in log.episodes if row["status"] == "failed"],
             radius=config["task"].get("radius"),
             config=json.dumps(config, indent=2, ensure_ascii=False),

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cost ledger: what each arm asked of its world model, how long it took, and what a success came to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wiw.evaluation.runlog import RunLog
+
+COLUMNS = (
+    ("decisions", "Decisions an episode."),
+    ("consulted", "Decisions an episode for which the world model was consulted."),
+    ("rollouts", "Imagined futures an episode, whether the model or the cache gave them."),
+    ("frames", "Frames of them."),
+    ("calls", "Batches an episode that the model was asked for; episodes that share one divide it."),
+    ("cached", "Share of the rollouts that came from the cache."),
+    ("model s", "Seconds an episode inside the world model."),
+    ("all s", "Seconds an episode, all stages."),
+    ("rollouts / success", "All rollouts of the arm over its successes."),
+    ("s / success", "All seconds of the arm over its successes."),
+)
+"""Columns of the table and what they mean."""
+
+
+@dataclass(frozen=True)
+class Costs:
+    """One arm's totals over the decisions of its ended episodes."""
+
+    arm: str
+    episodes: int
+    """That have ended, judged or not: what a failed one had asked for until then counts."""
+    successes: float
+    decisions: int
+    calls: Mapping[str, float]
+    """Asked for: consultations, rows (rollouts), frames. A function of the decisions alone."""
+    spent: Mapping[str, float]
+    """Taken: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens."""
+    seconds: Mapping[str, float]
+    """Wall time by stage; it depends on the machine and on what else ran."""
+
+    @property
+    def all_seconds(self) -> float:
+        """Wall time of all stages."""
+        return sum(self.seconds.values())
+
+    def per_success(self, total: float) -> float:
+        """A total over the number of successes; inf where there is none."""
+        return total / self.successes if self.successes else math.inf
+
+    def as_dict(self) -> dict[str, Any]:
+        """Totals as plain values: `asked_<what>`, `spent_<what>`, `seconds_<stage>`, and two figures a success."""
+        return {
+            "arm": self.arm,
+            "episodes": self.episodes,
+            "successes": self.successes,
+            "decisions": self.decisions,
+            **{f"asked_{name}": value for name, value in self.calls.items()},
+            **{f"spent_{name}": value for name, value in self.spent.items()},
+            **{f"seconds_{stage}": value for stage, value in self.seconds.items()},
+            "seconds": self.all_seconds,
+            "rollouts_per_success": self.per_success(self.calls.get("rows", 0.0)),
+            "seconds_per_success": self.per_success(self.all_seconds),
+        }
+
+    def cells(self) -> list[str]:
+        """The columns of the table, in words."""
+        each = max(1, self.episodes)
+        asked, spent = self.calls, self.spent
+        rows = asked.get("rows", 0.0)
+        return [
+            f"{self.decisions / each:.1f}",
+            f"{asked.get('consultations', 0.0) / each:.1f}",
+            f"{rows / each:.1f}",
+            f"{asked.get('frames', 0.0) / each:.1f}",
+            f"{spent.get('calls', 0.0) / each:.1f}",
+            f"{100 * spent.get('cached_rows', 0.0) / rows:.0f} %" if rows else "–",
+            f"{self.seconds.get('world_model', 0.0) / each:.2f}",
+            f"{self.all_seconds / each:.2f}",
+            _number(self.per_success(rows)) if rows else "–",
+            _number(self.per_success(self.all_seconds)),
+        ]
+
+
+def costs(log: RunLog) -> list[Costs]:
+    """What each arm of a run cost, in the order of its table; arms without an ended episode are left out."""
+    calls, spent, seconds = (log.store.totals(column) for column in ("calls", "spent", "seconds"))
+    ended: dict[str, list[float]] = {}
+    for outcome in log.store.outcomes():
+        ended.setdefault(outcome["arm"], []).append(float(outcome["metrics"].get("success", 0.0)))
+    return [
+        Costs(
+            arm,
+            len(ended[arm]),
+            sum(ended[arm]),
+            int(calls.get(arm, {}).get("decisions", 0)),
+            *({name: value for name, value in of.get(arm, {}).items() if name != "decisions"} for of in found),
+        )
+        for found in [(calls, spent, seconds)]
+        for arm in log.arms
+        if arm in ended
+    ]
+
+
+def print_costs(log: RunLog) -> None:
+    """Prints the ledger; nothing where no episode has ended."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    lines = costs(log)
+    if not lines:
+        return
+    table = Table(title="Costs, an episode", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+    table.add_column("arm", style="bold")
+    for title, _ in COLUMNS:
+        table.add_column(title, justify="right")
+    for line in lines:
+        table.add_row(line.arm, *line.cells())
+    console = Console()
+    Console(width=None if console.is_terminal else max(console.width, 140)).print(table)
+
+
+def _number(value: float) -> str:
+    return "∞" if math.isinf(value) else f"{value:.1f}"

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cost ledger: what was asked, what it took, and that both add up."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.cli.app import main
+from wiw.errors import ArgumentError
+from wiw.evaluation.costs import Costs
+from wiw.evaluation.evaluate import run_arms
+
+
+class Counted(wiw.WorldModel):
+    """Repeats the observation; fails once; counts what reaches it over all instances."""
+
+    accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective", best_batch=3)
+    calls: ClassVar[int] = 0
+    rows: ClassVar[int] = 0
+
+    def rollout(self, observations, controls, seeds):
+        Counted.calls += 1
+        Counted.rows += len(controls)
+        if Counted.calls == 2:
+            raise ConnectionError("once")
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+
+
+@pytest.fixture(scope="module")
+def log(two_rooms, tmp_path_factory):
+    """Three arms: without a model, with one, and with the same one out of a cache."""
+    from wiw.loop import attempts
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(attempts, "PAUSES", (0.0, 0.0))
+        cache = tmp_path_factory.mktemp("cache")
+        agent = wiw.Agent("heuristic", Counted(), revision="matcher", candidates=3)
+        agents = {"none": wiw.Agent("heuristic"), "asked": agent, "cached": agent}
+        task = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
+        options = {"progress": False, "live": 2, "cache": cache}
+        return run_arms(task, agents, 3, out=tmp_path_factory.mktemp("run") / "r", **options)
+
+
+def test_the_ledger_adds_up(log) -> None:
+    none, asked, cached = log.costs()
+    assert [none["arm"], asked["arm"], cached["arm"]] == ["none", "asked", "cached"]
+    decisions = [row for row in log.decisions if row["arm"] == "asked"]
+    assert asked["decisions"] == len(decisions) == asked["asked_consultations"]
+    assert asked["asked_rows"] == sum(row["calls"]["rows"] for row in decisions)
+    assert asked["spent_calls"] == pytest.approx(Counted.calls) and asked["spent_rows"] == pytest.approx(Counted.rows)
+    assert asked["spent_retries"] == pytest.approx(1)
+    assert cached["asked_rows"] == asked["asked_rows"] == pytest.approx(cached["spent_cached_rows"])
+    assert cached.get("spent_calls", 0.0) == 0.0 and cached["seconds_cache"] > 0
+    assert "asked_rows" not in none and none["spent_vlm_tokens"] == asked["spent_vlm_tokens"] == 0
+    stages = [value for name, value in asked.items() if name.startswith("seconds_") and name != "seconds_per_success"]
+    assert asked["seconds"] == pytest.approx(sum(stages)) and asked["seconds_environment"] > 0
+    for line in log.costs():
+        assert line["seconds"] <= sum(row["seconds"] for row in log.episodes if row["arm"] == line["arm"])
+
+
+def test_a_success_has_its_price() -> None:
+    costs = Costs("warp", 4, 2.0, 20, {"rows": 60.0, "consultations": 20.0}, {"calls": 5.0}, {"world_model": 3.0})
+    assert costs.as_dict()["rollouts_per_success"] == 30.0 and costs.as_dict()["seconds_per_success"] == 1.5
+    assert "15.0" in costs.cells() and "30.0" in costs.cells()
+    none = Costs("none", 4, 0.0, 20, {}, {}, {"propose": 1.0})
+    assert math.isinf(none.per_success(1.0)) and none.cells()[-2:] == ["–", "∞"]
+
+
+def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:
+    from wiw.policies.heuristic import Heuristic
+
+    class Wordy(Heuristic):
+        def propose(self, situations, candidates, horizon):
+            self.tokens += 100 * len(situations)
+            return super().propose(situations, candidates, horizon)
+
+    task = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
+    log = wiw.evaluate(task, wiw.Agent(Wordy()), 2, out=tmp_path / "run", progress=False)
+    assert log.costs()[0]["spent_vlm_tokens"] == 100 * log.costs()[0]["decisions"]
+
+
+def test_table_and_report_show_the_ledger(log, capsys) -> None:
+    assert main(["report", str(log.path)]) == 0
+    shown = capsys.readouterr().out
+    assert "Costs, an episode" in shown and "rollouts / success" in shown and "100 %" in shown
+    page = (log.path / "report.html").read_text()
+    assert '<section id="costs">' in page and "rollouts / success" in page
+    with pytest.raises(ArgumentError, match="seconds, calls or spent"):
+        log.store.totals("note")
