@@ -40,6 +40,7 @@ __all__ = [
     "scenes",
     "show",
     "types",
+    "verify",
     "world_model",
 ]
 
@@ -56,6 +57,7 @@ _HOME = {
     "policy": "wiw.registry",
     "power": "wiw.evaluation.power",
     "show": "wiw.viz.show",
+    "verify": "wiw.evaluation.verify",
     "world_model": "wiw.registry",
 }
 """Where a public name lives; the others in `__all__` are modules."""
@@ -78,6 +80,7 @@ if TYPE_CHECKING:
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.power import power
     from wiw.evaluation.runlog import load_run
+    from wiw.evaluation.verify import verify
     from wiw.loop.agent import Agent
     from wiw.policies.base import Policy
     from wiw.registry import make, make_vec, policy, world_model

@@ -19,6 +19,7 @@ from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scenes import scenes
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
+from wiw.cli.verify import verify
 from wiw.cli.view import view
 from wiw.errors import Error
 
@@ -30,8 +31,8 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
-Exit codes: 0 done, 1 the run is invalid, 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM, within 5 seconds;
-after both of these everything recorded is kept and `wiw resume` goes on."""
+Exit codes: 0 done, 1 the run is invalid (verify: it differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM within
+5 seconds; after both of these everything recorded is kept and `wiw resume` goes on."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
@@ -40,6 +41,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (resume, "resume", "Go on with a run that was stopped."),
     (power, "power", "How many episodes a run needs to show a difference."),
     (report, "report", "Table and HTML report of a run."),
+    (verify, "verify", "Run some episodes of a run again, and compare."),
     (view, "view", "Pages to walk through a run, to every decision."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),

@@ -121,23 +121,31 @@ def resume_run(
     if workers is not None:
         _at_least("workers", workers, 1)
     store = RunStore.resume(run)
-    info = store.info
-    if info["task"] is None or None in info["agents"].values():
-        store.close()
-        raise StoreError(
-            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
-            "call the same wiw.evaluate(..., out=..., resume=True) again"
-        )
-    task = TaskRecipe(**info["task"])
     try:
+        task, agents = recipes_of(store)
         built = task.build()
         store.require_task(built.describe())
     except Error:
         store.close()
         raise
-    _require_left(built, store, info["agents"], retry_failed)
-    agents = {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
-    return _finish(store, task, agents, workers or info["workers"], progress, retry_failed=retry_failed)
+    _require_left(built, store, agents, retry_failed)
+    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_failed=retry_failed)
+
+
+def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
+    """How a run's task and agents are made again.
+
+    Raises:
+        StoreError: the run was begun with objects that existed only in memory.
+    """
+    info = store.info
+    if info["task"] is None or None in info["agents"].values():
+        raise StoreError(
+            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
+            "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
+            "wiw.evaluation.recipes.AgentRecipe, or `wiw run`"
+        )
+    return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
 
 
 FOR_EVER = 1e12
@@ -228,14 +236,25 @@ def _require(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
 
 
 def _require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
-    """The same for the episodes that a run has left, which must be run with what the others were run with."""
-    episodes, kept = store.episodes(), store.info.get("scenes", {})
+    """The same for the episodes that a run has left."""
+    episodes = store.episodes()
     try:
-        used = _require(task, [episodes[index] for arm in arms for index in store.pending(arm, retry_failed)])
-        store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
+        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_failed)])
     except Error:
         store.close()
         raise
+
+
+def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> None:
+    """Sees that episodes of a run are run with what the others were run with.
+
+    Raises:
+        FileError: a scene is not there.
+        StoreError: what belongs to a scene has come or gone.
+    """
+    kept = store.info.get("scenes", {})
+    used = _require(task, episodes)
+    store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
 
 
 def _spread(episodes: int, count: int) -> list[int]:
