@@ -20,6 +20,7 @@ from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, ContractError
+from wiw.evaluation.rows import decode_jpeg
 from wiw.loop.scheduler import run_episodes
 from wiw.tasks.ar import AR
 from wiw.types import Answer, Episode, Observation
@@ -216,9 +217,10 @@ def test_many_at_a_time_are_as_one_by_one(file: Path) -> None:
 
 def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
     task = AR(episode_file=file)
-    agent = wiw.Agent(wiw.policy("heuristic")).settled(task.defaults)
-    with pytest.raises(ContractError, match=r"Heuristic\.answer: expected an Answer over"):
-        run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
+    for model, revision in ((None, "heuristic"), ("copy", "matcher")):
+        agent = wiw.Agent("heuristic", model, revision).settled(task.defaults)
+        with pytest.raises(ContractError, match=r"gives no answer, .* one of 4 choices.*revision="):
+            run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     env = task.environment()
     shown, info = env.reset(options={"episode": 0})
     with pytest.raises(ArgumentError, match=r"run\(actions, answer\)"):
@@ -253,3 +255,14 @@ def test_a_scene_without_any_of_the_categories_says_what_it_has(two_rooms: str) 
     with pytest.raises(ArgumentError, match=r"holds nothing of the categories bathtub.*categories=\["):
         AR(two_rooms).episodes(1)
     assert tuple(sorted(ar.CATEGORIES)) == ar.CATEGORIES
+
+
+def test_the_store_keeps_answers_and_pictures_with_the_box(file: Path, tmp_path: Path) -> None:
+    log = wiw.evaluate(AR(episode_file=file), wiw.Agent(SizeReader(0.5)), 1, out=tmp_path / "run", keep_images=1)
+    (episode,) = log.episodes
+    assert episode["status"] == "done"
+    decisions = log.decisions
+    assert [row["answer"]["confidence"] for row in decisions] == pytest.approx([0.5] * 10)
+    assert [len(row["executed"]) for row in decisions] == [1] * 9 + [0]
+    picture = decode_jpeg(log.store.images("none", 0, 0)["panorama"]).astype(int)
+    assert ((picture[..., 0] > 150) & (picture[..., 1:].max(axis=-1) < 110)).sum() > 100

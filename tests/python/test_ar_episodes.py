@@ -77,6 +77,14 @@ def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> Non
         assert info["best_primitives"] <= RULES.budget
 
 
+def test_no_two_episodes_show_a_target_from_one_place(two_rooms: str) -> None:
+    made = ar.generate(
+        world(two_rooms, "cpu"), 8, 1, ("table", "shelf"), ar.EpisodeRules(1, hidden=1, gain=1, survey=30)
+    )
+    assert len({(episode.info["target"], episode.start_position) for episode in made}) == 8
+    assert max(Counter(episode.info["category"] for episode in made).values()) == 4
+
+
 def test_the_best_view_is_as_many_primitives_away_as_it_says(two_rooms: str) -> None:
     place = world(two_rooms, "cpu")
     start, yaw = np.array([-2.0, 0.0, 0.5]), 0.4

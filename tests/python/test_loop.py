@@ -356,7 +356,7 @@ def test_answers_reach_the_decision_and_the_environment() -> None:
     assert decision.answer.label == "lamp" and decision.answer.confidence == 0.7
     assert decision_row("a", record_of(decision), False).values["answer"].startswith('{"label":"lamp"')
     for wrong in (Quiz(0.3, 0.3), Quiz(1.0), Quiz(-0.5, 1.5), Quiz(np.nan, 1.0), Greedy()):
-        with pytest.raises(ContractError, match=r"\.answer: expected"):
+        with pytest.raises(ContractError, match=r"\.answer: expected|Greedy gives no answer"):
             wiw.Agent(wrong).decide_batch([query])
 
 

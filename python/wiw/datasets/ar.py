@@ -161,7 +161,8 @@ def generate(
     tally = Counter(before)
     for round_ in range(count):
         for number, category in enumerate(_order(things, tally, core.fold_key([key, round_]))):
-            episode = _episode(world, survey, things[category], core.fold_key([key, round_, number]), rules)
+            draw = core.fold_key([key, round_, number])
+            episode = _episode(world, survey, things[category], draw, rules, made)
             if episode is not None:
                 made.append(episode)
                 tally[category] += 1
@@ -194,13 +195,23 @@ def _order(things: Mapping[str, Any], tally: Counter[str], key: int) -> list[str
 
 
 def _episode(
-    world: World, survey: Survey, instances: Sequence[Mapping[str, Any]], key: int, rules: EpisodeRules
+    world: World,
+    survey: Survey,
+    instances: Sequence[Mapping[str, Any]],
+    key: int,
+    rules: EpisodeRules,
+    made: Sequence[Episode],
 ) -> Episode | None:
-    """An episode with one of the instances as target, if one has a start that is hard and can be mended."""
+    """An episode with one of the instances as target, if one has a start that is hard and can be mended.
+
+    Never from where the same target is looked at in one of those `made`.
+    """
     draws = core.uniform(key, 2)
     instance = instances[int(draws[0] * len(instances))]
     name, centre = int(instance["id"]), np.asarray(instance["bounds"], np.float64).mean(axis=0)
     for start, size, share in _starts(world, survey, name, centre, core.fold_key([key, 1]), rules):
+        if any(name == other.info["target"] and _triple(start) == other.start_position for other in made):
+            continue
         ahead = np.arctan2(-(centre - start)[0], -(centre - start)[2])
         yaw = float(ahead + np.radians(rules.turned) * (2 * draws[1] - 1)) % (2 * np.pi)
         best = _best_view(world, start, yaw, name, rules)

@@ -130,7 +130,7 @@ def _truth(when: str, truth: Truth) -> dict[str, float]:
 def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     decision = record.decision
     if decision.observation is not None:
-        yield "panorama", encode_jpeg(decision.observation.panorama)
+        yield "panorama", encode_jpeg(decision.observation.as_dict()["panorama"])
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:
         yield "goal", encode_jpeg(decision.goal.image)
     for index, rollout in enumerate(decision.rollouts or ()):

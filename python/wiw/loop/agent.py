@@ -16,7 +16,14 @@ from wiw.errors import ArgumentError
 from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
-from wiw.loop.contract import check_model, check_proposals, checked_answers, checked_plan, checked_scores
+from wiw.loop.contract import (
+    check_answerer,
+    check_model,
+    check_proposals,
+    checked_answers,
+    checked_plan,
+    checked_scores,
+)
 from wiw.loop.imagine import Imagination, imagine
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.policies.base import Policy, Situation
@@ -270,6 +277,7 @@ class Agent:
     def _life(self, query: Query) -> _Life:
         name = (query.key.seed, query.key.episode)
         if query.key.decision == 0 or name not in self._lives:
+            check_answerer(self.revision, query.goal)
             memory = self.policy.begin(query.goal, query.key)
             same = self.revision is self.policy
             self._lives[name] = _Life(memory, memory if same else self.revision.begin(query.goal, query.key), [])

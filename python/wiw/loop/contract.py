@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError
-from wiw.policies.base import Situation
-from wiw.types import Answer, Proposal
+from wiw.policies.base import Policy, Situation
+from wiw.types import Answer, Goal, Proposal
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
@@ -95,6 +95,19 @@ def checked_scores(policy: Any, scores: Any, proposals: Sequence[Sequence[Propos
         if row.shape != (len(plans),) or not np.isfinite(row).all():
             raise ContractError(f"{name}: expected {len(plans)} finite numbers, one a plan, got {row.tolist()}")
     return found
+
+
+def check_answerer(policy: Policy, goal: Goal) -> None:
+    """Refuses a reviser that gives no answer where the goal asks for one.
+
+    Raises:
+        ContractError: it has not written `answer`.
+    """
+    if goal.choices and type(policy).answer is Policy.answer:
+        raise ContractError(
+            f"{type(policy).__name__} gives no answer, but task '{goal.task}' asks for one of {len(goal.choices)} "
+            "choices at every decision; write its `answer`, or give the agent a revision policy that answers (revision=)"
+        )
 
 
 def checked_answers(policy: Any, answers: Any, situations: Sequence[Situation]) -> list[Answer | None]:

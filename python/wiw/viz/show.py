@@ -54,7 +54,7 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     goal = decision.goal
     has_image = goal is not None and goal.image is not None
     columns = place.subgridspec(1, 2, width_ratios=[4, 1]) if has_image else place.subgridspec(1, 1)
-    panorama = decision.observation.panorama
+    panorama = decision.observation.as_dict()["panorama"]
     height = len(panorama)
     _picture(
         figure.add_subplot(columns[0, 0]),
