@@ -39,6 +39,17 @@ def test_a_box_across_the_seam_is_open_there():
     assert not drawn[:, 15:90].any()
 
 
+def test_a_line_outside_hides_nothing_of_a_small_box_and_stays_in_the_image():
+    drawn = is_color(annotate.box(canvas(), (20, 10, 22, 12), color=GREEN, thickness=2, outside=True), GREEN)
+    expected = np.zeros((60, 100), bool)
+    expected[8:14, 18:24] = True
+    expected[10:12, 20:22] = False
+    assert np.array_equal(drawn, expected)
+    drawn = is_color(annotate.box(canvas(), (99, 0, 3, 60), color=GREEN, thickness=2, outside=True), GREEN)
+    assert drawn[30, 97:99].all() and not drawn[30, 99]
+    assert drawn[30, 3:5].all() and not drawn[30, :3].any()
+
+
 def test_a_label_sits_on_a_plate_and_stays_in_the_image():
     drawn = annotate.box(canvas(), (80, 2, 99, 40), "door", color=GREEN)
     plain = annotate.box(canvas(), (80, 2, 99, 40), color=GREEN)

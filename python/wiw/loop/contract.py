@@ -106,7 +106,7 @@ def check_answerer(policy: Policy, goal: Goal) -> None:
     if goal.choices and type(policy).answer is Policy.answer:
         raise ContractError(
             f"{type(policy).__name__} gives no answer, but task '{goal.task}' asks for one of {len(goal.choices)} "
-            "choices at every decision; write its `answer`, or give the agent a revision policy that answers (revision=)"
+            "choices at every decision; write its `answer`, or give the agent a policy that answers (revision=)"
         )
 
 

@@ -22,7 +22,7 @@ def box_of(mask: Mask, wraps: bool = False) -> Box | None:
     rows = np.flatnonzero(mask.any(axis=1))
     if not len(rows):
         return None
-    left, right = _columns(mask.any(axis=0), wraps)
+    left, right = _columns(np.asarray(mask.any(axis=0)), wraps)
     return float(left), float(rows[0]), float(right), float(rows[-1] + 1)
 
 

@@ -172,7 +172,7 @@ def _size(frames: NDArray[np.uint8]) -> tuple[int, int]:
 def _without_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The masks, emptied where nothing is two pixels wide and high: specks at the rims of things are no sight of it."""
     wide = masks[:, :, :-1] & masks[:, :, 1:]
-    seen = (wide[:, :-1] & wide[:, 1:]).any(axis=(1, 2))
+    seen = np.asarray((wide[:, :-1] & wide[:, 1:]).any(axis=(1, 2)))
     return masks & seen[:, None, None]
 
 
