@@ -23,6 +23,7 @@ __all__ = [
     "accepts",
     "action",
     "annotate",
+    "compare",
     "envs",
     "errors",
     "evaluate",
@@ -50,6 +51,7 @@ _HOME = {
     "Policy": "wiw.policies.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
+    "compare": "wiw.evaluation.compare",
     "evaluate": "wiw.evaluation.evaluate",
     "load_run": "wiw.evaluation.runlog",
     "make": "wiw.registry",
@@ -77,6 +79,7 @@ def __dir__() -> list[str]:
 
 if TYPE_CHECKING:
     from wiw import action, annotate, envs, errors, metrics, nav, panorama, registry, render, reproject, scenes, types
+    from wiw.evaluation.compare import compare
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.power import power
     from wiw.evaluation.runlog import load_run

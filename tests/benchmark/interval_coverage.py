@@ -18,11 +18,12 @@ SCENES = (5, 10, 30, 87)
 PER_SCENE = 5
 CORRELATIONS = (0.0, 0.1)
 RUNS, SLOW_RUNS = 20_000, 1_500
-RATES = {"SR 20 %": [0.2, 0.8], "SR 35 %": [0.35, 0.65], "SR 50 %": [0.5, 0.5]}
+RATES = {"SR 5 %": [0.05, 0.95], "SR 20 %": [0.2, 0.8], "SR 35 %": [0.35, 0.65], "SR 50 %": [0.5, 0.5]}
 PAIRS = {  # won, lost, neither; as measured over 210 episodes
     "oracle - none, 69 won 4 lost": [69 / 210, 4 / 210, 137 / 210],
     "warp - none, 52 won 5 lost": [52 / 210, 5 / 210, 153 / 210],
     "climber - none, 33 won 10 lost": [33 / 210, 10 / 210, 167 / 210],
+    "oracle - warp, 21 won 3 lost": [21 / 210, 3 / 210, 186 / 210],
     "no difference, 10 % won 10 % lost": [0.1, 0.1, 0.8],
 }
 ANY_RATE = [[rate, 1 - rate] for rate in np.arange(0.1, 0.91, 0.05)]

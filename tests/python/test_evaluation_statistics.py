@@ -224,12 +224,11 @@ def test_t_over_scenes_is_students_where_every_episode_is_its_own_scene():
 
 
 def test_made_up_episodes_by_hand():
-    scenes = np.repeat(np.arange(5), 4)
-    assert clustered_t(np.zeros(20), scenes, "rate") == pytest.approx(
-        (0.0, 1 / 22 + stats.t.ppf(0.975, 4) * math.sqrt((1 / 22 - 1 / 22**2) / 22))
-    )
-    high = clustered_t(np.zeros(20), scenes, "difference")[1]
-    assert high == pytest.approx(stats.t.ppf(0.975, 4) / 22)
+    scenes, t = np.repeat(np.arange(5), 4), stats.t.ppf(0.975, 4)
+    more = 2 * (stats.norm.ppf(0.975) / t) ** 2
+    n, q = 20 + more, more / 2 / (20 + more)
+    assert clustered_t(np.zeros(20), scenes, "rate") == pytest.approx((0.0, q + t * math.sqrt(q * (1 - q) / n)))
+    assert clustered_t(np.zeros(20), scenes, "difference")[1] == pytest.approx(t * math.sqrt(more / 2) / n)
     with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
         clustered_t(np.zeros(4), np.zeros(4), "rate")
 

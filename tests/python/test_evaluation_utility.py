@@ -86,6 +86,11 @@ def test_arms_that_do_as_the_floor_are_not_certain_to_be_worth_nothing():
     assert one.value == 0 and one.low < -0.02 < 0.02 < one.high
 
 
+def test_an_arm_that_does_as_the_ceiling_is_not_certain_to_be_its_equal():
+    one = summary({**RATES, "mine": 0.8}).utility("mine")
+    assert one.value == 1 and one.low < 0.98 and one.high > 1.02
+
+
 def test_one_scene_counts_its_episodes():
     one = summary(scenes=1, per_scene=60).utility("mine")
     assert one.identifiable and one.scenes == 1

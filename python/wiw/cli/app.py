@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 
 import wiw
+from wiw.cli.compare import compare
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
@@ -39,6 +40,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
+    (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "How many episodes a run needs to show a difference."),
     (report, "report", "Table and HTML report of a run."),
     (verify, "verify", "Run some episodes of a run again, and compare."),

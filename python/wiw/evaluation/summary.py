@@ -99,6 +99,10 @@ class Summary:
                 rows.setdefault(difference.arm, {})[difference.metric] = difference
         return rows
 
+    def remarks(self) -> tuple[str, ...]:
+        """What else a reader must know, a sentence each."""
+        return ()
+
     def utility(self, arm: str) -> Utility:
         """Where an arm stands between floor and ceiling."""
         for found in self.utilities:
@@ -130,6 +134,11 @@ class Summary:
                 return difference
         raise KeyError(f"no difference of {metric} between '{arm}' and '{base}' in this run")
 
+    def __str__(self) -> str:
+        from wiw.evaluation.tables import as_text
+
+        return as_text(self)
+
     def __rich_console__(self, console: Any, options: Any) -> Any:
         from wiw.evaluation.tables import summary_tables
 
@@ -157,6 +166,19 @@ def summarise(
         seed: of the bootstrap.
         policies: arms that have no world model and differ from "none" by their policy.
     """
+    done, failed = finished(arms, outcomes)
+    lines = tuple(_line(arm, role_of(arm, policies), done[arm], failed[arm], episodes, seed) for arm in arms)
+    differences = tuple(
+        difference for base in ("none", FLOOR) if base in arms for difference in _against(base, arms, done, seed)
+    )
+    same = len({frozenset(ended) for ended in done.values()}) == 1
+    return Summary(lines, differences, same, _utilities(lines, done))
+
+
+def finished(
+    arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]]
+) -> tuple[dict[str, dict[int, Mapping[str, Any]]], dict[str, int]]:
+    """By arm: episodes that count, by index; and how many failed for infrastructure."""
     done: dict[str, dict[int, Mapping[str, Any]]] = {arm: {} for arm in arms}
     failed = dict.fromkeys(arms, 0)
     for outcome in outcomes:
@@ -164,12 +186,7 @@ def summarise(
             done[outcome["arm"]][outcome["episode"]] = outcome
         else:
             failed[outcome["arm"]] += 1
-    lines = tuple(_line(arm, role_of(arm, policies), done[arm], failed[arm], episodes, seed) for arm in arms)
-    differences = tuple(
-        difference for base in ("none", FLOOR) if base in arms for difference in _against(base, arms, done, seed)
-    )
-    same = len({frozenset(ended) for ended in done.values()}) == 1
-    return Summary(lines, differences, same, _utilities(lines, done))
+    return done, failed
 
 
 def role_of(arm: str, policies: Collection[str] = ()) -> str:
@@ -184,7 +201,7 @@ def _against(
     base: str, arms: Sequence[str], done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int
 ) -> tuple[Difference, ...]:
     others = [arm for arm in arms if arm not in (base, "none")]
-    found = [compare(arm, base, done, headline, seed) for arm in others for headline in _headlines(done)]
+    found = [compare(arm, base, done, headline, seed) for arm in others for headline in headlines_of(done)]
     return adjusted([difference for difference in found if difference is not None])
 
 
@@ -192,16 +209,16 @@ def _utilities(lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapp
     if FLOOR not in done or CEILING not in done:
         return ()
     others = [line for line in lines if line.name not in (FLOOR, CEILING)]
-    found = [utility(line.name, done, reference=not _under_test(line)) for line in others]
+    found = [utility(line.name, done, reference=not under_test(line.name, line.role)) for line in others]
     return tuple(one for one in found if one is not None)
 
 
-def _under_test(line: ArmSummary) -> bool:
-    """A world model with this run's policy; `warp` is what geometry alone gives."""
-    return line.role == WORLD_MODEL and line.name != "warp" and "+" not in line.name
+def under_test(arm: str, role: str) -> bool:
+    """Whether it is a world model with this run's policy; `warp` is what geometry alone gives."""
+    return role == WORLD_MODEL and arm != "warp" and "+" not in arm
 
 
-def _headlines(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Headline]:
+def headlines_of(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Headline]:
     """The columns that every finished episode has a value for."""
     ended = [outcome["metrics"] for arm in done.values() for outcome in arm.values()]
     return [headline for headline in HEADLINES if ended and all(headline.metric in metrics for metrics in ended)]
@@ -215,7 +232,7 @@ def _line(
         headline.metric: estimate_mean(
             [outcome["metrics"][headline.metric] for outcome in done.values()], scenes, headline, seed=seed
         )
-        for headline in _headlines({arm: done})
+        for headline in headlines_of({arm: done})
     }
     return ArmSummary(arm, role, len(done), failed, episodes - len(done) - failed, estimates)
 
@@ -228,6 +245,7 @@ def notes(summary: Summary) -> list[str]:
         found.insert(0, f"INVALID RUN, not to be quoted: {' '.join(summary.invalid)} `wiw resume --retry-failed`.")
     found += [_missing(line) for line in summary.arms if line.done < line.asked]
     found += [*_about_intervals(summary), *_about_differences(summary), *_about_utility(summary)]
+    found += summary.remarks()
     widest = max(
         (line.estimates["success"] for line in summary.arms if "success" in line.estimates),
         key=lambda estimate: estimate.high - estimate.low,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 from typing import Any
 
 from rich import box
@@ -36,6 +37,13 @@ def print_summary(summary: Summary) -> None:
     """Prints the tables, as wide as the terminal; a file or a pipe sets no limit."""
     console = Console()
     Console(width=None if console.is_terminal else max(console.width, ROOMY)).print(summary)
+
+
+def as_text(summary: Summary) -> str:
+    """The tables as plain text."""
+    console = Console(width=ROOMY, file=io.StringIO(), record=True)
+    console.print(summary)
+    return console.export_text()
 
 
 def summary_tables(summary: Summary, width: int) -> Any:

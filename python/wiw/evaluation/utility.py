@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from wiw.evaluation.intervals import Interval, left_out_covariance, per_cluster, steadied
+from wiw.evaluation.intervals import Interval, left_out_covariance, made_up, per_cluster, steadied
 
 FLOOR, CEILING = "copy", "oracle"
 UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
@@ -81,7 +81,11 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
     squares = [float(np.square(values).sum()) for values in both]
     a, var_a = map(float, steadied(over, squares[0], counts, "difference"))
     b, var_b = map(float, steadied(under, squares[1], counts, "difference"))
-    covariance = _correlation(over, under, counts) * math.sqrt(var_a * var_b)
+    apart = [
+        all_squares - float(sums.sum() ** 2 / counts.sum())
+        for all_squares, sums in zip(squares, (over, under), strict=True)
+    ]
+    covariance = _correlation(over, under, counts, apart) * math.sqrt(var_a * var_b)
     t_square = float(stats.t.ppf(0.5 + confidence / 2, len(counts) - 1)) ** 2
     square, half_linear, constant = b * b - t_square * var_b, a * b - t_square * covariance, a * a - t_square * var_a
     if b <= 0 or square <= 0:
@@ -90,8 +94,16 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
     return float(a / b), (float((half_linear - root) / square), float((half_linear + root) / square))
 
 
-def _correlation(over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64]) -> float:
-    """Of the two means over clusters; where one does not vary, that of fair coins, which share the floor's."""
-    shared, *own = (left_out_covariance(x, y, counts) for x, y in ((over, under), (over, over), (under, under)))
-    scale = math.sqrt(own[0] * own[1])
-    return float(np.clip(shared / scale, -1, 1)) if scale > 1e-12 else 0.5
+def _correlation(
+    over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64], apart: list[float]
+) -> float:
+    """Of the two means over clusters; `apart` are sums of squared distances from the mean, over episodes.
+
+    The made-up episodes count too: three fair coins, floor, arm and ceiling, give either difference a variance of 1/2
+    and both a covariance of 1/4. So an arm that did as the ceiling in every episode is not certain to be its equal.
+    """
+    shared, *own = (float(left_out_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
+    scale, weight = math.sqrt(own[0] * own[1]), made_up(len(counts))
+    seen = min(1.0, max(-1.0, shared / scale)) if scale > 1e-12 else 0.0
+    more = [one + weight / 2 for one in apart]
+    return (seen * math.sqrt(max(0.0, apart[0] * apart[1])) + weight / 4) / math.sqrt(more[0] * more[1])

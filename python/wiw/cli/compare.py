@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw compare`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+Run = Positional[Annotated[Path, arg(metavar="RUN")]]
+Arm = Annotated[str | None, arg(metavar="NAME")]
+
+
+def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -> int:
+    """Compares two runs on the same episodes, the second minus the first.
+
+      $ wiw compare runs/old runs/new                          # every arm that both have
+      $ wiw compare runs/old /elsewhere/new --arm warp         # one
+      $ wiw compare runs/a runs/b --arm warp --other mine      # mine of the second run minus warp of the first
+
+    Every episode of the one meets the same episode of the other, so runs of another task, seed, scenes or episodes are
+    refused: the message names the first field in which they differ. What else differs, such as the policy's weights or
+    the version of wiw, is told below the table.
+
+    Args:
+        first: Folder of a run, wherever it lies.
+        second: Folder of the run that is compared with it.
+        arm: Of both runs, or of the first; all that both have if not given.
+        other: Of the second run, if it has another name there.
+    """
+    from wiw.evaluation.compare import compare as compare_runs
+    from wiw.evaluation.tables import print_summary
+
+    print_summary(compare_runs(first, second, arm, other))
+    return 0
