@@ -59,7 +59,8 @@ def evaluate(
         workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
         progress: whether to show bars.
         arms: world models to run on the same episodes with this agent's policies, or "policy+model" for one with
-            another built-in policy, such as "heuristic+none"; None means the agent's own model.
+            another built-in policy, such as "heuristic+none"; "placebo-shuffled" and "placebo-swapped" are placebos of
+            the agent's model (else of warp), "placebo-shuffled:oracle" of another; None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
         keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one.
         resume: whether to go on with the run in `out` where it was stopped.
@@ -274,14 +275,16 @@ def _finish(
 ) -> RunLog:
     """Runs what is missing, closes the store and opens it for reading."""
     info = store.info
-    plan = Plan(task, agents, store.config["seed"], info["live"], frozenset(info["pictures"]), info["limits"])
+    episodes = store.episodes()
+    pictures = frozenset(info["pictures"])
+    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes)
     pending = {arm: store.pending(arm, retry_failed) for arm in agents}
     board = make_board(progress and any(pending.values()))
     try:
         for arm, indices in pending.items():
             store.discard(arm, indices)
         desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
-        _run_jobs(plan, store.episodes(), pending, desk, workers)
+        _run_jobs(plan, episodes, pending, desk, workers)
         keep_scene_maps(store, task)
     finally:
         board.close()

@@ -13,6 +13,8 @@ from wiw.errors import ArgumentError
 NUMBERS = ("candidates", "horizon", "execute", "depth", "width")
 """Of an agent; where it leaves one open, the task's own is taken."""
 
+PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
+"""What arms of placebos begin with, and the model that they are of where nobody names one."""
 NO_LIMITS: Mapping[str, Any] = {}
 
 
@@ -53,6 +55,7 @@ class AgentRecipe:
     execute: int | None = None
     depth: int | None = None
     width: int | None = None
+    placebo: str | None = None
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):
@@ -73,6 +76,10 @@ class AgentRecipe:
     def with_model(self, model: str) -> AgentRecipe:
         """The same agent with another world model."""
         return replace(self, model=None if model == "none" else model)
+
+    def as_placebo(self, kind: str, model: str | None = None) -> AgentRecipe:
+        """The same agent, whose world model (or another one) imagines something else than the plans."""
+        return replace(self, model=model or self.model or PLACEBO_MODEL, placebo=kind)
 
     def to_json(self) -> dict[str, Any]:
         """For the run store; `AgentRecipe(**...)` is the way back."""
@@ -163,8 +170,9 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
     if arms is None:
         return {_own_arm(agent): agent_recipe(agent)}
     names = [_parts(str(name)) for name in arms]
+    own = getattr(agent, "model", None)
     made: dict[str, AgentRecipe | Ready] = {
-        _arm_name(policy, model): _with_model(_with_policy(agent, policy), model) for policy, model in names
+        _arm_name(policy, model): _with_model(_with_policy(agent, policy), model, own) for policy, model in names
     }
     if not names or len(made) < len(names):
         raise ArgumentError(f"arms: expected different world models, got {[str(name) for name in arms]}")
@@ -180,7 +188,10 @@ def _parts(name: str) -> tuple[str | None, str]:
 
 
 def _arm_name(policy: str | None, model: str) -> str:
-    short = AgentRecipe("", None if model == "none" else model).arm
+    kind, named = placebo_of(model)
+    short = AgentRecipe("", None if named in ("none", None) else named).arm
+    if kind is not None:
+        short = f"{PLACEBO}{kind}{f':{short}' if named else ''}"
     return short if policy is None else policy if model == "none" else f"{policy}+{short}"
 
 
@@ -199,13 +210,36 @@ def _own_arm(agent: Any) -> str:
     return "none" if model is None else type(model).__name__.lower()
 
 
-def _with_model(agent: Any, model: str) -> AgentRecipe | ReadyAgent:
+def _with_model(agent: Any, model: str, own: Any) -> AgentRecipe | ReadyAgent:
+    kind, named = placebo_of(model)
     if isinstance(agent, AgentRecipe):
-        return agent.with_model(model)
+        return agent.with_model(model) if kind is None else agent.as_placebo(kind, named)
+    if kind is not None:
+        return ReadyAgent(agent.but(model=named or own or PLACEBO_MODEL, placebo=kind))
     return ReadyAgent(agent.but(model=None if model == "none" else model))
+
+
+def placebo_of(arm: str) -> tuple[str | None, str | None]:
+    """Kind and model of "placebo-shuffled:oracle"; no model where it names none, no kind for another arm.
+
+    Raises:
+        ArgumentError: an unknown kind of placebo.
+    """
+    from wiw.loop.placebo import PLACEBOS
+
+    if not arm.startswith(PLACEBO):
+        return None, arm
+    kind, _, model = arm.removeprefix(PLACEBO).partition(":")
+    if kind not in PLACEBOS or model == "none":
+        known = " or ".join(f"{PLACEBO}{name}[:MODEL]" for name in PLACEBOS)
+        raise ArgumentError(f"arms: expected {known}, of a world model, got '{arm}'")
+    return kind, model or None
 
 
 def absolute(model: str) -> str:
     """`path.py:Class` with its path made absolute, so that it means the same in any folder; other names as they are."""
+    kind, named = placebo_of(model)
+    if kind is not None and named is not None:
+        return f"{PLACEBO}{kind}:{absolute(named)}"
     path, colon, name = model.rpartition(":")
     return f"{Path(path).expanduser().resolve()}:{name}" if colon and path.endswith(".py") else model

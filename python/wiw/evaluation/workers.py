@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
-from wiw.errors import Error, InfrastructureError
+from wiw.errors import ArgumentError, Error, InfrastructureError
 from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, OutcomeRow, decision_row
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
@@ -51,6 +51,21 @@ class Plan:
     """Episodes whose decisions keep pictures."""
     limits: Mapping[str, Any] = field(default_factory=dict)
     """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
+    episodes: Sequence[Episode] = ()
+    """All episodes of the run, for agents that are shown another one's."""
+
+    def strangers(self, agent: Any, indices: Iterable[int]) -> dict[int, Episode]:
+        """For an agent with placebo="swapped" the next episode of each, counted round; else nothing.
+
+        Raises:
+            ArgumentError: the run has a single episode.
+        """
+        if getattr(agent, "placebo", None) != "swapped":
+            return {}
+        count = len(self.episodes)
+        if count < 2:
+            raise ArgumentError("placebo-swapped shows the model another episode: expected at least 2 episodes, got 1")
+        return {index: self.episodes[(index + 1) % count] for index in indices}
 
 
 @dataclass(frozen=True)
@@ -100,7 +115,15 @@ class Runner:
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
         sink = RowSink(job, self._plan, send)
-        run_episodes(self._task, self._agent, job.episodes, seed=self._plan.seed, live=self._plan.live, sink=sink)
+        run_episodes(
+            self._task,
+            self._agent,
+            job.episodes,
+            seed=self._plan.seed,
+            live=self._plan.live,
+            sink=sink,
+            strangers=self._plan.strangers(self._agent, [index for index, _ in job.episodes]),
+        )
 
 
 def run_here(plan: Plan, jobs: Iterable[Job], desk: Desk) -> None:

@@ -24,7 +24,8 @@ from wiw.loop.contract import (
     checked_plan,
     checked_scores,
 )
-from wiw.loop.imagine import Imagination, imagine
+from wiw.loop.imagine import Imagination, imagine, model_spec
+from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
@@ -41,6 +42,8 @@ class Query:
     key: Key
     simulator: Any = None
     """Fork of the environment; only looked at when the world model declares that it needs one."""
+    stranger: Query | None = None
+    """First moment of another episode; only looked at by an agent with placebo="swapped"."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,7 @@ class Agent:
         cache: "auto" keeps the rollouts of models that declare themselves `cacheable` in `~/.cache/wiw/rollouts`, a
             folder keeps those of any model there, "off" keeps none (`wiw.loop.rollout_cache`).
         cache_gb: most gigabytes of that folder; what was not used for longest goes first.
+        placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
 
     Raises:
         ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
@@ -105,6 +109,7 @@ class Agent:
         deadline: float = DEADLINE,
         cache: str | Path = "auto",
         cache_gb: float = BUDGET_GB,
+        placebo: Placebo | None = None,
     ) -> None:
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
@@ -122,6 +127,11 @@ class Agent:
                 f"Agent: expected candidates, depth and width >= 1 and execute from -horizon to horizon, got "
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
+            )
+        self.placebo = placebo
+        if placebo is not None and (placebo not in PLACEBOS or self.model is None):
+            raise ArgumentError(
+                f"Agent: expected placebo {' or '.join(PLACEBOS)}, with a world model, got '{placebo}' and {self.model}"
             )
         self._limits = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb}
         self._ask: Asking | None = None
@@ -178,6 +188,7 @@ class Agent:
     def but(self, **changes: Any) -> Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
+        parts["placebo"] = self.placebo
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, int]) -> Agent:
@@ -195,6 +206,7 @@ class Agent:
             "execute": self.execute,
             "depth": self.depth,
             "width": self.width,
+            **({} if self.placebo is None else {"placebo": self.placebo}),
         }
 
     def _meter(self) -> Counter[str]:
@@ -234,7 +246,12 @@ class Agent:
         clock: Clock,
     ) -> tuple[Imagination, list[NDArray[np.float64]]]:
         """Imagines and scores the plans of one level."""
-        imagined = imagine(ask, queries, beams.proposals, beams.origins, self.revision.frames, clock)
+        plans: Sequence[Sequence[Proposal]] = beams.proposals
+        if self.placebo == "shuffled":
+            spec = model_spec(ask.model.accepts)
+            plans = [shuffled(own, query.key, spec) for own, query in zip(plans, queries, strict=True)]
+        seen = [_stranger(query) for query in queries] if self.placebo == "swapped" else None
+        imagined = imagine(ask, queries, plans, beams.origins, self.revision.frames, clock, seen)
         beams.spend(imagined.calls)
         with clock("revise"):
             scores = self.revision.score(revising, beams.proposals, imagined.rollouts)
@@ -315,6 +332,15 @@ class Agent:
         if self.execute > 0:
             return min(self.execute, length)
         return max(1, min(length, self.horizon) + self.execute)
+
+
+def _stranger(query: Query) -> Query:
+    if query.stranger is None:
+        raise ArgumentError(
+            "placebo='swapped' imagines from the first observation of another episode, which a run hands over: use "
+            "wiw.evaluate, or decide_batch([Query(..., stranger=Query(...))])"
+        )
+    return query.stranger
 
 
 def settled_numbers(given: Mapping[str, int], defaults: Mapping[str, int]) -> dict[str, int]:

@@ -52,16 +52,18 @@ def imagine(
     origins: Sequence[Sequence[int]],
     frames: FrameSpec,
     clock: Clock,
+    seen: Sequence[Any] | None = None,
 ) -> Imagination:
     """Imagines every proposal of every episode and shows the futures in the views that the reviser asked for.
 
-    `origins` numbers the seed of each proposal.
+    `origins` numbers the seed of each proposal. `seen` are queries whose observations the model is shown instead of the
+    episodes' own; real views, those of leading turns, stay the episodes' own.
     """
     accepts = ask.model.accepts
     with clock("platform"):
-        batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], _spec(accepts))
+        batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], model_spec(accepts))
         panoramas = np.stack([query.observation.panorama for query in queries])
-        conditioning = _conditioning(accepts, batch, queries, panoramas)
+        conditioning = _conditioning(accepts, batch, queries if seen is None else seen)
         seeds = _seeds(batch, queries, origins)
     answers: list[NDArray[np.uint8]] = []
     for part in batch.parts:
@@ -80,7 +82,8 @@ def imagine(
         return Imagination(_unpack(batch, shown, view, proposals), _cost(batch, len(queries)), queries, batch, answers)
 
 
-def _spec(accepts: Accepts) -> Any:
+def model_spec(accepts: Accepts) -> Any:
+    """What the planner must know of a model."""
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
 
 
@@ -89,7 +92,7 @@ def _maker(view: str, size: tuple[int, int]) -> Any:
     return planner.ViewMaker(view, size)
 
 
-def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any], panoramas: NDArray[np.uint8]) -> Conditioning:
+def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> Conditioning:
     """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
     maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
     depth = simulators = None
@@ -102,6 +105,7 @@ def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any], panorama
         simulators = [
             _turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
         ]
+    panoramas = np.stack([query.observation.panorama for query in queries])
     return Conditioning(batch.observations(panoramas, maker), depth=depth, simulators=simulators)
 
 

@@ -6,13 +6,15 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, ContractError, RolloutError
 from wiw.loop.agent import Agent, Query
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
+
+NO_STRANGERS: Mapping[int, Episode] = {}
 
 
 class Sink(Protocol):
@@ -38,13 +40,14 @@ class Trial:
     key: Key
     observation: Any
     begin: float
+    stranger: Query | None = None
     decisions: int = 0
     done: bool = field(default=False)
 
     def query(self, agent: Agent) -> Query:
         """What the agent is asked; a fork of the simulator goes along only where the world model declares its need."""
         simulator = self.env.fork() if "simulator" in agent.needs else None
-        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator)
+        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator, self.stranger)
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Executes the decision's first segment and observes."""
@@ -63,9 +66,18 @@ class Trial:
 
 
 def run_episodes(
-    task: Any, agent: Agent, episodes: Sequence[tuple[int, Episode]], *, seed: int, live: int = 4, sink: Sink
+    task: Any,
+    agent: Agent,
+    episodes: Sequence[tuple[int, Episode]],
+    *,
+    seed: int,
+    live: int = 4,
+    sink: Sink,
+    strangers: Mapping[int, Episode] = NO_STRANGERS,
 ) -> None:
     """Runs (index, episode) pairs to their ends, at most `live` at a time.
+
+    `strangers` names for each index another episode, whose first moment goes along with every query; for placebos.
 
     An exception in an episode is infrastructure: the episode is reported as failed and the rest go on. One in a batch
     may be due to any of its episodes, so each of them is run again by itself, after the others: what fails does not
@@ -77,9 +89,9 @@ def run_episodes(
     try:
         while waiting or trials or suspects:
             while waiting and envs:
-                _start(waiting.popleft(), envs, trials, seed, sink)
+                _start(agent, waiting.popleft(), envs, trials, seed, sink, strangers)
             if not trials and not waiting and suspects:
-                _start(suspects.popleft(), envs, trials, seed, sink)
+                _start(agent, suspects.popleft(), envs, trials, seed, sink, strangers)
             suspects += _advance(agent, trials, sink)
             for trial in [trial for trial in trials if trial.done]:
                 trials.remove(trial)
@@ -90,17 +102,31 @@ def run_episodes(
             env.close()
 
 
-def _start(item: tuple[int, Episode], envs: list[Any], trials: list[Trial], seed: int, sink: Sink) -> None:
+def _start(
+    agent: Agent,
+    item: tuple[int, Episode],
+    envs: list[Any],
+    trials: list[Trial],
+    seed: int,
+    sink: Sink,
+    strangers: Mapping[int, Episode],
+) -> None:
     index, episode = item
     begin = time.perf_counter()
     env = envs.pop()
     try:
+        stranger = _first_moment(agent, env, strangers[index], Key(seed, index)) if strangers else None
         observation = env.begin(episode)
     except Exception as error:  # whatever went wrong, the run goes on and the record says so
         envs.append(env)
         sink.episode(_failed(index, episode, begin, "environment", error))
         return
-    trials.append(Trial(index, episode, env, Key(seed, index), observation, begin))
+    trials.append(Trial(index, episode, env, Key(seed, index), observation, begin, stranger))
+
+
+def _first_moment(agent: Agent, env: Any, episode: Episode, key: Key) -> Query:
+    observation = env.begin(episode)
+    return Query(observation, env.goal, key, env.fork() if "simulator" in agent.needs else None)
 
 
 def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, Episode]]:

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Placebos cost what the real arm costs, tell nothing of the plan, and are as reproducible as anything else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import wiw
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.errors import ArgumentError
+from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
+from wiw.loop.agent import Query
+from wiw.loop.imagine import model_spec
+from wiw.loop.placebo import shuffled
+from wiw.types import Key, Proposal
+
+SPEC = model_spec(wiw.accepts(control="trajectory"))
+PLANS = st.lists(
+    st.lists(st.sampled_from([int(FORWARD), int(TURN_LEFT), int(TURN_RIGHT), int(STOP)]), min_size=1, max_size=6),
+    min_size=1,
+    max_size=5,
+)
+
+
+def proposals(plans):
+    return [Proposal(plan, prior=float(i), note=str(i)) for i, plan in enumerate(plans)]
+
+
+@settings(max_examples=60)
+@given(PLANS, st.integers(0, 5))
+def test_shuffling_keeps_lengths_primitives_and_stops(plans, decision) -> None:
+    dealt = shuffled(proposals(plans), Key(3, 1, decision), SPEC)
+    assert [len(p.actions) for p in dealt] == [len(plan) for plan in plans]
+    assert sorted(a for p in dealt for a in p.actions.tolist()) == sorted(a for plan in plans for a in plan)
+    for p, plan in zip(dealt, plans, strict=True):
+        assert [a == STOP for a in p.actions.tolist()] == [a == STOP for a in plan]
+    assert [(p.prior, p.note) for p in dealt] == [(p.prior, p.note) for p in proposals(plans)]
+    again = shuffled(proposals(plans), Key(3, 1, decision), SPEC)
+    assert all((a.actions == b.actions).all() for a, b in zip(dealt, again, strict=True))
+
+
+def test_shuffling_differs_by_decision_and_usually_changes_plans() -> None:
+    plans = proposals([[1, 1, 1, 1, 1], [2, 2, 1, 1, 1], [1, 3, 1, 3, 1]])
+    found = {tuple(tuple(p.actions.tolist()) for p in shuffled(plans, Key(0, 0, d), SPEC)) for d in range(30)}
+    assert len(found) > 15 and tuple(tuple(p.actions.tolist()) for p in plans) not in found
+
+
+class Seen(wiw.WorldModel):
+    """Answers with the mean colour of what it is shown; remembers plans and colours."""
+
+    accepts = wiw.accepts(control="action", view="panorama")
+
+    def __init__(self) -> None:
+        self.log = []
+
+    def rollout(self, observations, controls, seeds):
+        for image, control in zip(observations.image, controls, strict=True):
+            self.log.append((int(image.mean()), control.actions[: control.length].tolist()))
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+
+
+class Fixed(wiw.Policy):
+    """Three plans, one beginning with a turn; likes bright ends."""
+
+    def propose(self, situations, candidates, horizon):
+        return [[Proposal([1, 1, 2]), Proposal([2, 1, 1]), Proposal([1, 3, 1])] for _ in situations]
+
+    def score(self, situations, proposals, rollouts):
+        return [np.array([float(r.frames[-1].mean()) for r in rows]) for rows in rollouts]
+
+
+def query(fill, stranger=None):
+    panorama = np.full((576, 1024, 3), fill, np.uint8)
+    observation = wiw.types.Observation(panorama, panorama[:480, :480], np.zeros(3))
+    return Query(observation, wiw.types.Goal("x"), Key(0, 0, 0), stranger=stranger)
+
+
+def test_the_swapped_model_sees_the_stranger_and_the_policy_keeps_its_real_views() -> None:
+    model = Seen()
+    agent = wiw.Agent(Fixed(), model, placebo="swapped")
+    (decision,) = agent.decide_batch([query(40, stranger=query(200))])
+    assert [colour for colour, _ in model.log] == [200] * 3
+    assert sorted(plan for _, plan in model.log) == [[1, 1], [1, 1, 2], [1, 3, 1]]
+    turned, ahead = decision.rollouts[1].frames[0], decision.rollouts[1].frames[1]
+    assert turned.mean() == 40 and decision.rollouts[1].real[0] and ahead.mean() == 200
+    with pytest.raises(ArgumentError, match="stranger"):
+        agent.decide_batch([query(40)])
+
+
+def test_the_shuffled_model_sees_other_plans_and_the_policy_scores_its_own() -> None:
+    real, placebo = Seen(), Seen()
+    wiw.Agent(Fixed(), real).decide_batch([query(40)])
+    (decision,) = wiw.Agent(Fixed(), placebo, placebo="shuffled").decide_batch([query(40)])
+    assert [p.actions.tolist() for p in decision.proposals] == [[1, 1, 2], [2, 1, 1], [1, 3, 1]]
+    assert [len(r.frames) for r in decision.rollouts] == [3, 3, 3]
+    assert sorted(plan for _, plan in placebo.log) != sorted(plan for _, plan in real.log)
+    assert len(placebo.log) == len(real.log) == decision.calls["rows"]
+
+
+def test_what_placebo_arms_are_of() -> None:
+    agent = AgentRecipe("matcher", "oracle", horizon=7)
+    arms = ["placebo-shuffled", "placebo-swapped:copy", "heuristic+placebo-shuffled", "placebo-shuffled:a/b.py:Mine"]
+    made = arm_recipes(agent, arms)
+    assert made == {
+        "placebo-shuffled": AgentRecipe("matcher", "oracle", horizon=7, placebo="shuffled"),
+        "placebo-swapped:copy": AgentRecipe("matcher", "copy", horizon=7, placebo="swapped"),
+        "heuristic+placebo-shuffled": AgentRecipe("heuristic", "oracle", horizon=7, placebo="shuffled"),
+        "placebo-shuffled:Mine": AgentRecipe("matcher", "a/b.py:Mine", horizon=7, placebo="shuffled"),
+    }
+    assert AgentRecipe(**made["placebo-shuffled"].to_json()) == made["placebo-shuffled"]
+    assert arm_recipes(AgentRecipe("matcher"), ["placebo-swapped"])["placebo-swapped"].model == "warp"
+    built = arm_recipes(wiw.Agent("matcher", "copy"), ["placebo-shuffled"])["placebo-shuffled"].build({})
+    assert built.placebo == "shuffled" and type(built.model).__name__ == "Copy"
+    assert absolute("placebo-shuffled:a.py:Mine").startswith("placebo-shuffled:/")
+    for wrong in ("placebo-odd", "placebo-shuffled:none"):
+        with pytest.raises(ArgumentError, match="placebo-shuffled"):
+            arm_recipes(agent, [wrong])
+    with pytest.raises(ArgumentError, match="with a world model"):
+        wiw.Agent("matcher", placebo="shuffled")
+
+
+@pytest.fixture(scope="module")
+def run(two_rooms, tmp_path_factory):
+    """The same arms with one worker and several episodes live, and with two workers."""
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
+    agent = AgentRecipe("heuristic", "copy", revision="matcher")
+    arms = ["copy", "placebo-shuffled", "placebo-swapped", "placebo-swapped:oracle"]
+
+    def made(workers, live):
+        out = tmp_path_factory.mktemp("run") / "r"
+        return wiw.evaluate(task, agent, 4, out=out, workers=workers, live=live, arms=arms, progress=False)
+
+    return made(1, 4), made(2, 1)
+
+
+def test_placebos_do_not_depend_on_workers_or_batches(run) -> None:
+    def facts(log):
+        names = ("arm", "episode", "decision", "actions", "scores", "executed", "path", "calls")
+        return [{name: row[name] for name in names} for row in log.decisions]
+
+    assert facts(run[0]) == facts(run[1]) and len({row["arm"] for row in run[0].decisions}) == 4
+    assert all(row["status"] == "done" for row in run[0].episodes)
+
+
+def test_placebos_cost_what_the_real_arm_costs(run) -> None:
+    """Where both stand at the same place: at the first decision, with the same proposals."""
+    first = {(row["arm"], row["episode"]): row for row in run[0].decisions if row["decision"] == 0}
+    for episode in range(4):
+        real, swapped = first["copy", episode], first["placebo-swapped", episode]
+        assert real["proposals"] == swapped["proposals"] and real["calls"] == swapped["calls"]
+        shuffle = first["placebo-shuffled", episode]["calls"]
+        assert abs(shuffle["rows"] - real["calls"]["rows"]) <= 1
+        assert first["placebo-shuffled", episode]["proposals"] == real["proposals"]
+
+
+def test_a_swap_needs_another_episode(two_rooms, tmp_path) -> None:
+    task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
+    with pytest.raises(ArgumentError, match="at least 2 episodes"):
+        wiw.evaluate(task, AgentRecipe("matcher"), 1, out=tmp_path / "r", arms=["placebo-swapped"], progress=False)
