@@ -174,7 +174,11 @@ TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav"
 TRACKERS = Registry(
     "tracker",
     "",
-    {"reprojection": "wiw.perception.tracking:Reprojection", "sam2": "wiw.perception.sam2:Sam2"},
+    {
+        "reprojection": "wiw.perception.tracking:Reprojection",
+        "growing": "wiw.perception.growing:Growing",
+        "sam2": "wiw.perception.sam2:Sam2",
+    },
 )
 METRICS = Registry(
     "metric",

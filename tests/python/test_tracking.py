@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_viewpoints
@@ -18,6 +18,7 @@ from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError
 from wiw.panorama import directions
 from wiw.perception.boxes import box_of, largest_part, scaled, width_of
+from wiw.perception.growing import Growing, grown
 from wiw.perception.tracking import Reprojection, Tracker, _without_specks, track_rollouts
 from wiw.perception.views import target_views
 from wiw.registry import TRACKERS
@@ -77,6 +78,37 @@ def test_what_is_hidden_in_the_new_view_is_not_marked(two_rooms: str) -> None:
         assert (marked & ~true).sum() <= 80  # a column of pixels at the rim; the whole shelf has 1400
     assert track.found[:3].all()
     assert not track.found[seen == 0].any()
+
+
+def test_what_comes_into_sight_is_grown_into(two_rooms: str) -> None:
+    aside = np.tile(np.eye(4), (8, 1, 1))
+    aside[:, 0, 3] = 0.04 * np.arange(1, 9)  # out from behind the wall beside the door
+    observation, frames, truth = look(world(two_rooms), (-1.0, 0, 1.05), -np.pi / 2, "shelf", aside)
+    plain, more = (tracker.track([observation], [aside], [frames])[0] for tracker in (Reprojection(), Growing()))
+    boxes = [
+        [overlap(boxed(b), boxed(box_of(t, True))) for b, t in zip(x.boxes, truth, strict=True)] for x in (plain, more)
+    ]
+    assert np.mean(boxes[0]) < 0.5
+    assert np.mean(boxes[1]) > 0.8
+    again = Growing().track([observation], [aside], [frames])[0]
+    np.testing.assert_array_equal(more.masks, again.masks)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 63), st.booleans())
+@settings(max_examples=25)
+def test_growth_keeps_the_seed_and_stays_in_what_was_not_seen(seed: int, shift: int, wraps: bool) -> None:
+    rng = np.random.default_rng(seed)
+    frame = rng.integers(0, 255, (32, 64, 3), np.uint8)
+    own, unseen = np.zeros((32, 64), bool), np.zeros((32, 64), bool)
+    own[12:18, 20:26] = True
+    unseen[10:20, 26:36] = True
+    frame[own | unseen] = frame[own | unseen] // 8
+    found = grown(*(np.roll(part, shift, axis=1) for part in (frame, own, unseen)), wraps)
+    found = np.roll(found, -shift, axis=1)
+    assert (found & own).sum() == own.sum()
+    assert not (found & ~own & ~unseen).any()
+    if wraps:
+        np.testing.assert_array_equal(found, grown(frame, own, unseen, wraps))
 
 
 def test_a_hairline_is_no_sight_of_a_target() -> None:

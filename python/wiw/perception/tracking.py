@@ -122,28 +122,39 @@ class Reprojection(Tracker):
         panoramic: bool,
     ) -> list[NDArray[np.bool_]]:
         """The warped mask, without what no observation showed."""
+        return [mask for mask, _ in self.reprojected(observations, viewpoints, frames, panoramic)]
+
+    def reprojected(
+        self,
+        observations: Sequence[Observation],
+        viewpoints: Sequence[NDArray[np.float64]],
+        frames: Sequence[NDArray[np.uint8]],
+        panoramic: bool,
+    ) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+        """For each plan the warped mask and what the observation did not show, both bool [K, H, W]."""
         found: list[Any] = [None] * len(frames)
         for rows in _grouped(observations, frames):
             poses = np.concatenate([viewpoints[row] for row in rows])
             moved = _moved(observations[rows[0]], poses, _size(frames[rows[0]]), panoramic)
-            parts = np.split(moved, np.cumsum([len(viewpoints[row]) for row in rows])[:-1])
-            for row, part in zip(rows, parts, strict=True):
-                found[row] = part
+            cuts = np.cumsum([len(viewpoints[row]) for row in rows])[:-1]
+            for row, *parts in zip(rows, *(np.split(images, cuts) for images in moved), strict=True):
+                found[row] = tuple(parts)
         return found
 
 
 def _moved(
     observation: Observation, poses: NDArray[np.float64], size: tuple[int, int], panoramic: bool
-) -> NDArray[np.bool_]:
-    """Bool [K, H, W]: the target's mask as seen from K poses."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """The target's mask as seen from K poses, and what was not seen from the observation's, both bool [K, H, W]."""
     depth, mask = observation.depth, target_of(observation).mask
     assert depth is not None
     if not len(poses) or not mask.any():
-        return np.zeros((len(poses), *size), bool)
+        return np.zeros((len(poses), *size), bool), np.ones((len(poses), *size), bool)
     painted = np.repeat(mask[None, :, :, None], 3, axis=3).astype(np.uint8) * 255
     hfov = None if panoramic else FRONT_HFOV
     shown = warp(painted, depth[None], poses[None], size=size, target_hfov_deg=hfov, outputs=("color", "hole"))
-    return (shown["color"][0, ..., 0] > 127) & ~shown["hole"][0]
+    hole = shown["hole"][0]
+    return (shown["color"][0, ..., 0] > 127) & ~hole, hole
 
 
 def target_of(observation: Observation) -> Target:
