@@ -52,7 +52,7 @@ def grown(frame: NDArray[np.uint8], seed: Mask, unseen: Mask, wraps: bool) -> Ma
     if box is None or not unseen.any():
         return seed
     shift = round(seed.shape[1] / 2 - box[0] - width_of(box, seed.shape[1]) / 2) if wraps else 0
-    image, own, open_ = (np.roll(part, shift, axis=1) for part in (frame, seed, unseen))
+    image, own, open_ = np.roll(frame, shift, axis=1), np.roll(seed, shift, axis=1), np.roll(unseen, shift, axis=1)
     middle = box_of(own)
     assert middle is not None
     crop = _around(middle, seed.shape)
@@ -82,7 +82,8 @@ def _cut(image: NDArray[np.uint8], seed: Mask, unseen: Mask) -> Mask:
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
     small = np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     cv2.setRNGSeed(0)  # its mixtures of colours begin at random
-    cv2.grabCut(small, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), ROUNDS, cv2.GC_INIT_WITH_MASK)
+    rectangle = (0, 0, 0, 0)  # not looked at where a mask is given
+    cv2.grabCut(small, labels, rectangle, np.zeros((1, 65)), np.zeros((1, 65)), ROUNDS, cv2.GC_INIT_WITH_MASK)
     _, pieces = cv2.connectedComponents((labels & 1).astype(np.uint8))
     kept = np.isin(pieces, np.unique(pieces[settled])).astype(np.uint8)
     return np.asarray(cv2.resize(kept, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0, bool)
