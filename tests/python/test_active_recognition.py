@@ -20,6 +20,7 @@ from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, ContractError
+from wiw.evaluation.report.episodes import Attempt
 from wiw.evaluation.rows import decode_jpeg
 from wiw.loop.scheduler import run_episodes
 from wiw.tasks.ar import AR
@@ -266,3 +267,15 @@ def test_the_store_keeps_answers_and_pictures_with_the_box(file: Path, tmp_path:
     assert [len(row["executed"]) for row in decisions] == [1] * 9 + [0]
     picture = decode_jpeg(log.store.images("none", 0, 0)["panorama"]).astype(int)
     assert ((picture[..., 0] > 150) & (picture[..., 1:].max(axis=-1) < 110)).sum() > 100
+
+
+def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
+    task = AR(episode_file=file, decisions=2)
+    log = wiw.evaluate(task, wiw.Agent(SizeReader(0.5)), 1, out=tmp_path / "run", keep_images=1)
+    page = log.report().read_text()
+    assert "The boxed thing: table" in page
+    assert "Answer: table, 50 %" in page
+    assert "recognised in 2 decisions" in page
+    assert "find where this was taken" not in page
+    missed = Attempt("none", {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}, (), None, CHOICES)
+    assert missed.text == "taken for shelf in 0 decisions"

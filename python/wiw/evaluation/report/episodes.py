@@ -84,6 +84,8 @@ class Step:
     note: str
     seconds: Mapping[str, float]
     calls: Mapping[str, float]
+    answer: str = ""
+    """What the agent believed and how surely, where the task asks."""
 
     @property
     def gain(self) -> float:
@@ -99,6 +101,8 @@ class Attempt:
     outcome: Mapping[str, Any]
     steps: tuple[Step, ...]
     trail: Trail | None
+    choices: Sequence[str] = ()
+    """What answers are chosen from, where the task asks for any."""
 
     @property
     def reached(self) -> bool:
@@ -112,10 +116,16 @@ class Attempt:
             return "failed for infrastructure"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
+        if self.choices:
+            return f"recognised in {count}" if self.reached else f"{self._mistaken(metrics)} in {count}"
         if self.reached:
             return f"reached in {count}"
         left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
         return f"not reached in {count}{left}"
+
+    def _mistaken(self, metrics: Mapping[str, Any]) -> str:
+        predicted = int(metrics.get("predicted", -1))
+        return f"taken for {self.choices[predicted]}" if 0 <= predicted < len(self.choices) else "not answered"
 
 
 @dataclass(frozen=True)
@@ -141,7 +151,13 @@ class Story:
     def way(self) -> str:
         """E.g. " · 4.2 m to go"; nothing where no arm could measure it."""
         length = self.episode.geodesic
-        return f" · {length:.1f} m to go" if np.isfinite(length) else ""
+        end = "to the best view" if self.target else "to go"
+        return f" · {length:.1f} m {end}" if np.isfinite(length) else ""
+
+    @property
+    def target(self) -> str:
+        """What is to be recognised, where the task is that."""
+        return str(self.episode.info.get("category", ""))
 
 
 def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
@@ -213,7 +229,8 @@ def _attempt(
         _step(row, store.images(arm, row["episode"], row["decision"]), album, f"{name}-{row['decision']}")
         for row in decisions
     )
-    return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None)
+    choices = store.config.get("task", {}).get("categories", ())
+    return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None, choices)
 
 
 def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, name: str) -> Step:
@@ -230,6 +247,7 @@ def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, nam
         row["note"],
         row["seconds"],
         row["calls"],
+        f"{row['answer']['label']}, {100 * row['answer']['confidence']:.0f} %" if row["answer"] else "",
     )
 
 
