@@ -38,6 +38,7 @@ __all__ = [
     "registry",
     "render",
     "reproject",
+    "scale",
     "scenes",
     "show",
     "types",
@@ -58,6 +59,7 @@ _HOME = {
     "make_vec": "wiw.registry",
     "policy": "wiw.registry",
     "power": "wiw.evaluation.power",
+    "scale": "wiw.evaluation.scale",
     "show": "wiw.viz.show",
     "verify": "wiw.evaluation.verify",
     "world_model": "wiw.registry",
@@ -83,6 +85,7 @@ if TYPE_CHECKING:
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.power import power
     from wiw.evaluation.runlog import load_run
+    from wiw.evaluation.scale import scale
     from wiw.evaluation.verify import verify
     from wiw.loop.agent import Agent
     from wiw.policies.base import Policy

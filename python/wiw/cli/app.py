@@ -18,6 +18,7 @@ from wiw.cli.names import list_names
 from wiw.cli.power import power
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
+from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
 from wiw.cli.verify import verify
@@ -42,6 +43,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (resume, "resume", "Go on with a run that was stopped."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "How many episodes a run needs to show a difference."),
+    (scale, "scale", "Success against the number of imagined futures."),
     (report, "report", "Table and HTML report of a run."),
     (verify, "verify", "Run some episodes of a run again, and compare."),
     (view, "view", "Pages to walk through a run, to every decision."),

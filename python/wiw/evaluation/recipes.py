@@ -56,6 +56,8 @@ class AgentRecipe:
     depth: int | None = None
     width: int | None = None
     placebo: str | None = None
+    pool: int | None = None
+    imagine_fraction: float | None = None
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):

@@ -21,7 +21,7 @@ from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, OutcomeRow, to_
 from wiw.evaluation.store import DECISION_JSON, RunStore
 from wiw.evaluation.workers import Job, Plan, Runner
 
-UNLIKE = ("seconds", "calls", "arm", "episode", "decision")
+UNLIKE = ("seconds", "calls", "spent", "arm", "episode", "decision")
 """Columns of a decision that are not compared: timings, what depends on retries and caches, and the row's own name."""
 
 
@@ -106,7 +106,8 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     store.require_task(built.describe())
     require_scenes(built, store, [all_episodes[index] for _, index in keys])
     limits = {**info.get("limits", {}), "cache": "off"}
-    plan = Plan(task, agents, store.config["seed"], info["live"], frozenset(info["pictures"]), limits)
+    pictures = frozenset(info["pictures"])
+    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
     runner, found = Runner(plan), dict[tuple[str, int], Facts]()
     for arm in agents:
         indices = sorted(index for name, index in keys if name == arm)

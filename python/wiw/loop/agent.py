@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw._core import core
 from wiw.errors import ArgumentError
 from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.beam import Beams
@@ -31,6 +32,9 @@ from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
 from wiw.types import Decision, Goal, Key, Observation, Proposal, Rollout
 from wiw.world_models.base import WorldModel
+
+_CONSULT = 0x636F6E73
+"""Keeps the draw whether to consult apart from all others of the decision."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,10 @@ class Agent:
         cache: "auto" keeps the rollouts of models that declare themselves `cacheable` in `~/.cache/wiw/rollouts`, a
             folder keeps those of any model there, "off" keeps none (`wiw.loop.rollout_cache`).
         cache_gb: most gigabytes of that folder; what was not used for longest goes first.
+        pool: plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ
+            in `candidates` alone are nested; None proposes as many as are kept.
+        imagine_fraction: share of decisions for which the model is consulted; for the others the proposer's own
+            preference decides. Drawn by the decision's key: what a smaller share consults, a larger one does too.
         placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
 
     Raises:
@@ -110,6 +118,8 @@ class Agent:
         cache: str | Path = "auto",
         cache_gb: float = BUDGET_GB,
         placebo: Placebo | None = None,
+        pool: int | None = None,
+        imagine_fraction: float = 1.0,
     ) -> None:
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
@@ -127,6 +137,13 @@ class Agent:
                 f"Agent: expected candidates, depth and width >= 1 and execute from -horizon to horizon, got "
                 f"candidates={self.candidates}, horizon={self.horizon}, execute={self.execute}, depth={depth}, "
                 f"width={self.width}"
+            )
+        self.pool, self.imagine_fraction = self.candidates if pool is None else pool, imagine_fraction
+        self._given_pool = pool
+        if self.pool < self.candidates or not 0 <= imagine_fraction <= 1:
+            raise ArgumentError(
+                f"Agent: expected a pool of at least candidates={self.candidates} and an imagine_fraction from 0 to 1, "
+                f"got pool={pool}, imagine_fraction={imagine_fraction}"
             )
         self.placebo = placebo
         if placebo is not None and (placebo not in PLACEBOS or self.model is None):
@@ -168,8 +185,9 @@ class Agent:
             self.policy.observe(proposing)
             if self.revision is not self.policy:
                 self.revision.observe(revising)
-            proposals = self.policy.propose(proposing, self.candidates, self.horizon)
-            check_proposals(self.policy, proposals, len(queries), self.candidates, self.horizon)
+            proposals = self.policy.propose(proposing, self.pool, self.horizon)
+            check_proposals(self.policy, proposals, len(queries), self.pool, self.horizon)
+            proposals = [plans[: self.candidates] for plans in proposals]
         futures = self._futures(queries, proposing, revising, proposals, clock)
         with clock("revise"):
             shown = [future.proposals for future in futures], [future.rollouts for future in futures]
@@ -188,7 +206,7 @@ class Agent:
     def but(self, **changes: Any) -> Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
-        parts["placebo"] = self.placebo
+        parts |= {"placebo": self.placebo, "pool": self._given_pool, "imagine_fraction": self.imagine_fraction}
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, int]) -> Agent:
@@ -207,6 +225,8 @@ class Agent:
             "depth": self.depth,
             "width": self.width,
             **({} if self.placebo is None else {"placebo": self.placebo}),
+            **({} if self._given_pool is None else {"pool": self.pool}),
+            **({} if self.imagine_fraction == 1 else {"imagine_fraction": self.imagine_fraction}),
         }
 
     def _meter(self) -> Counter[str]:
@@ -226,14 +246,30 @@ class Agent:
         clock: Clock,
     ) -> list[_Future]:
         """What each episode has to choose from: imagined and scored, or with the proposer's own preference."""
-        if self._ask is None:
-            return [_Future(plans, None, np.array([plan.prior for plan in plans]), {}) for plans in proposals]
+        futures = [_Future(plans, None, np.array([plan.prior for plan in plans]), {}) for plans in proposals]
+        asking = [place for place, query in enumerate(queries) if consults(query.key, self.imagine_fraction)]
+        if self._ask is not None and asking:
+            chosen = ([values[place] for place in asking] for values in (queries, proposing, revising, proposals))
+            for place, future in zip(asking, self._imagined(self._ask, *chosen, clock), strict=True):
+                futures[place] = future
+        return futures
+
+    def _imagined(
+        self,
+        ask: Asking,
+        queries: Sequence[Query],
+        proposing: Sequence[Situation],
+        revising: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        clock: Clock,
+    ) -> list[_Future]:
+        """What each episode has to choose from after looking ahead."""
         beams = Beams(proposing, proposals, self.width, self.depth)
-        imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
+        imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
         while beams.level < self.depth:
             with clock("propose"):
                 beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
-            imagined, scores = self._look_ahead(self._ask, queries, revising, beams, clock)
+            imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
         rows = zip(beams.proposals, imagined.rollouts, scores, beams.calls, strict=True)
         return [_Future(plans, rollouts, score, dict(calls)) for plans, rollouts, score, calls in rows]
 
@@ -332,6 +368,11 @@ class Agent:
         if self.execute > 0:
             return min(self.execute, length)
         return max(1, min(length, self.horizon) + self.execute)
+
+
+def consults(key: Key, fraction: float) -> bool:
+    """Whether a world model that is consulted for a share of all decisions is consulted for this one."""
+    return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _CONSULT]), 1)[0] < fraction)
 
 
 def _stranger(query: Query) -> Query:

@@ -52,6 +52,26 @@ def success_by_arm(summary: Summary) -> Markup:
     return _svg(figure, "success-by-arm")
 
 
+def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) -> Markup:
+    """Success rates with their intervals against imagined futures; for each series (rollouts, estimate, label)."""
+    colors = arm_colors(list(series))
+    figure, axes = _figure()
+    for name, points in series.items():
+        axes.plot(
+            [x for x, _, _ in points], [found.value for _, found, _ in points], "-o", color=colors[name], label=name
+        )
+        for x, found, label in points:
+            axes.plot([x, x], [found.low, found.high], color=colors[name], lw=4, alpha=0.3, solid_capstyle="round")
+            axes.annotate(label, (x, found.value), textcoords="offset points", xytext=(6, 6), fontsize=8, color=INK)
+    axes.set_ylim(-2, 102)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("imagined futures an episode")
+    axes.set_ylabel("success rate, %")
+    axes.grid(axis="y", color=INK, alpha=0.08)
+    _legend(axes)
+    return _svg(figure, "success-by-rollouts")
+
+
 def success_by_distance(outcomes: Outcomes) -> Markup:
     """How success depends on the way to go: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))

@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw scale`."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+Name = Annotated[str, arg(metavar="NAME")]
+Count = Annotated[int, arg(metavar="N")]
+Values = Annotated[str | None, arg(metavar="A,B,...")]
+
+
+def scale(
+    task: Positional[Annotated[str, arg(metavar="TASK")]] = "imagenav",
+    /,
+    *,
+    world_model: Name = "warp",
+    policy: Name = "matcher",
+    revision: Annotated[str | None, arg(metavar="NAME")] = None,
+    candidates: Values = None,
+    imagine_fraction: Values = None,
+    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    episodes: Count = 20,
+    seed: Count = 0,
+    workers: Count = 1,
+    out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    horizon: Annotated[int | None, arg(metavar="L")] = None,
+    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    backend: Literal["auto", "cpu", "gpu"] = "auto",
+    live: Count = 4,
+    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
+    cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
+    cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
+) -> int:
+    """Success against the number of futures that a world model imagines, all amounts on the same episodes.
+
+      $ wiw scale imagenav --world-model warp --candidates 1,2,4,8
+      $ wiw scale imagenav --world-model my_model.py:MyModel --imagine-fraction 0,0.25,0.5,0.75,1
+
+    The amounts are nested: fewer candidates are the first of the most, and a smaller share of decisions is part of a
+    larger one. Writes scale.json and scale.svg beside the run, which `wiw resume` and `wiw report` know as any other.
+
+    Args:
+        task: See `wiw list`.
+        world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        policy: Proposes plans; name or path.py:Class.
+        revision: Scores imagined futures; the policy's own choice if not given.
+        candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
+        imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
+        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        episodes: How many.
+        seed: All randomness is a function of it.
+        workers: Processes; results do not depend on it.
+        out: Folder of the run; runs/scale-TIME if not given.
+        horizon: Primitives in a plan; the task's own number if not given.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        backend: Renderer.
+        live: Episodes kept live at a time in a process, so that model calls are batched.
+        deadline: Most seconds for a call of the world model, 600 if not given.
+        cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
+            folder for every model; or off.
+        cache_gb: Most gigabytes of that folder.
+    """
+    from wiw.cli.run import stoppable
+    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.evaluation.scale import scale as run_scale
+
+    agent = AgentRecipe(
+        absolute(policy), None if world_model == "none" else absolute(world_model), revision and absolute(revision),
+        horizon=horizon,
+    )  # fmt: skip
+    recipe = TaskRecipe(task, {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend})
+    folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")
+
+    def work() -> Any:
+        return run_scale(
+            recipe, agent, counts, shares, episodes, seed, folder, workers,
+            live=live, deadline=deadline, cache=cache, cache_gb=cache_gb,
+        )  # fmt: skip
+
+    found = stoppable(work, folder)
+    found.summary()
+    for path in found.save():
+        print(path)
+    problems = found.log.numbers().invalid
+    for reason in problems:
+        print(f"INVALID RUN, not to be quoted: {reason}")
+    return 1 if problems else 0
+
+
+def _numbers(text: str | None, kind: Any, name: str) -> list[Any] | None:
+    from wiw.errors import ArgumentError
+
+    if text is None:
+        return None
+    try:
+        return [kind(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        raise ArgumentError(f"--{name}: expected numbers as in 1,2,4, got '{text}'") from None

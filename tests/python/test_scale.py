@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inference-time scaling: nested amounts of imagination on the same episodes."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.cli.app import main
+from wiw.errors import ArgumentError
+from wiw.evaluation.recipes import AgentRecipe
+from wiw.loop.agent import Query, consults
+from wiw.types import Goal, Key, Observation, Proposal
+
+
+def test_shares_of_decisions_are_nested_and_as_large_as_said() -> None:
+    keys = [Key(5, e, d) for e in range(100) for d in range(20)]
+    before: set[Key] = set()
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        chosen = {key for key in keys if consults(key, share)}
+        assert before <= chosen and abs(len(chosen) / len(keys) - share) < 0.04
+        before = chosen
+    assert len(before) == len(keys)
+
+
+class Many(wiw.Policy):
+    """Proposes one plan after another; remembers how many it was asked for."""
+
+    asked = 0
+
+    def propose(self, situations, candidates, horizon):
+        self.asked = candidates
+        return [[Proposal([1] * (i + 1), prior=-float(i)) for i in range(candidates)] for _ in situations]
+
+    def score(self, situations, proposals, rollouts):
+        return [np.arange(len(plans), dtype=float) for plans in proposals]
+
+
+def query(episode=0, decision=0):
+    panorama = np.full((576, 1024, 3), 9, np.uint8)
+    return Query(Observation(panorama, panorama[:480, :480], np.zeros(3)), Goal("x"), Key(0, episode, decision))
+
+
+def test_fewer_candidates_are_the_first_of_the_pool() -> None:
+    for count in (1, 2, 4):
+        agent = wiw.Agent(Many(), "copy", candidates=count, pool=4)
+        (decision,) = agent.decide_batch([query()])
+        assert agent.policy.asked == 4
+        assert [len(p.actions) for p in decision.proposals] == [1, 2, 3, 4][:count]
+        assert agent.but().pool == 4 and agent.describe()["pool"] == 4
+    with pytest.raises(ArgumentError, match="pool"):
+        wiw.Agent(Many(), "copy", candidates=4, pool=3)
+    with pytest.raises(ArgumentError, match="imagine_fraction"):
+        wiw.Agent(Many(), "copy", imagine_fraction=1.5)
+
+
+def test_decisions_without_imagination_follow_the_proposer() -> None:
+    agent = wiw.Agent(Many(), "copy", imagine_fraction=0.5)
+    queries = [query(episode) for episode in range(12)]
+    decisions = agent.decide_batch(queries)
+    for asked, decision in zip(queries, decisions, strict=True):
+        imagines = consults(asked.key, 0.5)
+        assert (decision.rollouts is not None) == imagines
+        assert decision.chosen == (2 if imagines else 0)
+        assert decision.calls.get("consultations", 0) == imagines
+    assert 0 < sum(d.rollouts is not None for d in decisions) < 12
+
+
+def test_a_sweep_in_python(two_rooms, tmp_path) -> None:
+    agent = AgentRecipe("heuristic", "copy", revision="matcher")
+    options = {"scenes": two_rooms, "decisions": 3}
+    found = wiw.scale(
+        "imagenav", agent, [1, 3], [0.0, 0.5, 1.0], episodes=3, out=tmp_path / "run", progress=False,
+        cache=tmp_path / "cache", **options,
+    )  # fmt: skip
+    by = {(point.sweep, point.value): point for point in found.points}
+    assert list(by) == [
+        ("candidates", 1), ("candidates", 3), ("imagine_fraction", 0), ("imagine_fraction", 0.5),
+        ("imagine_fraction", 1),
+    ]  # fmt: skip
+    assert by["imagine_fraction", 0].rollouts == 0 == by["imagine_fraction", 0].consultations
+    assert by["candidates", 1].rollouts <= by["candidates", 3].rollouts
+    full, most = by["imagine_fraction", 1], by["candidates", 3]
+    assert (full.rollouts, full.success) == (most.rollouts, most.success)  # three candidates are the task's own number
+    assert full.cached == 1.0 and full.calls == 0.0 and most.cached > 0
+    assert 0 < by["imagine_fraction", 0.5].consultations < full.consultations
+    numbers, plot = found.save()
+    assert len(json.loads(numbers.read_text())["points"]) == 5 and "<svg" in plot.read_text()
+
+
+def test_the_command(two_rooms, tmp_path, capsys) -> None:
+    options = ["--scenes", two_rooms, "--episodes", "1", "--policy", "heuristic", "--world-model", "copy"]
+    out = ["--out", str(tmp_path / "run")]
+    assert main(["scale", "imagenav", "--candidates", "1,2", *options, *out]) == 0
+    shown = capsys.readouterr().out
+    assert "candidates=1" in shown and "candidates=2" in shown and "scale.svg" in shown
+    assert main(["scale", "imagenav", "--candidates", "1,x", *options]) == 2
+    assert "expected numbers" in capsys.readouterr().err
+    for wrong, said in ((["--candidates", "1,1"], "different values"), (["--imagine-fraction", "2"], "from 0 to 1")):
+        assert main(["scale", "imagenav", *wrong, *options]) == 2
+        assert said in capsys.readouterr().err
+    with pytest.raises(ArgumentError, match="with a world model"):
+        wiw.scale("imagenav", wiw.Agent("heuristic"))
