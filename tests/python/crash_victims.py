@@ -7,6 +7,8 @@ so many seconds, or lets it end where none are given, and answers [exit code (ne
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import json
 import os
 import resource
@@ -73,7 +75,17 @@ def report(out, target, **_):
     load_run(out).report(target)
 
 
-WORK = {"evaluate": evaluate, "report": report}
+def export(out, target, kind, **_):
+    from wiw.evaluation.runlog import load_run
+
+    log = load_run(out)
+    if kind == "view":
+        log.view(target)
+    else:
+        log.export(**{kind: target})
+
+
+WORK = {"evaluate": evaluate, "report": report, "export": export}
 
 
 def live(job, said):
@@ -94,8 +106,14 @@ def serve():
     cv2.setNumThreads(1)
     import fakes  # noqa: F401 - everything that victims need is imported before they are forked
 
+    for extra in ("pyarrow.parquet", "rerun"):
+        with contextlib.suppress(ModuleNotFoundError):
+            importlib.import_module(extra)
+
     import wiw.evaluation.evaluate
+    import wiw.evaluation.export
     import wiw.evaluation.report.page
+    import wiw.evaluation.view
     import wiw.loop.scheduler  # noqa: F401
 
     print("ready", flush=True)

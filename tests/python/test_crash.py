@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import random
 import shutil
@@ -20,7 +21,7 @@ from wiw.evaluation.faults import whole_file, whole_folder
 from wiw.evaluation.runlog import load_run
 from wiw.evaluation.store import RunStore, store_path
 
-KILLS_OF_RUNS = 140
+KILLS_OF_RUNS, KILLS_OF_EXPORTS = 140, 60
 HERE = Path(__file__).parent
 
 
@@ -81,6 +82,47 @@ def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference,
         assert facts(out) == expected
         shutil.rmtree(out)
     assert runs >= KILLS_OF_RUNS / 7
+
+
+def contents(target):
+    files = [target] if target.is_file() else sorted(path for path in target.rglob("*") if path.is_file())
+    return {str(path.relative_to(target)): path.read_bytes() for path in files}
+
+
+def kinds():
+    found = {"csv": "tables", "view": "pages"}
+    found |= {"parquet": "columns"} if importlib.util.find_spec("pyarrow") else {}
+    return found | ({"rerun": "run.rrd"} if importlib.util.find_spec("rerun") else {})
+
+
+def test_exports_killed_at_random_moments_leave_all_or_nothing(victims, reference, tmp_path):
+    before, draw, kills = store_path(reference).read_bytes(), random.Random(1), dict.fromkeys(kinds(), 0)
+    for kind, name in kinds().items():
+        whole_copy = tmp_path / f"whole-{name}"
+        most = seconds(victims, "export", reference, kind=kind, target=str(whole_copy))
+        expected, target, tries = contents(whole_copy), tmp_path / kind / name, 0
+        while kills[kind] < KILLS_OF_EXPORTS / len(kinds()):
+            after = draw.uniform(0, most)
+            if victims.run("export", reference, kind=kind, target=str(target), kill_after=after) == 0:
+                most *= 0.9
+            else:
+                kills[kind] += 1
+            if target.exists():
+                assert same(kind, contents(target), expected)
+                shutil.rmtree(target) if target.is_dir() else target.unlink()
+            tries += 1
+            assert tries < 200
+        assert victims.run("export", reference, kind=kind, target=str(target)) == 0
+        assert [path.name for path in target.parent.iterdir()] == [name]  # what the killed had begun is swept away
+    assert store_path(reference).read_bytes() == before
+
+
+def same(kind, found, expected):
+    """Recordings are cut into parts by the clock; that one is whole shows in its last bytes, which mark its end."""
+    if kind == "rerun":
+        ((_, data),), ((_, wanted),) = found.items(), expected.items()
+        return data[:4] == wanted[:4] and data.endswith(wanted[-12:]) and b"FOOT" in wanted[-12:]
+    return found == expected
 
 
 def test_a_full_disk_at_each_write_in_turn_is_said_and_mended(victims, tmp_path):

@@ -14,6 +14,7 @@ from wiw.cli.compare import compare
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
+from wiw.cli.export import export
 from wiw.cli.names import list_names
 from wiw.cli.power import power
 from wiw.cli.report import report
@@ -33,8 +34,8 @@ DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
-Exit codes: 0 done, 1 the run is invalid (verify: it differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM within
-5 seconds; after both of these everything recorded is kept and `wiw resume` goes on."""
+Exit codes: 0 done, 1 the run is invalid (verify: it differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM,
+within 5 seconds; after both of these everything recorded is kept and `wiw resume` goes on."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
@@ -45,6 +46,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (power, "power", "How many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),
     (report, "report", "Table and HTML report of a run."),
+    (export, "export", "A run as CSV or Parquet tables, or as a Rerun recording."),
     (verify, "verify", "Run some episodes of a run again, and compare."),
     (view, "view", "Pages to walk through a run, to every decision."),
     (doctor, "doctor", "What this machine can do, and what to mend."),

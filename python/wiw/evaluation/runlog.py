@@ -118,6 +118,14 @@ class RunLog:
 
         return write_view(self, Path(folder) if folder is not None else self.path / "view").index
 
+    def export(
+        self, csv: str | Path | None = None, parquet: str | Path | None = None, rerun: str | Path | None = None
+    ) -> list[Path]:
+        """Writes tables into new folders, a recording for the Rerun viewer, or several of these; returns the files."""
+        from wiw.evaluation.export import export
+
+        return export(self, *(None if path is None else Path(path) for path in (csv, parquet, rerun)))
+
     def close(self) -> None:
         """Closes the run's file."""
         self.store.close()

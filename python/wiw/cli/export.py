@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+Folder = Annotated[Path | None, arg(metavar="DIR")]
+
+
+def export(
+    run: Positional[Annotated[Path, arg(metavar="RUN")]],
+    /,
+    *,
+    csv: Folder = None,
+    parquet: Folder = None,
+    rerun: Annotated[Path | None, arg(metavar="FILE.rrd")] = None,
+) -> int:
+    """Writes a run as plain tables for other programs, or as a recording for the Rerun viewer.
+
+    $ wiw export runs/first --csv tables
+    $ wiw export runs/first --parquet tables --rerun first.rrd
+
+    Tables: arms, episodes, outcomes, decisions and candidates. A stopped export leaves no half file.
+
+    Args:
+        run: The run's folder.
+        csv: New folder for CSV files.
+        parquet: New folder for Parquet files; needs pyarrow.
+        rerun: Recording for `rerun FILE.rrd`, with the pictures that the run kept; needs rerun-sdk.
+    """
+    from wiw.evaluation.runlog import load_run
+
+    for path in load_run(run).export(csv, parquet, rerun):
+        print(path)
+    return 0

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as a recording of the Rerun viewer: /episode/arm/..., over the timeline "decision"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wiw.evaluation.report.plots import arm_colors
+from wiw.evaluation.runlog import RunLog
+from wiw.types import Episode
+
+
+def record(log: RunLog, file: Path) -> None:
+    """Writes the ended episodes of all arms."""
+    import rerun as rr
+
+    stream = rr.RecordingStream("wiw", recording_id=f"{log.path.name} {log.store.created}")
+    stream.save(file)
+    stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Y_UP, static=True)
+    colors, episodes, begun = arm_colors(log.arms), log.store.episodes(), set[int]()
+    for outcome in log.store.outcomes():
+        arm, index = outcome["arm"], outcome["episode"]
+        home = f"/episode_{index:04d}"
+        if index not in begun:
+            _ends(rr, stream, home, episodes[index])
+            begun.add(index)
+        place = f"{home}/{rr.escape_entity_path_part(arm)}"
+        ended = f"{outcome['status']} {outcome['metrics']} {outcome['error']}".strip()
+        stream.log(f"{place}/outcome", rr.TextDocument(ended), static=True)
+        for row in log.store.decisions(arm, index):
+            stream.set_time("decision", sequence=row["decision"])
+            _decision(rr, stream, place, row, colors[arm])
+            for name, jpeg in log.store.images(arm, index, row["decision"]).items():
+                stream.log(f"{place}/{name}", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+    stream.flush()
+    stream.disconnect()
+
+
+def _ends(rr: Any, stream: Any, home: str, episode: Episode) -> None:
+    points = rr.Points3D(
+        [episode.start_position, episode.goal_position],
+        labels=["start", "goal"],
+        radii=0.12,
+        colors=[0x22242AFF, 0xE0475BFF],
+    )
+    stream.log(f"{home}/world", points, static=True)
+    stream.log(f"{home}/scene", rr.TextDocument(episode.scene), static=True)
+
+
+def _decision(rr: Any, stream: Any, place: str, row: dict[str, Any], color: str) -> None:
+    stream.log(f"{place}/path", rr.LineStrips3D([np.asarray(row["path"])], radii=0.03, colors=[color_of(color)]))
+    stream.log(f"{place}/distance_to_goal", rr.Scalars(row["after_distance"]))
+    scores = [np.nan if score is None else score for score in row["scores"] or []]
+    if scores:
+        stream.log(f"{place}/scores", rr.Scalars(scores))
+    plans = [
+        f"{'chosen ' if i == row['chosen'] else ''}{p['actions']} {p['note']}" for i, p in enumerate(row["proposals"])
+    ]
+    stream.log(f"{place}/plans", rr.TextDocument("\n".join([*plans, row["note"]]).strip()))
+
+
+def color_of(web: str) -> int:
+    """0xRRGGBBAA of "#rrggbb"."""
+    return (int(web.removeprefix("#"), 16) << 8) | 0xFF
