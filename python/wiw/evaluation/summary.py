@@ -288,7 +288,7 @@ def _about_differences(summary: Summary) -> list[str]:
 def _about_utility(summary: Summary) -> list[str]:
     if not summary.utilities:
         return []
-    found = ["U: 0 is as good as copy, 1 as good as oracle; Fieller's interval, paired by episode."]
+    found = ["U = (SR - copy) / (oracle - copy), on the episodes that all three have finished; Fieller's interval."]
     if any(not one.identifiable for one in summary.utilities):
         found.append("Not identifiable: the interval of oracle - copy holds 0; there is no share to measure.")
     return found

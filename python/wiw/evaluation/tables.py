@@ -87,7 +87,7 @@ def _add_arm_column(table: Table, names: list[str]) -> None:
 
 
 def _utilities(summary: Summary) -> Table:
-    table = _table("Utility U = (SR - copy) / (oracle - copy), on the episodes that all three have finished")
+    table = _table("Utility U, from copy (0) to oracle (1)")
     _add_arm_column(table, [found.arm for found in summary.utilities])
     for title in ("U ↑", "n"):
         table.add_column(title, justify="right")
