@@ -9,7 +9,7 @@ from scipy import stats
 
 from wiw.evaluation.report import summary_html
 from wiw.evaluation.statistics import HEADLINES, estimate_difference
-from wiw.evaluation.summary import notes, summarise
+from wiw.evaluation.summary import notes, role_of, summarise
 from wiw.evaluation.utility import ratio
 
 RATES = {"none": 0.2, "copy": 0.2, "warp": 0.5, "placebo-shuffled:mine": 0.2, "mine": 0.6, "oracle": 0.8}
@@ -49,7 +49,9 @@ def test_utility_by_hand():
 
 def test_only_the_world_model_under_test_is_no_reference():
     assert {one.arm for one in summary().utilities if not one.reference} == {"mine"}
-    assert summary()["placebo-shuffled:mine"].role.startswith("placebo")
+    for arm in ("placebo-shuffled:mine", "placebo-swapped", "heuristic+placebo-swapped:mine"):
+        assert role_of(arm).startswith("placebo")
+    assert role_of("mine") == role_of("placebo") == "world model"
 
 
 def test_interval_holds_the_quotients_that_a_t_test_does_not_reject():

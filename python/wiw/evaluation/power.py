@@ -16,7 +16,7 @@ from wiw.evaluation.simulate import draw, total
 
 BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
 """Near what 210 test episodes of Image-Goal Navigation in 42 apartments gave (`docs/results.md`): 18 % succeed without
-a world model; the oracle wins 76 more and loses 4; paired differences correlate within an apartment by -0.06 to 0.06."""
+a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by -0.06 to 0.06."""
 MOST_SCENES = 100_000
 _DRAWS = 2_000_000
 

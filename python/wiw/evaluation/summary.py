@@ -193,7 +193,7 @@ def role_of(arm: str, policies: Collection[str] = ()) -> str:
     """What an arm stands for, by its name; `policies` name those without a world model."""
     if arm in ROLES:
         return ROLES[arm]
-    placebo = PLACEBOS.get(arm.partition(":")[0])
+    placebo = PLACEBOS.get(arm.rpartition("+")[2].partition(":")[0])
     return placebo or (ANOTHER_POLICY if arm in policies else WORLD_MODEL)
 
 
