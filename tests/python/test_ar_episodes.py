@@ -137,7 +137,7 @@ def test_bad_fields_are_named(tmp_path: Path, two_rooms: str, info: dict[str, An
 
 def test_a_scene_that_is_not_there_is_named(tmp_path: Path) -> None:
     task = AR(episode_file=a_file(tmp_path / "ar.json", "/nowhere/house.glb"))
-    with pytest.raises(FileError, match=r"/nowhere/house\.glb: no such file"):
+    with pytest.raises(FileError, match=r"ar\.json: episode 0: scene: /nowhere/house\.glb: no such file"):
         task.require(task.episodes(1))
 
 

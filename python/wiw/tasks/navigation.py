@@ -17,7 +17,7 @@ from wiw.envs.navigation import NavigationEnv
 from wiw.envs.pointing import Pointing
 from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
@@ -186,11 +186,18 @@ class NavigationTask(ABC):
             For each scene, what it is used with: its "navmesh", a file or "built".
 
         Raises:
-            FileError: one is not; names it.
+            FileError: one is not; names it, and the episode file.
         """
-        used = {}
-        for scene in dict.fromkeys(episode.scene for episode in episodes):
-            resolve(scene)
+        used: dict[str, dict[str, str]] = {}
+        for episode in episodes:
+            scene = episode.scene
+            if scene in used:
+                continue
+            try:
+                resolve(scene)
+            except (FileError, ArgumentError) as error:
+                where = f"{self.episode_file}: episode {episode.episode_id}: scene: " if self.episode_file else ""
+                raise FileError(f"{where}{error}") from error
             used[scene] = {"navmesh": str(navmesh_file(scene) or "built")}
         return used
 

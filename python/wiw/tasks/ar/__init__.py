@@ -52,9 +52,10 @@ class ARRules:
 
 
 class AR(NavigationTask):
-    """The task: what is to be recognised, when an episode ends, and what is measured.
+    """Say what the boxed thing is, moving where that helps; the policy has to answer.
 
-    `NavigationTask` documents the other arguments.
+    What is to be recognised, when an episode ends, and what is measured. `NavigationTask` documents the rest of the
+    arguments.
 
     Args:
         categories: what targets are and answers are chosen from; None means the built-in list

@@ -46,7 +46,10 @@ class ImageNavRules:
 
 
 class ImageNav(NavigationTask):
-    """The task: goal images, when one is reached, and what is measured; `NavigationTask` documents the arguments."""
+    """Reach the place where a goal image was taken.
+
+    Goal images, when one is reached, and what is measured; `NavigationTask` documents the arguments.
+    """
 
     name = "imagenav"
     metrics = ("success", "spl", "mean_trajectory")
