@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
 import math
+import re
 
 import numpy as np
 import pytest
@@ -45,6 +46,16 @@ def test_utility_by_hand():
         assert one.low < one.value < one.high and (one.n, one.scenes) == (60, 12)
     with pytest.raises(KeyError, match="needs episodes that arm, copy and oracle"):
         found.utility("copy")
+
+
+def test_the_report_shows_utilities_on_one_scale():
+    found = summary({**RATES, "worse": 0.05})
+    html, one = summary_html(found), found.utility("mine")
+    assert f"<strong>{one.value:.2f}</strong>" in html and f"{one.low:.2f} – {one.high:.2f}" in html
+    worse = found.utility("worse")
+    assert worse.value < 0 and f"<strong>\u2212{-worse.value:.2f}</strong>" in html
+    zero = re.findall(r'class="zero" style="left:([\d.]+)%', html.partition("differences")[0])
+    assert len(zero) == 5 and len(set(zero)) == 1
 
 
 def test_only_the_world_model_under_test_is_no_reference():

@@ -103,9 +103,17 @@ def _common(summary: Summary) -> dict[str, Any]:
         "notes": notes(summary),
         "groups": summary.groups(),
         "utilities": {found.arm: found for found in summary.utilities},
+        "utility_ends": _utility_ends(summary),
         "colors": plots.arm_colors([line.name for line in summary.arms]),
         "reach": _reach(summary.differences),
     }
+
+
+def _utility_ends(summary: Summary) -> tuple[float, float]:
+    """From floor to ceiling, or as far as any arm, so that all bars share a scale; intervals are cut at -1 and 2."""
+    shown = [found for found in summary.utilities if found.identifiable]
+    low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
+    return low, max([1.0, *(min(2.0, found.high) for found in shown), *(found.value for found in shown)])
 
 
 def _reach(differences: Sequence[Difference]) -> dict[str, float]:

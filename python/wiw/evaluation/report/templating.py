@@ -27,7 +27,7 @@ def environment(*packages: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how}
+    made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how, "number": _number}
     made.filters["asset"] = lambda name: _asset(homes, name)
     made.tests["binding"] = _binding
     return made
@@ -36,6 +36,11 @@ def environment(*packages: str) -> Environment:
 def signed(value: float) -> str:
     """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
     return f"{value:+.1f}".replace("-", "\u2212")
+
+
+def _number(value: float) -> str:
+    """Two digits, with a true minus sign."""
+    return f"{value:.2f}".replace("-", "\u2212")
 
 
 def _how(estimate: Estimate) -> str:
