@@ -5,9 +5,11 @@ import re
 
 import numpy as np
 import pytest
+from fakes import LineAgent, LineTask
 from rich.console import Console
 from scipy import stats
 
+from wiw.evaluation.evaluate import run_arms
 from wiw.evaluation.report import summary_html
 from wiw.evaluation.statistics import HEADLINES, estimate_difference
 from wiw.evaluation.summary import notes, role_of, summarise
@@ -127,3 +129,12 @@ def test_a_terminal_shows_every_utility(width):
     assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
     for one in summary().utilities:
         assert f"{one.value:.2f} [{one.low:.2f}, {one.high:.2f}]" in shown
+
+
+def test_the_plain_table_of_a_run_has_utilities(tmp_path):
+    arms = {"copy": LineAgent(0.3), "mine": LineAgent(0.6), "oracle": LineAgent(1.0)}
+    log = run_arms(LineTask(), arms, 40, out=tmp_path / "run", progress=False)
+    copy, mine, oracle = log.table()
+    assert "utility" not in copy and "utility" not in oracle
+    assert mine["utility"] == (mine["success"] - copy["success"]) / (oracle["success"] - copy["success"])
+    assert mine["utility_low"] < mine["utility"] < mine["utility_high"]
