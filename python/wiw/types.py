@@ -184,6 +184,24 @@ class Rollout:
 
 
 @dataclass(frozen=True)
+class Fidelity:
+    """What would really have been seen along each plan of a decision. Privileged, as `Truth` is."""
+
+    rollouts: tuple[Rollout, ...]
+    scores: NDArray[np.float64]
+    """float64 [M]: what the reviser gives the true futures."""
+    rank: float
+    """Kendall's tau between scores of imagined and of true futures, NaN where either tells no plans apart."""
+    psnr: NDArray[np.float64]
+    """float64 [M] dB: mean over a plan's imagined frames, latitude-weighted for panoramas; NaN without any."""
+    ssim: NDArray[np.float64]
+
+    def regret(self, chosen: int | None) -> float:
+        """By how much the true future of the chosen plan scores less than the best one; NaN for a plan made anew."""
+        return float("nan") if chosen is None else float(self.scores.max() - self.scores[chosen])
+
+
+@dataclass(frozen=True)
 class Decision:
     """The outcome of one pass through propose, imagine, revise, with all evidence kept."""
 
@@ -208,6 +226,8 @@ class Decision:
     note: str = ""
     answer: Answer | None = None
     """What the agent believes now, where the goal has choices."""
+    fidelity: Fidelity | None = None
+    """How true imagination was, where the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
     """What answering took, an equal share of the batch's: calls of the world model with their rows and frames, retries
     among the calls, cached_rows that needed none, vlm_tokens."""

@@ -47,6 +47,7 @@ def run(
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
     cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
+    fidelity: bool = False,
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -89,6 +90,7 @@ def run(
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
             themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
+        fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
         report: Whether to write report.html at the end.
     """
     from wiw.evaluation.evaluate import evaluate
@@ -108,7 +110,7 @@ def run(
         return evaluate(
             recipe, agent, episodes, seed, folder, workers,
             arms=names, live=live, keep_images=keep_images, deadline=deadline,
-            cache=cache, cache_gb=cache_gb,
+            cache=cache, cache_gb=cache_gb, fidelity=fidelity,
         )  # fmt: skip
 
     return finish(stoppable(work, folder), report)

@@ -40,6 +40,7 @@ def evaluate(
     deadline: float | None = None,
     cache: str | Path | None = None,
     cache_gb: float | None = None,
+    fidelity: bool = False,
     **task_options: Any,
 ) -> RunLog:
     """Runs an agent on the first `episodes` episodes of a task.
@@ -69,6 +70,8 @@ def evaluate(
         cache: where rollouts are kept and found: a folder, "off", or "auto" (those of models that declare themselves
             `cacheable`, in `~/.cache/wiw/rollouts`); None means the agent's own, "auto" unless it was given another.
         cache_gb: most gigabytes of that folder.
+        fidelity: whether every imagined plan is also replayed in the simulator, to tell how true imagination was; see
+            `RunLog.fidelity`. Changes no decision and no cost that is reported, but takes about as long as `oracle`.
         task_options: options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
@@ -77,7 +80,8 @@ def evaluate(
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
     """
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline, cache, cache_gb)
+    limits = _Limits(deadline, cache, cache_gb, fidelity)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
     return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
 
 
@@ -96,9 +100,11 @@ def run_arms(
     deadline: float | None = None,
     cache: str | Path | None = None,
     cache_gb: float | None = None,
+    fidelity: bool = False,
 ) -> RunLog:
     """Runs several named agents on the same episodes; see `evaluate` for the rest."""
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, deadline, cache, cache_gb)
+    limits = _Limits(deadline, cache, cache_gb, fidelity)
+    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
     return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
 
 
@@ -154,6 +160,30 @@ FOR_EVER = 1e12
 
 
 @dataclass(frozen=True)
+class _Limits:
+    """What every agent of a run is built with beyond its own recipe; none of it changes what an agent decides."""
+
+    deadline: float | None
+    cache: str | Path | None
+    cache_gb: float | None
+    fidelity: bool
+
+    def __post_init__(self) -> None:
+        if self.deadline is not None and not self.deadline > 0:
+            raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
+        if self.cache_gb is not None and not self.cache_gb > 0:
+            raise ArgumentError(f"evaluate: expected a cache_gb above 0, got {self.cache_gb}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """Options of `wiw.Agent`; those that are None are left to it."""
+        deadline = None if self.deadline is None else min(self.deadline, FOR_EVER)
+        named = self.cache is None or str(self.cache) in ("auto", "off")
+        cache = self.cache if named else str(Path(str(self.cache)).expanduser().resolve())
+        limits = {"deadline": deadline, "cache": cache, "cache_gb": self.cache_gb, "fidelity": self.fidelity or None}
+        return {name: value for name, value in limits.items() if value is not None}
+
+
+@dataclass(frozen=True)
 class _Options:
     """What `evaluate` and `run_arms` have in common."""
 
@@ -165,32 +195,17 @@ class _Options:
     live: int
     keep_images: int | Literal["all"]
     resume: bool
-    deadline: float | None
-    cache: str | Path | None
-    cache_gb: float | None
+    limits: _Limits
 
     def __post_init__(self) -> None:
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1)):
             _at_least(name, getattr(self, name), least)
         _at_least("keep_images", self.pictures, 0)
-        if self.deadline is not None and not self.deadline > 0:
-            raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
-        if self.cache_gb is not None and not self.cache_gb > 0:
-            raise ArgumentError(f"evaluate: expected a cache_gb above 0, got {self.cache_gb}")
 
     @property
     def pictures(self) -> int:
         """How many episodes keep pictures."""
         return self.episodes if self.keep_images == "all" else self.keep_images
-
-    @property
-    def limits(self) -> dict[str, Any]:
-        """What every agent is built with beyond its own recipe."""
-        deadline = None if self.deadline is None else min(self.deadline, FOR_EVER)
-        named = self.cache is None or str(self.cache) in ("auto", "off")
-        cache = self.cache if named else str(Path(str(self.cache)).expanduser().resolve())
-        limits = {"deadline": deadline, "cache": cache, "cache_gb": self.cache_gb}
-        return {name: value for name, value in limits.items() if value is not None}
 
 
 def _at_least(name: str, value: int, least: int) -> None:
@@ -223,7 +238,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "scenes": used,
             "live": options.live,
             "workers": options.workers,
-            "limits": options.limits,
+            "limits": options.limits.as_dict(),
             "command": sys.argv,
             "preparation_seconds": time.perf_counter() - started,
         }

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.types import Answer, DecisionRecord, EpisodeResult, Truth
+from wiw.types import Answer, DecisionRecord, EpisodeResult, Fidelity, Truth
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
@@ -95,6 +95,7 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "proposals": to_json(proposals),
         "real_frames": None if real is None else to_json(real),
         "answer": None if decision.answer is None else to_json(_answer(decision.answer)),
+        "fidelity": None if decision.fidelity is None else to_json(_fidelity(decision.fidelity, decision.chosen)),
         "note": decision.note,
         "path": to_json(record.path),
         "seconds": to_json(dict(decision.seconds)),
@@ -112,6 +113,17 @@ def _answer(answer: Answer) -> dict[str, Any]:
         "label": answer.label,
         "confidence": answer.confidence,
         "probabilities": dict(zip(answer.choices, answer.probabilities, strict=True)),
+    }
+
+
+def _fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
+    return {
+        "scores": found.scores,
+        "rank": found.rank,
+        "regret": found.regret(chosen),
+        "best": None if chosen is None else bool(found.scores[chosen] == found.scores.max()),
+        "psnr": found.psnr,
+        "ssim": found.ssim,
     }
 
 
@@ -135,6 +147,8 @@ def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
         yield "goal", encode_jpeg(decision.goal.image)
     for index, rollout in enumerate(decision.rollouts or ()):
         yield f"imagined/{index}", encode_jpeg(strip(rollout.frames))
+    for index, rollout in enumerate(decision.fidelity.rollouts if decision.fidelity else ()):
+        yield f"true/{index}", encode_jpeg(strip(rollout.frames))
 
 
 def strip(frames: NDArray[np.uint8], height: int = STRIP_HEIGHT) -> NDArray[np.uint8]:

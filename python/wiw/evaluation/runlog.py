@@ -8,6 +8,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 from wiw.evaluation.costs import costs
+from wiw.evaluation.fidelity import fidelity
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.summary import Summary, summarise
 
@@ -105,6 +106,13 @@ class RunLog:
     def costs(self) -> Records:
         """What each arm cost: one dict an arm, totals and what a success took; see `wiw.evaluation.costs.Costs`."""
         return Records(line.as_dict() for line in costs(self))
+
+    def fidelity(self) -> Records:
+        """How true imagination was in each arm that was run with `fidelity=True`: one dict an arm.
+
+        See `wiw.evaluation.fidelity.ArmFidelity`; each decision's own figures are in `decisions`, column "fidelity".
+        """
+        return Records(line.as_dict() for line in fidelity(self))
 
     def report(self, path: str | Path | None = None) -> Path:
         """Writes a self-contained HTML report and returns its path; default `report.html` in the run's folder."""

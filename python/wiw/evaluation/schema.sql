@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 4 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 5 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -40,6 +40,7 @@ CREATE TABLE decision (
     proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note}]
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
     answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
+    fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim}; NULL where it is not measured
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
     seconds TEXT NOT NULL,          -- JSON: wall time by stage
@@ -56,7 +57,7 @@ CREATE TABLE image (
     arm TEXT NOT NULL,
     episode INTEGER NOT NULL,
     decision INTEGER NOT NULL,
-    name TEXT NOT NULL,             -- panorama | goal (with decision 0) | imagined/<proposal>
+    name TEXT NOT NULL,             -- panorama | goal (with decision 0) | imagined/<proposal> | true/<proposal>
     jpeg BLOB NOT NULL,
     PRIMARY KEY (arm, episode, decision, name)
 );

@@ -24,12 +24,13 @@ from wiw.evaluation.faults import explained, remedy
 from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 DECISION_JSON = (
     "actions",
     "executed",
     "scores",
     "answer",
+    "fidelity",
     "proposals",
     "real_frames",
     "path",

@@ -25,12 +25,13 @@ from wiw.loop.contract import (
     checked_plan,
     checked_scores,
 )
+from wiw.loop.fidelity import remembered, replay
 from wiw.loop.imagine import Imagination, imagine, model_spec
 from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.types import Decision, Goal, Key, Observation, Proposal, Rollout
+from wiw.types import Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout
 from wiw.world_models.base import WorldModel
 
 _CONSULT = 0x636F6E73
@@ -59,6 +60,7 @@ class _Future:
     """None where nothing was imagined."""
     scores: NDArray[np.float64]
     calls: Mapping[str, int]
+    fidelity: Fidelity | None = None
 
 
 @dataclass
@@ -96,6 +98,8 @@ class Agent:
             in `candidates` alone are nested; None proposes as many as are kept.
         imagine_fraction: share of decisions for which the model is consulted; for the others the proposer's own
             preference decides. Drawn by the decision's key: what a smaller share consults, a larger one does too.
+        fidelity: whether every plan is also replayed in the simulator, to tell how true imagination was
+            (`wiw.loop.fidelity`); changes no decision, and needs a simulator with every query.
         placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
 
     Raises:
@@ -117,6 +121,7 @@ class Agent:
         deadline: float = DEADLINE,
         cache: str | Path = "auto",
         cache_gb: float = BUDGET_GB,
+        fidelity: bool = False,
         placebo: Placebo | None = None,
         pool: int | None = None,
         imagine_fraction: float = 1.0,
@@ -150,7 +155,8 @@ class Agent:
             raise ArgumentError(
                 f"Agent: expected placebo {' or '.join(PLACEBOS)}, with a world model, got '{placebo}' and {self.model}"
             )
-        self._limits = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb}
+        self._limits = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb, "fidelity": fidelity}
+        self.fidelity = fidelity and self.model is not None
         self._ask: Asking | None = None
         if self.model is not None:
             self._ask = remember(Attempts(self.model, deadline), cache, cache_gb)
@@ -163,7 +169,8 @@ class Agent:
     def needs(self) -> tuple[str, ...]:
         """What observations must carry beyond images: "depth", "simulator"."""
         model = () if self.model is None else self.model.accepts.needs
-        return tuple(sorted({*self.policy.needs, *self.revision.needs, *model}))
+        replays = ("simulator",) if self.fidelity else ()
+        return tuple(sorted({*self.policy.needs, *self.revision.needs, *model, *replays}))
 
     def decide(self, observation: Any, goal: Goal, key: Key, simulator: Any = None) -> Decision:
         """One decision for one episode; `observation` is an Observation or the environment's dict.
@@ -265,13 +272,19 @@ class Agent:
     ) -> list[_Future]:
         """What each episode has to choose from after looking ahead."""
         beams = Beams(proposing, proposals, self.width, self.depth)
+        before = remembered(revising) if self.fidelity else []
         imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
         while beams.level < self.depth:
             with clock("propose"):
                 beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
+            before = remembered(revising) if self.fidelity else []
             imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
-        rows = zip(beams.proposals, imagined.rollouts, scores, beams.calls, strict=True)
-        return [_Future(plans, rollouts, score, dict(calls)) for plans, rollouts, score, calls in rows]
+        found: list[Fidelity | None] = [None] * len(queries)
+        if self.fidelity:
+            with clock("replay"):
+                found = [*replay(self.revision, queries, before, beams.proposals, imagined.rollouts, scores)]
+        rows = zip(beams.proposals, imagined.rollouts, scores, beams.calls, found, strict=True)
+        return [_Future(plans, rollouts, score, dict(calls), true) for plans, rollouts, score, calls, true in rows]
 
     def _look_ahead(
         self,
@@ -360,6 +373,7 @@ class Agent:
             goal=query.goal,
             key=query.key,
             calls=future.calls,
+            fidelity=future.fidelity,
             **costs,
         )
 

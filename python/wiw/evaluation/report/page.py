@@ -13,6 +13,8 @@ from markupsafe import Markup
 
 from wiw.evaluation.costs import COLUMNS, costs
 from wiw.evaluation.faults import whole_file
+from wiw.evaluation.fidelity import COLUMNS as FIDELITY_COLUMNS
+from wiw.evaluation.fidelity import ArmFidelity, fidelity
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories
 from wiw.evaluation.report.templating import environment, signed
@@ -39,6 +41,7 @@ def render(log: RunLog) -> str:
     """A run's report as HTML, without anything outside the page. All text from the run is escaped."""
     summary, config, info = log.numbers(), log.store.config, log.store.info
     told, pictures = stories(log.store, log.arms)
+    truths = fidelity(log)
     return (
         environment()
         .get_template("page.html.j2")
@@ -49,11 +52,13 @@ def render(log: RunLog) -> str:
             created=log.store.created,
             version=log.store.wiw_version,
             sentence=sentence(summary),
-            plots=_plots(log, summary),
+            plots=_plots(log, summary, truths),
             stories=told,
             pictures=pictures,
             costs=[(line, line.cells()) for line in costs(log)],
             cost_columns=COLUMNS,
+            fidelity=[(line, line.cells()) for line in truths],
+            fidelity_columns=FIDELITY_COLUMNS,
             failures=[row for row in log.episodes if row["status"] == "failed"],
             radius=config["task"].get("radius"),
             config=json.dumps(config, indent=2, ensure_ascii=False),
@@ -125,7 +130,7 @@ def _reach(differences: Sequence[Difference]) -> dict[str, float]:
     return reach
 
 
-def _plots(log: RunLog, summary: Summary) -> list[tuple[str, str, Markup]]:
+def _plots(log: RunLog, summary: Summary, truths: Sequence[ArmFidelity]) -> list[tuple[str, str, Markup]]:
     """Title, explanation and drawing of each plot."""
     done: dict[str, list[Mapping[str, Any]]] = {
         arm: [row for row in log.episodes if row["arm"] == arm and row["status"] == "done"] for arm in log.arms
@@ -148,4 +153,7 @@ def _plots(log: RunLog, summary: Summary) -> list[tuple[str, str, Markup]]:
         found.append(
             ("Decisions to success", "How soon the goal is reached.", plots.decisions_to_success(done, budget))
         )
+    if sum(not math.isnan(line.rank) for line in truths) > 1:
+        about = "Does the arm that orders plans rightly also succeed? Kendall's tau against the true futures."
+        found.append(("Controllability and success", about, plots.success_by_rank(truths, summary)))
     return found

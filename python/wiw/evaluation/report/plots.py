@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from wiw.evaluation.fidelity import ArmFidelity
 from wiw.evaluation.intervals import wilson
 from wiw.evaluation.summary import Summary
 
@@ -70,6 +71,22 @@ def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) 
     axes.grid(axis="y", color=INK, alpha=0.08)
     _legend(axes)
     return _svg(figure, "success-by-rollouts")
+
+
+def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
+    """Success rate with its interval against how rightly imagined futures order the plans, a point an arm."""
+    colors = arm_colors([line.name for line in summary.arms])
+    figure, axes = _figure()
+    for line in truths:
+        estimate = summary[line.arm].estimates["success"]
+        axes.plot([line.rank] * 2, [estimate.low, estimate.high], color=colors[line.arm], lw=4, alpha=0.35)
+        axes.plot(line.rank, estimate.value, "o", color=colors[line.arm], ms=9, label=line.arm)
+    axes.set_xlim(-1.05, 1.05)
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel("rank agreement, Kendall's tau")
+    axes.set_ylabel("success rate, %")
+    _legend(axes)
+    return _svg(figure, "success-by-rank")
 
 
 def success_by_distance(outcomes: Outcomes) -> Markup:

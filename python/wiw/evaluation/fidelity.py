@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How true each arm's imagination was, next to how often the agent succeeded with it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from wiw.evaluation.runlog import RunLog
+
+COLUMNS = (
+    ("SR %", "Success rate."),
+    ("rank", "Kendall's tau: how far imagined futures put the plans into the order that the true ones give."),
+    ("best chosen %", "Decisions for the plan whose true future scores best."),
+    ("regret", "By how much the chosen plan's true future scores less than the best one."),
+    ("PSNR dB", "Of imagined frames against what would have been seen, open loop, at the size the reviser sees."),
+    ("SSIM", "The same, structural similarity."),
+)
+"""Columns of the table and what they mean."""
+
+
+@dataclass(frozen=True)
+class ArmFidelity:
+    """Means over an arm's decisions; NaN where no decision says."""
+
+    arm: str
+    decisions: int
+    """That were replayed."""
+    success: float
+    """Percent of the judged episodes."""
+    rank: float
+    best: float
+    """Percent."""
+    regret: float
+    psnr: float
+    ssim: float
+
+    def cells(self) -> list[str]:
+        """The columns of the table, in words."""
+        values = ((self.success, ".1f"), (self.rank, ".2f"), (self.best, ".0f"), (self.regret, ".3f"))
+        return [_shown(value, form) for value, form in (*values, (self.psnr, ".1f"), (self.ssim, ".3f"))]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return asdict(self)
+
+
+def fidelity(log: RunLog) -> list[ArmFidelity]:
+    """One line for each arm that imagined and was replayed, in the order of the run's table."""
+    return [line for arm in log.arms if (line := _arm(log, arm)) is not None]
+
+
+def _arm(log: RunLog, arm: str) -> ArmFidelity | None:
+    found = [row["fidelity"] for row in log.store.decisions(arm) if row["fidelity"] is not None]
+    if not found:
+        return None
+    judged = [e["metrics"].get("success") for e in log.episodes if e["arm"] == arm and e["status"] == "done"]
+    best = [float(one["best"]) for one in found if one["best"] is not None]
+    return ArmFidelity(
+        arm,
+        len(found),
+        100 * _mean(judged),
+        _mean([one["rank"] for one in found]),
+        100 * _mean(best),
+        _mean([one["regret"] for one in found]),
+        _mean([value for one in found for value in one["psnr"]]),
+        _mean([value for one in found for value in one["ssim"]]),
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float:
+    known = [value for value in values if value is not None and math.isfinite(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _shown(value: float, form: str) -> str:
+    return "–" if math.isnan(value) else f"{value:{form}}"
