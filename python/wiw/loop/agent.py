@@ -241,7 +241,7 @@ class Agent:
         policies = [self.policy] if self.revision is self.policy else [self.policy, self.revision]
         counts = Counter({"vlm_tokens": sum(policy.tokens for policy in policies)})
         if self._ask is not None:
-            counts.update({name: count for name, count in self._ask.tally.items() if name != "cache_seconds"})
+            counts.update(self._ask.tally)
         return counts
 
     def _futures(
@@ -256,8 +256,15 @@ class Agent:
         futures = [_Future(plans, None, np.array([plan.prior for plan in plans]), {}) for plans in proposals]
         asking = [place for place, query in enumerate(queries) if consults(query.key, self.imagine_fraction)]
         if self._ask is not None and asking:
-            chosen = ([values[place] for place in asking] for values in (queries, proposing, revising, proposals))
-            for place, future in zip(asking, self._imagined(self._ask, *chosen, clock), strict=True):
+            imagined = self._imagined(
+                self._ask,
+                [queries[place] for place in asking],
+                [proposing[place] for place in asking],
+                [revising[place] for place in asking],
+                [proposals[place] for place in asking],
+                clock,
+            )
+            for place, future in zip(asking, imagined, strict=True):
                 futures[place] = future
         return futures
 

@@ -51,6 +51,8 @@ class Attempts:
         self.tally: Counter[str] = Counter()
         """What was asked so far: `calls` that the model has answered or not, their `rows` and `frames` (padding and
         frames that other rows answer left out), and `retries`, calls that repeat one that gave nothing."""
+        self.cache_seconds = 0.0
+        """Nothing is cached here."""
         self._helper: _Helper | None = None
 
     def __reduce__(self) -> Any:

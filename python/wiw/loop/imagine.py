@@ -71,9 +71,9 @@ def imagine(
             observations = _at_start(conditioning, part, answers, accepts)
             controls = _controls(accepts, part)
         with clock("world_model"):
-            before = ask.tally["cache_seconds"]
+            before = ask.cache_seconds
             answers.append(ask(observations, controls, seeds[part.rows]))
-        clock.move(ask.tally["cache_seconds"] - before, "world_model", "cache")
+        clock.move(ask.cache_seconds - before, "world_model", "cache")
     with clock("platform"):
         kind = "perspective" if accepts.view == "perspective" else "panorama"
         view = "front" if kind == "perspective" else frames.view

@@ -86,7 +86,7 @@ class RolloutCache:
         size = _HEADER.size + data.nbytes
         if not self._writing or size > self.budget:
             return
-        start = struct.pack("<8s5I", _MAGIC, first, *data.shape[:3], zlib.crc32(data))
+        start = struct.pack("<8s5I", _MAGIC, first, *data.shape[:3], zlib.crc32(data.data))
         path = self._path(key)
         draft = path.with_suffix(f".{uuid.uuid4().hex}.draft")
         try:
@@ -119,10 +119,10 @@ class RolloutCache:
         if begin > first or begin + count != first + len(frames) or (height, width) != frames.shape[1:3]:
             return False
         data = frames if begin == first else np.empty((count, height, width, _CHANNELS), np.uint8)
-        view = memoryview(data).cast("B")
+        view = data.data.cast("B")
         while len(view) and (taken := file.readinto(view)):
             view = view[taken:]
-        if len(view) or zlib.crc32(data) != checksum:
+        if len(view) or zlib.crc32(data.data) != checksum:
             raise ValueError("its checksum differs")
         if data is not frames:
             frames[:] = data[first - begin :]
@@ -162,6 +162,8 @@ class Remembered:
 
     def __init__(self, ask: Attempts, cache: RolloutCache) -> None:
         self.model, self.cache = ask.model, cache
+        self.cache_seconds = 0.0
+        """Spent on the cache so far."""
         self._ask = ask
         self._identity = f"{ask.model.fingerprint()} {ask.model.accepts}".encode()
 
@@ -186,7 +188,7 @@ class Remembered:
             if first < end and not self.cache.get(key, first, frames[row, first:end])
         ]
         self.tally["cached_rows"] += len(controls) - len(missing)
-        self.tally["cache_seconds"] += time.perf_counter() - begin
+        self.cache_seconds += time.perf_counter() - begin
         if missing:
             fresh = self._ask(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
             begin = time.perf_counter()
@@ -194,7 +196,7 @@ class Remembered:
                 first, end = own[row]
                 self.cache.put(keys[row], first, answer[first:end])
                 frames[row, first:end] = answer[first:end]
-            self.tally["cache_seconds"] += time.perf_counter() - begin
+            self.cache_seconds += time.perf_counter() - begin
         return frames
 
 
