@@ -162,7 +162,7 @@ class RunStore:
     def _require_whole(self) -> None:
         """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
-        if self.path.stat().st_size < pages * size and not _has_log(self.path):
+        if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
             raise StoreError(f"{self.path}: the file is cut short; {remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
