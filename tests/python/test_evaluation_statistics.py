@@ -247,3 +247,9 @@ def test_arms_of_one_table_are_one_family_of_tests():
     assert [d.p_value for d in found] == pytest.approx([1.0, 2 / 2**6, 2 / 2**9])
     assert [d.p_adjusted for d in found] == pytest.approx([1.0, 2 * 2 / 2**6, 3 * 2 / 2**9])
     assert summary.difference("warp", "copy").p_adjusted == pytest.approx(2 * 2 / 2**5 / 2)  # two arms, the larger p
+
+
+def test_few_scenes_that_happen_to_be_alike_do_not_make_an_interval_narrow():
+    spl = [0.9, 0.0, 0.88, 0.0, 0.0, 0.91]  # one of two reached in each of three scenes
+    low, high = clustered_t(spl, ["a", "a", "b", "b", "c", "c"], "rate")
+    assert high - low > 0.6

@@ -23,6 +23,9 @@ Kind = Literal["rate", "difference", "length"]
 COINS = {"rate": (0.5, 0.5), "difference": (0.0, 0.5)}
 """Mean and mean square of an episode in which the success of each arm is a fair coin."""
 
+FEW = 5
+"""Scenes below which equal means are taken for chance: scenes never count as more alike than their episodes are."""
+
 
 def wilson(mean: float, n: int, confidence: float = 0.95) -> Interval:
     """Score interval of a proportion (Wilson 1927).
@@ -121,6 +124,8 @@ def steadied(
     plain = (squares / n - mean**2) / n
     seen = (plain > 1e-12) & (variance > 1e-12)
     effect = np.where(seen, variance / np.where(seen, plain, 1.0), 1.0)
+    if len(counts) < FEW:
+        effect = np.maximum(effect, 1.0)
     coin, coin_square = COINS[kind]
     weight = made_up(len(counts))
     center = (total + weight * coin) / (n + weight)

@@ -168,7 +168,9 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def _legend(axes: Axes) -> None:
-    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=4, loc="lower left", bbox_to_anchor=(0, 1))
+    longest = max((len(text) for text in axes.get_legend_handles_labels()[1]), default=0)
+    columns = 4 if longest < 11 else 2  # as many as fit the drawing's width
+    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
 
 
 def _svg(figure: Figure, name: str) -> Markup:
