@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from typing import ClassVar
 
 import numpy as np
@@ -161,6 +162,23 @@ def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) 
     assert states == {0: "failed", 1: "done", 2: "done"}
     assert "server is gone" in recorder.results[0].error and not recorder.results[0].metrics
     assert recorder.results[0].kind == "world_model/raised"
+
+
+def test_a_model_that_hangs_fails_its_episode_and_the_rest_goes_on(task: ImageNav) -> None:
+    release = threading.Event()
+
+    class Stuck(Stamp):
+        """Never answers the first decision of episode 1."""
+
+        def rollout(self, observations, controls, seeds):
+            if {core.fold_key([0, 1, 0, c]) for c in range(4)} & set(seeds.tolist()):
+                release.wait(60)
+            return super().rollout(observations, controls, seeds)
+
+    recorder = run(task, wiw.Agent(Greedy(), Stuck(), deadline=0.6), count=3, live=3)
+    release.set()
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done"}
+    assert recorder.results[1].kind == "world_model/deadline" and "within 0.6 s" in recorder.results[1].error
 
 
 @pytest.mark.parametrize("live", [1, 2, 4])

@@ -60,7 +60,7 @@ def scale(
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
-        deadline: Most seconds for a call of the world model, 600 if not given.
+        deadline: Most seconds for a call of the world model, 300 if not given.
         cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
             folder for every model; or off.
         cache_gb: Most gigabytes of that folder.

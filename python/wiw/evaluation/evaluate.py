@@ -66,7 +66,7 @@ def evaluate(
         keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one.
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
-            600 unless it was given another.
+            300 unless it was given another.
         cache: where rollouts are kept and found: a folder, "off", or "auto" (those of models that declare themselves
             `cacheable`, in `~/.cache/wiw/rollouts`); None means the agent's own, "auto" unless it was given another.
         cache_gb: most gigabytes of that folder.

@@ -31,7 +31,7 @@ from wiw.world_models.base import WorldModel, checked_rollout
 TRIES = 3
 PAUSES = (0.2, 1.0)
 """Seconds before the second and the third try; a server that restarts may be back by then."""
-DEADLINE = 600.0
+DEADLINE = 300.0
 """Seconds a call may take unless the user says otherwise: room for a first call that loads and compiles."""
 
 
