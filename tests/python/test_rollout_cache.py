@@ -251,6 +251,8 @@ def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     first, calls = run("a")
     again, after = run("b", live=1)
     assert calls > 0 and after == calls and again == first
+    processes, after = run("p", workers=2)
+    assert after == calls and processes == first
     uncached = wiw.evaluate(task, agent, 3, out=tmp_path / "c", progress=False, cache="off")
     assert [(r["episode"], r["decision"], r["scores"], r["executed"]) for r in uncached.decisions] == first
     assert (tmp_path / "logged.log").read_text().count("asked") > calls
