@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -191,7 +192,7 @@ def tell(
     if kept is not None:
         webp, matrix = kept
         frame = frame_of_picture(Image.open(io.BytesIO(webp)).size, matrix)
-        picture = f"scene-{list(store_scenes(store)).index(episode.scene)}"
+        picture = f"scene-{hashlib.sha256(episode.scene.encode()).hexdigest()[:12]}"
         pictures[picture] = album.put(picture, "webp", webp)
     else:
         frame = frame_of_points(all_points(episode, [row for rows in decisions.values() for row in rows]))
@@ -204,11 +205,6 @@ def tell(
     start, end = start_and_goal(frame, episode)
     shown = album.put(f"{index}-goal", "jpeg", goal) if goal else None
     return Story(index, episode, shown, picture, frame, start, end, attempts)
-
-
-def store_scenes(store: RunStore) -> dict[str, None]:
-    """Scenes of the run, in order, each once."""
-    return dict.fromkeys(episode.scene for episode in store.episodes())
 
 
 def place(scene: str) -> str:

@@ -94,11 +94,11 @@ def write_view(log: RunLog, folder: Path) -> Site:
         album = Beside(draft / "images")
         pages = draft / "episodes"
         pages.mkdir()
-        lines = _lines(log)
+        outcomes = outcomes_by_episode(log.store, log.arms)
+        lines = _lines(log, outcomes)
         common = _common(log)
         (draft / "index.html").write_text(_index(log, lines, common), encoding="utf-8")
         told = [line for line in lines if line.told]
-        outcomes = outcomes_by_episode(log.store, log.arms)
         for number, line in enumerate(told):
             scenes: dict[str, str] = {}
             story = tell(log.store, line.index, line.episode, outcomes[line.index], scenes, album)
@@ -138,8 +138,8 @@ def _common(log: RunLog) -> dict[str, Any]:
     }
 
 
-def _lines(log: RunLog) -> list[Line]:
-    outcomes, pictures = outcomes_by_episode(log.store, log.arms), set(log.store.info["pictures"])
+def _lines(log: RunLog, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
+    pictures = set(log.store.info["pictures"])
     return [
         Line(
             index,
