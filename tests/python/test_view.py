@@ -25,6 +25,9 @@ EVIL = """<img src=x onerror="document.title='owned'">'"/../&"""
 ARMS = ("none", "warp", EVIL)
 
 
+TRUTH = {"scores": [0.25, 0.5], "rank": None, "regret": 0.25, "best": False, "psnr": [None, 21.34], "ssim": [None, 0.7]}
+
+
 class EvilTask(LineTask):
     """Scenes and errors with names that try to become part of the page."""
 
@@ -43,6 +46,9 @@ def log(tmp_path_factory):
     strip = np.concatenate([np.full((160, 160, 3), 40 * k, np.uint8) for k in range(5)], axis=1)
     with sqlite3.connect(store_path(out)) as store:
         store.execute("INSERT INTO image VALUES ('warp', 0, 0, 'true/1', ?)", (encode_jpeg(strip),))
+        store.execute(
+            "UPDATE decision SET fidelity = ? WHERE arm = 'warp' AND episode = 0 AND decision = 0", (json.dumps(TRUTH),)
+        )
     return log
 
 
@@ -78,6 +84,13 @@ def test_every_address_is_a_file_beside_and_every_picture_is_shown(log, site):
     decisions = len(log.decisions)
     assert site.pictures == 3 * decisions + 7 + 1  # panorama and two strips each; goals of 7 episodes; one true strip
     assert all(Image.open(file).size[0] > 20 for file in shown)
+
+
+def test_a_plan_says_how_true_its_imagination_was(site):
+    html = (site.index.parent / "episodes" / "0000.html").read_text()
+    assert html.count('class="best"') == 1 and html.count('class="true"') == 1
+    assert "<small>true score 0.250</small>" in html and ">true score 0.500 · PSNR 21.3 dB · SSIM 0.70</small>" in html
+    assert html.count("regret 0.250 · propose") == 1 and "rank agreement" not in html
 
 
 def test_names_from_the_run_stay_text(log, site):

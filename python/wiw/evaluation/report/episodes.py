@@ -64,6 +64,9 @@ class Candidate:
     """What was imagined; as `Album.put` says."""
     true: str | None
     """What would really have been seen."""
+    truth: str
+    """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
+    truly_best: bool
     real_frames: int
     """How many leading frames are the real view turned."""
     frames: int
@@ -83,6 +86,8 @@ class Step:
     after: float
     """Metres of shortest way to the goal; straight-line where there is no way."""
     note: str
+    fidelity: str
+    """How well imagination ranked the plans; empty where not measured."""
     seconds: Mapping[str, float]
     calls: Mapping[str, float]
     answer: str = ""
@@ -241,9 +246,33 @@ def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, nam
         _way(row, "before"),
         _way(row, "after"),
         row["note"],
+        _fidelity(row["fidelity"]),
         row["seconds"],
         row["calls"],
         f"{row['answer']['label']}, {100 * row['answer']['confidence']:.0f} %" if row["answer"] else "",
+    )
+
+
+def _fidelity(found: Mapping[str, Any] | None) -> str:
+    """E.g. "rank agreement +0.33 · regret 0.120"."""
+    said = {"rank agreement": ("rank", "{:+.2f}"), "regret": ("regret", "{:.3f}")}
+    return _spoken(found or {}, said)
+
+
+def _truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, bool]:
+    """What is known of a candidate's true future, in words, and whether that scores best."""
+    if found is None:
+        return "", False
+    own = {name: found[name][index] for name in ("scores", "psnr", "ssim")}
+    said = {"true score": ("scores", "{:.3f}"), "PSNR": ("psnr", "{:.1f} dB"), "SSIM": ("ssim", "{:.2f}")}
+    known = [score for score in found["scores"] if score is not None]
+    return _spoken(own, said), own["scores"] is not None and own["scores"] == max(known)
+
+
+def _spoken(values: Mapping[str, Any], said: Mapping[str, tuple[str, str]]) -> str:
+    """The numbers that are there, with their names."""
+    return " · ".join(
+        f"{title} {form.format(values[name])}" for title, (name, form) in said.items() if values.get(name) is not None
     )
 
 
@@ -276,6 +305,7 @@ def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes], album: Albu
                 proposal["note"],
                 shown.get("imagined"),
                 shown.get("true"),
+                *_truth(row["fidelity"], index),
                 sum(real),
                 len(real),
             )
