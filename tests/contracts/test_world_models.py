@@ -13,6 +13,7 @@ import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import RegistryError
 from wiw.loop.agent import Query
+from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
 from wiw.loop.imagine import imagine
 from wiw.policies.base import FrameSpec
@@ -33,7 +34,7 @@ def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS):
     model = wiw.world_model(name_or_model)
     proposals = [[Proposal(plan) for plan in plans] for _ in queries]
     return imagine(
-        model,
+        Attempts(model),
         queries,
         proposals,
         [range(len(plans)) for plans in proposals],
