@@ -12,6 +12,7 @@ import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
+from wiw.evaluation.verify import verify
 from wiw.loop.agent import Query
 from wiw.loop.imagine import model_spec
 from wiw.loop.placebo import shuffled
@@ -143,6 +144,11 @@ def test_placebos_do_not_depend_on_workers_or_batches(run) -> None:
 
     assert facts(run[0]) == facts(run[1]) and len({row["arm"] for row in run[0].decisions}) == 4
     assert all(row["status"] == "done" for row in run[0].episodes)
+
+
+def test_placebos_can_be_verified(run) -> None:
+    found = verify(run[0].path, episodes=1)
+    assert found.same and len(found.checks) == 4, str(found)
 
 
 def test_placebos_cost_what_the_real_arm_costs(run) -> None:
