@@ -202,6 +202,7 @@ void fill_color(ImageView<std::uint8_t> color, ImageView<const float> depth, boo
   const int columns = (depth.size.width + kBlock - 1) / kBlock;
   const int rows = (depth.size.height + kBlock - 1) / kBlock;
   std::vector<Between> across;
+  across.reserve(static_cast<std::size_t>(std::max(0, depth.size.width)));
   for (int x = 0; x < depth.size.width; ++x) across.push_back(between(x, columns, wraps));
   for (int y = 0; y < depth.size.height; ++y) {
     const Between down = between(y, rows, false);
