@@ -10,7 +10,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
-# The same commit always gets the same verdict; look for new counter-examples with --hypothesis-profile=explore.
+# Examples are drawn from fixed seeds, so that a commit gets one verdict. (Hypothesis mixes in constants of the modules
+# that are loaded, so other tests beside may change some.) --hypothesis-profile=explore looks for new ones.
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None)
 hypothesis.settings.register_profile("explore", max_examples=1000, deadline=None)
 hypothesis.settings.load_profile("fixed")

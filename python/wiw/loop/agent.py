@@ -279,13 +279,14 @@ class Agent:
     ) -> list[_Future]:
         """What each episode has to choose from after looking ahead."""
         beams = Beams(proposing, proposals, self.width, self.depth)
-        before = remembered(revising) if self.fidelity else []
-        imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
-        while beams.level < self.depth:
+        while True:
+            last = beams.level == self.depth
+            before = remembered(revising) if self.fidelity and last else []
+            imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
+            if last:
+                break
             with clock("propose"):
                 beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
-            before = remembered(revising) if self.fidelity else []
-            imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
         found: list[Fidelity | None] = [None] * len(queries)
         if self.fidelity:
             with clock("replay"):
