@@ -10,6 +10,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 
+# Torch reads this when it is loaded: pytest-xdist has a worker for every core already.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # Examples are drawn from fixed seeds, so that a commit gets one verdict. (Hypothesis mixes in constants of the modules
 # that are loaded, so other tests beside may change some.) --hypothesis-profile=explore looks for new ones.
 hypothesis.settings.register_profile("fixed", derandomize=True, deadline=None)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from dataclasses import replace
 from typing import ClassVar
@@ -217,6 +218,15 @@ def test_networks_count_by_content() -> None:
 
     prints = [model(1), model(1), model(2), model(1, torch.bfloat16)]
     assert prints[0] == prints[1] and len(set(prints)) == 3
+
+
+def test_what_needs_no_torch_has_one_name_with_and_without_it(monkeypatch) -> None:
+    torch = pytest.importorskip("torch")
+    there = Counting().fingerprint()
+    monkeypatch.setattr(torch, "get_float32_matmul_precision", lambda: "medium")
+    assert Counting().fingerprint() != there
+    monkeypatch.delitem(sys.modules, "torch")
+    assert Counting().fingerprint() == there
 
 
 MODEL = """

@@ -36,11 +36,17 @@ def fingerprint(model: Any) -> str:
     _add(digest, json.dumps(model.describe(), sort_keys=True, default=str), "describe()")
     for name, value in sorted(vars(model).items()):
         _add(digest, value, f"{type(model).__name__}.{name}")
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        matmul = torch.backends.cuda.matmul
-        _add(digest, [torch.get_float32_matmul_precision(), str(torch.get_default_dtype()), matmul.allow_tf32], "torch")
+    _add(digest, _precision(), "torch")
     return digest.hexdigest()
+
+
+def _precision() -> list[Any]:
+    """Torch's precision settings; where nothing has loaded torch, the ones that it would start with."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        return ["highest", "torch.float32", False]
+    matmul = torch.backends.cuda.matmul
+    return [torch.get_float32_matmul_precision(), str(torch.get_default_dtype()), bool(matmul.allow_tf32)]
 
 
 def _source(cls: type) -> bytes:
