@@ -7,6 +7,8 @@ __all__ = [
     "ArgumentError",
     "BackendError",
     "ContractError",
+    "DependencyError",
+    "DeviceMemoryError",
     "Error",
     "FileError",
     "InfrastructureError",
@@ -14,6 +16,7 @@ __all__ = [
     "RegistryError",
     "RolloutError",
     "StoreError",
+    "WeightsError",
 ]
 
 
@@ -34,6 +37,26 @@ class ContractError(Error, TypeError):
 
 class InfrastructureError(Error):
     """Something around the task failed (a server, a file, memory): the episode is recorded as such and not scored."""
+
+
+class DependencyError(Error, ImportError):
+    """An optional package is not installed. The message names it and the extra of wiw that brings it."""
+
+
+class WeightsError(Error):
+    """A model's weights cannot be had or used.
+
+    `kind` is "missing" (no such folder, repository or file), "revision", "gated" (accept its terms and log in),
+    "network", or "unfit" (another kind of model, or damaged files).
+    """
+
+    def __init__(self, message: str = "", kind: str = "missing") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class DeviceMemoryError(InfrastructureError):
+    """The accelerator's memory is full. The message names the options that need less of it."""
 
 
 class RolloutError(InfrastructureError):

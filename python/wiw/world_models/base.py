@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,10 +110,29 @@ def _check(name: str, value: str, allowed: Sequence[str]) -> None:
         raise ArgumentError(f"accepts: {name} is '{value}', expected one of {', '.join(allowed)}")
 
 
+@dataclass(frozen=True)
+class Requirements:
+    """What a world model needs of a machine; `wiw list world-models` says what of it is there."""
+
+    packages: tuple[str, ...] = ()
+    """Importable names."""
+    extra: str = ""
+    """Of wiw, which installs them: `pip install 'wiw[EXTRA]'`."""
+    weights: str = ""
+    """Name on the Hugging Face hub of what is loaded by default."""
+    gpu: bool = False
+    """Whether it is of no practical use without one."""
+
+    def missing(self) -> list[str]:
+        """Packages that are not installed; nothing is imported."""
+        return [name for name in self.packages if importlib.util.find_spec(name) is None]
+
+
 class WorldModel(ABC):
     """Predicts what an agent would see. Subclasses set `accepts` and write `rollout`."""
 
     accepts: Accepts
+    requires: ClassVar[Requirements] = Requirements()
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
