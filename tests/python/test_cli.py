@@ -139,6 +139,43 @@ def test_per_scene_is_an_option(tmp_path, two_rooms, short):
     assert load_run(tmp_path / "run").store.config["task"]["per_scene"] == 2
 
 
+OPTIONED = """
+import numpy as np
+import wiw
+
+
+class Tinted(wiw.WorldModel):
+    accepts = wiw.accepts(control="image")
+
+    def __init__(self, weights: str = "", strength: float = 0.5):
+        assert isinstance(weights, str) and isinstance(strength, float)
+        self.weights, self.strength = weights, strength
+
+    def rollout(self, observations, controls, seeds):
+        frames = np.repeat(observations.image[:, None], 1 + len(controls[0].actions), axis=1)
+        frames[:, 1:] = frames[:, 1:] * self.strength
+        return frames
+"""
+
+
+def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
+    (tmp_path / "tinted.py").write_text(OPTIONED)
+    task = ["run", "imagenav", "--scenes", two_rooms, "--preset", short, "--episodes", "1", "--no-report"]
+    model = ["--world-model", f"{tmp_path}/tinted.py:Tinted"]
+    options = ["--world-model-option", "weights=123", "--world-model-option", "strength=0.25"]
+    arms = ["--arms", "none,placebo-shuffled", "--out", str(tmp_path / "run")]
+    assert main([*task, *model, *options, *arms]) == 0
+    agents = load_run(tmp_path / "run").store.info["agents"]
+    taken = {arm: agent["model_options"] for arm, agent in agents.items()}
+    given = {"weights": "123", "strength": 0.25}
+    assert taken == {"none": {}, "placebo-shuffled": given, "Tinted": given}
+    assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
+    for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "no YAML")):
+        assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / wrong)]) == 2
+        assert said in capsys.readouterr().err
+    assert main([*task, "--world-model-option", "steps=3"]) == 2
+
+
 def test_errors_are_one_clean_line(tmp_path, capsys):
     assert run("--world-model", "wrap", "--out", tmp_path / "a") == 2
     message = capsys.readouterr().err

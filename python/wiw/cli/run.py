@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options, model_options
 from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
@@ -24,6 +25,7 @@ def run(
     /,
     *,
     world_model: Name = "none",
+    world_model_option: Options = (),
     policy: Name = "matcher",
     revision: MaybeName = None,
     arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
@@ -63,6 +65,7 @@ def run(
     Args:
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        world_model_option: An option of --world-model, such as weights=FOLDER or steps=30; may be given again.
         policy: Proposes plans; name or path.py:Class.
         revision: Scores imagined futures; the policy's own choice if not given.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
@@ -101,8 +104,9 @@ def run(
     recipe = TaskRecipe(task, {**options, **{name: value for name, value in more.items() if value is not None}})
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
-        absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width
-    )
+        absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
+        model_options=model_options(model, world_model_option),
+    )  # fmt: skip
     names = _arms(arms, world_model)
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 

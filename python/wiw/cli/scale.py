@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options, model_options
+
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
 Values = Annotated[str | None, arg(metavar="A,B,...")]
@@ -19,6 +21,7 @@ def scale(
     /,
     *,
     world_model: Name = "warp",
+    world_model_option: Options = (),
     policy: Name = "matcher",
     revision: Annotated[str | None, arg(metavar="NAME")] = None,
     candidates: Values = None,
@@ -47,6 +50,7 @@ def scale(
     Args:
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
         policy: Proposes plans; name or path.py:Class.
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
@@ -69,9 +73,10 @@ def scale(
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
     from wiw.evaluation.scale import scale as run_scale
 
+    model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
-        absolute(policy), None if world_model == "none" else absolute(world_model), revision and absolute(revision),
-        horizon=horizon,
+        absolute(policy), model, revision and absolute(revision), horizon=horizon,
+        model_options=model_options(model, world_model_option),
     )  # fmt: skip
     recipe = TaskRecipe(task, {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend})
     folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"

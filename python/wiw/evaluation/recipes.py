@@ -58,6 +58,8 @@ class AgentRecipe:
     placebo: str | None = None
     pool: int | None = None
     imagine_fraction: float | None = None
+    model_options: Mapping[str, Any] = field(default_factory=dict)
+    """What the world model is made with, by name."""
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):
@@ -71,17 +73,23 @@ class AgentRecipe:
         `limits` are what a run gives every agent beyond its identity: `deadline`, `cache`, `cache_gb`.
         """
         from wiw.loop.agent import Agent
+        from wiw.registry import WORLD_MODELS
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
+        options = given.pop("model_options")
+        if options:
+            given["model"] = WORLD_MODELS.make(self.model, **options)
         return Agent(**given, **limits).settled(defaults)
 
     def with_model(self, model: str) -> AgentRecipe:
         """The same agent with another world model."""
-        return replace(self, model=None if model == "none" else model)
+        if model == self.model:
+            return self
+        return replace(self, model=None if model == "none" else model, model_options={})
 
     def as_placebo(self, kind: str, model: str | None = None) -> AgentRecipe:
         """The same agent, whose world model (or another one) imagines something else than the plans."""
-        return replace(self, model=model or self.model or PLACEBO_MODEL, placebo=kind)
+        return replace(self.with_model(model or self.model or PLACEBO_MODEL), placebo=kind)
 
     def to_json(self) -> dict[str, Any]:
         """For the run store; `AgentRecipe(**...)` is the way back."""
@@ -98,7 +106,7 @@ class AgentRecipe:
         for registry, name in ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision)):
             if name is not None:
                 registry.find(name)
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        return {name: value for name, value in asdict(self).items() if value not in (None, {})}
 
     @property
     def arm(self) -> str:

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""KEY=VALUE on the command line, as options of a class or function."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+from tyro.conf import UseAppendAction, arg
+
+from wiw.errors import ArgumentError
+
+Options = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="KEY=VALUE")]
+"""A flag that may be given several times."""
+
+
+def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict[str, Any]:
+    """`["steps=30", "size=[480, 480]"]` as options of a factory.
+
+    A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
+    such, so that a revision of digits is no number.
+
+    Raises:
+        ArgumentError: no `=`, a key given twice, or a value that is no YAML; names the flag.
+    """
+    import yaml
+
+    options: dict[str, Any] = {}
+    parameters = inspect.signature(factory).parameters
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        name = key.strip().replace("-", "_")
+        if not equals or not name:
+            raise ArgumentError(f"{flag}: expected KEY=VALUE, got '{pair}'")
+        if name in options:
+            raise ArgumentError(f"{flag}: '{name}' is given twice")
+        annotation = inspect.formatannotation(parameters[name].annotation) if name in parameters else ""
+        try:
+            options[name] = value if annotation.strip("'").startswith("str") else yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ArgumentError(f"{flag}: {pair}: the value is no YAML ({error})") from None
+    return options
+
+
+def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
+    """What `--world-model-option` gives a world model.
+
+    Raises:
+        ArgumentError: options without a model to take them.
+    """
+    from wiw.registry import WORLD_MODELS
+
+    if pairs and model is None:
+        raise ArgumentError("--world-model-option: name the model that takes it with --world-model")
+    return parsed(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
