@@ -119,6 +119,24 @@ class Goal:
 
 
 @dataclass(frozen=True)
+class Wording:
+    """How reports and views speak of a task's episodes."""
+
+    succeeded: str = "succeeded"
+    """What a successful episode did, e.g. "reached the goal"."""
+    won: str = "succeeded"
+    """The same in a word, e.g. "reached"."""
+    lost: str = "not succeeded"
+    """Any other episode, e.g. "not reached"."""
+    goal: str = "goal"
+    """What distances end at."""
+    way: str = "to the goal"
+    """Where an episode's shortest way leads."""
+    asked: str = "The goal"
+    """Over what the agent is shown, e.g. "The goal: find where this was taken"."""
+
+
+@dataclass(frozen=True)
 class Proposal:
     """One candidate plan: primitive ids int8 [K], 1 <= K <= horizon."""
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -269,6 +270,10 @@ def test_the_store_keeps_answers_and_pictures_with_the_box(file: Path, tmp_path:
     assert ((picture[..., 0] > 150) & (picture[..., 1:].max(axis=-1) < 110)).sum() > 100
 
 
+def without_tags(page: str) -> str:
+    return re.sub(r"<style>.*?</style>|<script>.*?</script>|<[^>]*>", " ", page, flags=re.DOTALL)
+
+
 def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     task = AR(episode_file=file, decisions=2)
     log = wiw.evaluate(task, wiw.Agent(SizeReader(0.5)), 1, out=tmp_path / "run", keep_images=1)
@@ -276,6 +281,11 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     assert "The boxed thing: table" in page
     assert "Answer: table, 50 %" in page
     assert "recognised in 2 decisions" in page
-    assert "find where this was taken" not in page
-    missed = Attempt("none", {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}, (), None, CHOICES)
+    assert "recognised the target, %" in page
+    shown = (log.view().read_text(), *(file.read_text() for file in log.view().parent.glob("episodes/*.html")))
+    assert len(shown) == 2 and not any(
+        re.search("the goal|reached", without_tags(text), re.I) for text in [page, *shown]
+    )
+    outcome = {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}
+    missed = Attempt("none", outcome, (), None, task.wording, CHOICES)
     assert missed.text == "taken for shelf in 0 decisions"

@@ -76,6 +76,12 @@ def test_the_page_shows_every_arm_decision_and_failure(log, page):
     assert f"{log.numbers()['warp'].estimates['success'].value:.1f}" in text
 
 
+def test_a_task_that_says_nothing_of_itself_is_spoken_of_plainly(page):
+    text = " ".join(page.texts)
+    assert "percent of episodes that succeeded." in text and "succeeded, %" in text
+    assert "not succeeded in" in text and "reached in" not in text
+
+
 def test_pictures_are_kept_small_and_inside(page):
     pictures = [attributes["src"] for tag, attributes in page.tags if tag == "img"]
     assert len(pictures) > 20 and all(picture.startswith("data:image/jpeg;base64,") for picture in pictures)

@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
-from wiw.types import Episode, EpisodeResult
+from wiw.types import Episode, EpisodeResult, Wording
 
 
 def evaluate(
@@ -236,6 +236,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "pictures": _spread(options.episodes, options.pictures),
             "scenes": used,
+            "wording": asdict(getattr(built, "wording", Wording())),
             "live": options.live,
             "workers": options.workers,
             "limits": options.limits.as_dict(),

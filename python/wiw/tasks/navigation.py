@@ -21,7 +21,7 @@ from wiw.errors import ArgumentError, FileError
 from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
-from wiw.types import Episode, Goal
+from wiw.types import Episode, Goal, Wording
 
 
 class NavigationTask(ABC):
@@ -42,6 +42,8 @@ class NavigationTask(ABC):
     name: str
     metrics: tuple[str, ...]
     rules_class: type
+    wording = Wording()
+    """How reports speak of its episodes."""
     choices: tuple[str, ...] = ()
     """What answers are chosen from, where the task asks for any."""
 

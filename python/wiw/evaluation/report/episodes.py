@@ -29,7 +29,7 @@ from wiw.evaluation.report.maps import (
 )
 from wiw.evaluation.rows import decode_jpeg, encode_jpeg
 from wiw.evaluation.store import RunStore
-from wiw.types import Episode
+from wiw.types import Episode, Wording
 
 GLYPHS = {int(FORWARD): "↑", int(TURN_LEFT): "↖", int(TURN_RIGHT): "↗", int(STOP): "■"}
 BAND = (0.2, 0.8)
@@ -84,7 +84,7 @@ class Step:
     """The plan, where it is none of the candidates."""
     before: float
     after: float
-    """Metres of shortest way to the goal; straight-line where there is no way."""
+    """Metres of shortest way to the goal or target; straight-line where there is no way."""
     note: str
     fidelity: str
     """How well imagination ranked the plans; empty where not measured."""
@@ -107,12 +107,13 @@ class Attempt:
     outcome: Mapping[str, Any]
     steps: tuple[Step, ...]
     trail: Trail | None
+    words: Wording
     choices: Sequence[str] = ()
     """What answers are chosen from, where the task asks for any."""
 
     @property
     def reached(self) -> bool:
-        """Whether the goal was reached."""
+        """Whether the episode was a success."""
         return bool(self.outcome["metrics"].get("success"))
 
     @property
@@ -122,16 +123,13 @@ class Attempt:
             return "failed for infrastructure"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
-        if self.choices:
-            return f"recognised in {count}" if self.reached else f"{self._mistaken(metrics)} in {count}"
         if self.reached:
-            return f"reached in {count}"
+            return f"{self.words.won} in {count}"
+        if self.choices:
+            label = taken_for(metrics, self.choices)
+            return f"taken for {label} in {count}" if label else f"not answered in {count}"
         left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
-        return f"not reached in {count}{left}"
-
-    def _mistaken(self, metrics: Mapping[str, Any]) -> str:
-        predicted = int(metrics.get("predicted", -1))
-        return f"taken for {self.choices[predicted]}" if 0 <= predicted < len(self.choices) else "not answered"
+        return f"{self.words.lost} in {count}{left}"
 
 
 @dataclass(frozen=True)
@@ -147,6 +145,7 @@ class Story:
     start_mark: Mark
     goal_mark: Mark
     attempts: tuple[Attempt, ...]
+    words: Wording
 
     @property
     def place(self) -> str:
@@ -155,10 +154,9 @@ class Story:
 
     @property
     def way(self) -> str:
-        """E.g. " · 4.2 m to go"; nothing where no arm could measure it."""
+        """E.g. " · 4.2 m to the goal"; nothing where no arm could measure it."""
         length = self.episode.geodesic
-        end = "to the best view" if self.target else "to go"
-        return f" · {length:.1f} m {end}" if np.isfinite(length) else ""
+        return f" · {length:.1f} m {self.words.way}" if np.isfinite(length) else ""
 
     @property
     def target(self) -> str:
@@ -209,7 +207,18 @@ def tell(
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
     start, end = start_and_goal(frame, episode)
     shown = album.put(f"{index}-goal", "jpeg", goal) if goal else None
-    return Story(index, episode, shown, picture, frame, start, end, attempts)
+    return Story(index, episode, shown, picture, frame, start, end, attempts, wording(store))
+
+
+def wording(store: RunStore) -> Wording:
+    """How the run's task speaks of its episodes."""
+    return Wording(**store.info.get("wording", {}))
+
+
+def taken_for(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
+    """The final answer, where the task asks for any; empty where none was given."""
+    predicted = int(metrics.get("predicted", -1))
+    return choices[predicted] if 0 <= predicted < len(choices) else ""
 
 
 def place(scene: str) -> str:
@@ -231,7 +240,7 @@ def _attempt(
         for row in decisions
     )
     choices = store.config.get("task", {}).get("categories", ())
-    return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None, choices)
+    return Attempt(arm, outcome, steps, trail(frame, arm, decisions) if decisions else None, wording(store), choices)
 
 
 def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, name: str) -> Step:

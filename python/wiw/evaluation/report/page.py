@@ -16,7 +16,7 @@ from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import COLUMNS as FIDELITY_COLUMNS
 from wiw.evaluation.fidelity import ArmFidelity, fidelity
 from wiw.evaluation.report import plots
-from wiw.evaluation.report.episodes import stories
+from wiw.evaluation.report.episodes import stories, wording
 from wiw.evaluation.report.templating import environment, signed
 from wiw.evaluation.statistics import Difference
 from wiw.evaluation.summary import Summary, notes, shown_headlines
@@ -51,6 +51,7 @@ def render(log: RunLog) -> str:
             task=config["task"],
             created=log.store.created,
             version=log.store.wiw_version,
+            words=wording(log.store),
             sentence=sentence(summary),
             plots=_plots(log, summary, truths),
             stories=told,
@@ -137,6 +138,7 @@ def _plots(log: RunLog, summary: Summary, truths: Sequence[ArmFidelity]) -> list
     }
     if not any(rows and "success" in rows[0]["metrics"] for rows in done.values()):
         return []
+    words = wording(log.store)
     budget = int(max(row["metrics"].get("decisions", 0) for rows in done.values() for row in rows))
     found = [
         (
@@ -148,11 +150,10 @@ def _plots(log: RunLog, summary: Summary, truths: Sequence[ArmFidelity]) -> list
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
     if any(ways.values()):
         about = "Do longer ways need the world model more?"
-        found.append(("Success by distance", about, plots.success_by_distance(ways)))
+        found.append(("Success by distance", about, plots.success_by_distance(ways, words)))
     if budget:
-        found.append(
-            ("Decisions to success", "How soon the goal is reached.", plots.decisions_to_success(done, budget))
-        )
+        about = "How soon episodes succeed."
+        found.append(("Decisions to success", about, plots.decisions_to_success(done, budget, words)))
     if sum(not math.isnan(line.rank) for line in truths) > 1:
         about = "Does the arm that orders plans rightly also succeed? Kendall's tau against the true futures."
         found.append(("Controllability and success", about, plots.success_by_rank(truths, summary)))

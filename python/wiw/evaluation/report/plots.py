@@ -17,6 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from wiw.evaluation.fidelity import ArmFidelity
 from wiw.evaluation.intervals import wilson
 from wiw.evaluation.summary import Summary
+from wiw.types import Wording
 
 INK = "#010203"
 """Stands for the page's text colour."""
@@ -89,26 +90,26 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     return _svg(figure, "success-by-rank")
 
 
-def success_by_distance(outcomes: Outcomes) -> Markup:
+def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     """How success depends on the way to go: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))
     figure, axes = _figure()
     if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
-        _outcome_dots(axes, outcomes, colors)
+        _outcome_dots(axes, outcomes, colors, words)
     else:
         _binned_rates(axes, outcomes, colors)
-    axes.set_xlabel("shortest way from start to goal, m")
+    axes.set_xlabel(f"shortest way {words.way}, m")
     return _svg(figure, "success-by-distance")
 
 
-def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str], words: Wording) -> None:
     for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
         for row in rows:
             filled = colors[arm] if row["metrics"].get("success") else "none"
             axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9)
     axes.set_yticks(range(len(outcomes)), list(reversed(list(outcomes))))
     axes.set_ylim(-0.6, len(outcomes) - 0.4)
-    axes.set_title("filled: reached, hollow: not", loc="right", fontsize=9, color=INK)
+    axes.set_title(f"filled: {words.won}, hollow: {words.lost}", loc="right", fontsize=9, color=INK)
 
 
 def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
@@ -135,8 +136,8 @@ def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> 
     _legend(axes)
 
 
-def decisions_to_success(outcomes: Outcomes, budget: int) -> Markup:
-    """Share of episodes that have reached the goal after so many decisions."""
+def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Markup:
+    """Share of episodes that have succeeded after so many decisions."""
     colors = arm_colors(list(outcomes))
     figure, axes = _figure()
     for arm, rows in outcomes.items():
@@ -148,7 +149,7 @@ def decisions_to_success(outcomes: Outcomes, budget: int) -> Markup:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(-3, 103)
     axes.set_xlabel("decisions")
-    axes.set_ylabel("reached the goal, %")
+    axes.set_ylabel(f"{words.succeeded}, %")
     _legend(axes)
     return _svg(figure, "decisions-to-success")
 

@@ -7,16 +7,16 @@ Both draw an episode from the same values and template parts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wiw.evaluation.faults import whole_folder
-from wiw.evaluation.report.episodes import Album, Story, outcomes_by_episode, place, tell
+from wiw.evaluation.report.episodes import Album, Story, outcomes_by_episode, place, taken_for, tell, wording
 from wiw.evaluation.report.plots import arm_colors
 from wiw.evaluation.report.templating import environment
-from wiw.types import Episode
+from wiw.types import Episode, Wording
 
 if TYPE_CHECKING:
     from wiw.evaluation.runlog import RunLog
@@ -47,8 +47,10 @@ class Cell:
 
     arm: str
     state: str
-    """"reached", "missed", "failed" (infrastructure) or "open" (not run yet)."""
+    """"reached" (a success), "missed", "failed" (infrastructure) or "open" (not run yet)."""
     text: str
+    about: str
+    """What the text says."""
 
 
 @dataclass(frozen=True)
@@ -135,31 +137,37 @@ def _common(log: RunLog) -> dict[str, Any]:
         "colors": arm_colors(log.arms),
         "radius": task.get("radius"),
         "place": place,
+        "words": wording(log.store),
+        "choices": task.get("categories", ()),
     }
 
 
 def _lines(log: RunLog, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
     pictures = set(log.store.info["pictures"])
+    words, choices = wording(log.store), log.store.config["task"].get("categories", ())
     return [
         Line(
             index,
             episode,
             place(episode.scene),
-            tuple(_cell(arm, outcomes.get(index, {}).get(arm)) for arm in log.arms),
+            tuple(_cell(arm, outcomes.get(index, {}).get(arm), words, choices) for arm in log.arms),
             index in pictures,
         )
         for index, episode in enumerate(log.store.episodes())
     ]
 
 
-def _cell(arm: str, outcome: Mapping[str, Any] | None) -> Cell:
+def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: Sequence[str]) -> Cell:
     if outcome is None:
-        return Cell(arm, "open", "to run")
+        return Cell(arm, "open", "to run", "not run yet")
     if outcome["status"] == "failed":
-        return Cell(arm, "failed", "failed")
+        return Cell(arm, "failed", "failed", "failed for infrastructure")
     metrics = outcome["metrics"]
     count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
     if metrics.get("success"):
-        return Cell(arm, "reached", count)
-    left = f"{metrics['distance_to_goal']:.1f} m" if "distance_to_goal" in metrics else count
-    return Cell(arm, "missed", left)
+        return Cell(arm, "reached", count, f"{words.won}; decisions taken")
+    if choices:
+        return Cell(arm, "missed", taken_for(metrics, choices) or "no answer", f"{words.lost}; what it was taken for")
+    if "distance_to_goal" in metrics:
+        return Cell(arm, "missed", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; metres short")
+    return Cell(arm, "missed", count, f"{words.lost}; decisions taken")

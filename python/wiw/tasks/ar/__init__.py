@@ -17,7 +17,7 @@ from wiw.envs.pointing import Pointing
 from wiw.envs.trip import Trip
 from wiw.errors import ArgumentError
 from wiw.tasks.navigation import NavigationTask
-from wiw.types import Answer, Episode, Goal
+from wiw.types import Answer, Episode, Goal, Wording
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,14 @@ class AR(NavigationTask):
     name = "ar"
     metrics = ("success", "mean_trajectory")
     rules_class = ARRules
+    wording = Wording(
+        succeeded="recognised the target",
+        won="recognised",
+        lost="not recognised",
+        goal="target",
+        way="to the best view",
+        asked="The boxed thing",
+    )
 
     def __init__(self, *args: Any, categories: Sequence[str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)

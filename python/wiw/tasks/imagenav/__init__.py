@@ -15,7 +15,7 @@ from wiw.datasets.worlds import World
 from wiw.envs.trip import Trip
 from wiw.errors import ArgumentError
 from wiw.tasks.navigation import NavigationTask
-from wiw.types import Episode, Goal
+from wiw.types import Episode, Goal, Wording
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,9 @@ class ImageNav(NavigationTask):
     name = "imagenav"
     metrics = ("success", "spl", "mean_trajectory")
     rules_class = ImageNavRules
+    wording = Wording(
+        succeeded="reached the goal", won="reached", lost="not reached", asked="The goal: find where this was taken"
+    )
 
     def goal(self, place: World, episode: Episode) -> Goal:
         """The goal image: front view at the goal's pose."""
