@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
+from wiw.cli import main
 from wiw.datasets import ar
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
@@ -268,6 +269,17 @@ def test_the_store_keeps_answers_and_pictures_with_the_box(file: Path, tmp_path:
     assert [len(row["executed"]) for row in decisions] == [1] * 9 + [0]
     picture = decode_jpeg(log.store.images("none", 0, 0)["panorama"]).astype(int)
     assert ((picture[..., 0] > 150) & (picture[..., 1:].max(axis=-1) < 110)).sum() > 100
+
+
+def test_the_command_line_names_the_categories(file: Path, tmp_path: Path) -> None:
+    policy = f"{Path(__file__).with_name('fakes.py')}:SizeReader"
+    command = ["run", "ar", "--episode-file", str(file), "--episodes", "1", "--policy", policy, "--no-report"]
+    assert main([*command, "--task-option", "categories=coffee table, table", "--out", str(tmp_path / "run")]) == 0
+    log = wiw.load_run(tmp_path / "run")
+    assert log.store.config["task"]["categories"] == ["coffee table", "table"]
+    assert log.decisions[0]["answer"]["label"] in ("coffee table", "table")
+    assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
+    assert main([*command, "--task-option", "categories=table, table", "--out", str(tmp_path / "b")]) == 2
 
 
 def without_tags(page: str) -> str:

@@ -176,6 +176,34 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     assert main([*task, "--world-model-option", "steps=3"]) == 2
 
 
+def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
+    task = ["run", "imagenav", "--scenes", two_rooms, "--preset", short, "--episodes", "1", "--no-report"]
+    options = ["--task-option", "radius=9", "--task-option", "spl=actions"]
+    assert main([*task, *options, "--out", str(tmp_path / "run")]) == 0
+    log = load_run(tmp_path / "run")
+    said = log.store.config["task"]
+    assert (said["radius"], said["spl"], log.episodes[0]["metrics"]["success"]) == (9.0, "actions", 1.0)
+    assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
+    for wrong, message in (
+        ("radius=wide", "radius: expected a value of type float"),
+        ("radios=9", "unknown rules radios"),
+        ("seed=3", "--seed"),
+        ("radius", "KEY=VALUE"),
+    ):
+        assert main([*task, "--task-option", wrong, "--out", str(tmp_path / wrong)]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_scaling_and_episodes_take_a_tasks_options_too(tmp_path, two_rooms, short, capsys):
+    task = ["scale", "imagenav", "--scenes", two_rooms, "--preset", short, "--episodes", "1", "--candidates", "1"]
+    options = ["--task-option", "radius=9", "--world-model", "copy", "--out", str(tmp_path / "run")]
+    assert main([*task, *options]) == 0
+    assert load_run(tmp_path / "run").store.config["task"]["radius"] == 9.0
+    made = ["episodes", "ar", "--scenes", two_rooms, "--out", str(tmp_path / "ar.json")]
+    assert main([*made, "--task-option", "categories=bathtub, coffee table"]) == 2
+    assert "holds nothing of the categories bathtub, coffee table" in capsys.readouterr().err
+
+
 def test_errors_are_one_clean_line(tmp_path, capsys):
     assert run("--world-model", "wrap", "--out", tmp_path / "a") == 2
     message = capsys.readouterr().err

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options, task_options
+
 
 def episodes(
     task: Positional[Annotated[str, arg(metavar="TASK")]] = "imagenav",
@@ -19,12 +21,14 @@ def episodes(
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
+    task_option: Options = (),
 ) -> int:
     """Generates the episodes of a task and writes them to a file, which `wiw run --episode-file` takes.
 
     $ wiw episodes imagenav --scenes apartments:val:20 --episodes 100 --out val.json.gz
     $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json
     $ wiw run imagenav --episode-file house.json --world-model warp
+    $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
 
     Scenes that lie below the file's folder are named relative to it, so that the folder may be moved or shared.
 
@@ -36,13 +40,14 @@ def episodes(
         per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
         seed: The episodes are a function of it and the scenes.
         backend: Renderer, which sees to it that goals are out of sight.
+        task_option: Another option of the task, such as categories=bed,sofa; may be given again.
     """
     from wiw.datasets.episodes import save
     from wiw.errors import FileError
     from wiw.registry import TASKS
 
-    options = {"scenes": scenes, "seed": seed, "backend": backend}
-    made = TASKS.make(task, **options if per_scene is None else {**options, "per_scene": per_scene})
+    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene}
+    made = TASKS.make(task, **task_options(task, task_option, flags))
     found = made.episodes(episodes)
     choices = {"categories": list(made.choices)} if getattr(made, "choices", ()) else {}
     try:

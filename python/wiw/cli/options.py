@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 from tyro.conf import UseAppendAction, arg
@@ -19,7 +19,8 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
     """`["steps=30", "size=[480, 480]"]` as options of a factory.
 
     A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
-    such, so that a revision of digits is no number.
+    such, so that a revision of digits is no number. The brackets of a list may be left out where it is annotated as a
+    sequence: `categories=bed,coffee table`.
 
     Raises:
         ArgumentError: no `=`, a key given twice, or a value that is no YAML; names the flag.
@@ -35,9 +36,11 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
             raise ArgumentError(f"{flag}: expected KEY=VALUE, got '{pair}'")
         if name in options:
             raise ArgumentError(f"{flag}: '{name}' is given twice")
-        annotation = inspect.formatannotation(parameters[name].annotation) if name in parameters else ""
+        annotation = inspect.formatannotation(parameters[name].annotation).strip("'") if name in parameters else ""
+        if annotation.startswith("Sequence") and not value.lstrip().startswith("["):
+            value = f"[{value}]"
         try:
-            options[name] = value if annotation.strip("'").startswith("str") else yaml.safe_load(value)
+            options[name] = value if annotation.startswith("str") else yaml.safe_load(value)
         except yaml.YAMLError as error:
             raise ArgumentError(f"{flag}: {pair}: the value is no YAML ({error})") from None
     return options
@@ -54,3 +57,18 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
     if pairs and model is None:
         raise ArgumentError("--world-model-option: name the model that takes it with --world-model")
     return parsed(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
+
+
+def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
+    """What a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
+
+    Raises:
+        ArgumentError: an option that has a flag of its own.
+    """
+    from wiw.registry import TASKS
+
+    options = parsed(pairs, TASKS.find(task), "--task-option") if pairs else {}
+    for name in options:
+        if name in flags:
+            raise ArgumentError(f"--task-option: '{name}' has a flag of its own, --{name.replace('_', '-')}")
+    return {**{name: value for name, value in flags.items() if value is not None}, **options}

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, model_options
+from wiw.cli.options import Options, model_options, task_options
 from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
@@ -43,6 +43,7 @@ def run(
     width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     live: Count = 4,
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2,
@@ -85,6 +86,8 @@ def run(
         width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
+            categories=bed,sofa; may be given again.
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         keep_images: Episodes that keep pictures for `wiw report` and `wiw view`; all: every one, at 0.2 MB a decision.
@@ -99,9 +102,11 @@ def run(
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
 
-    options = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
-    more = {"motion": motion, "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder}
-    recipe = TaskRecipe(task, {**options, **{name: value for name, value in more.items() if value is not None}})
+    flags = {
+        "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion, "per_scene": per_scene,
+        "episode_file": episode_file, "scene_folder": scene_folder,
+    }  # fmt: skip
+    recipe = TaskRecipe(task, task_options(task, task_option, flags))
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,

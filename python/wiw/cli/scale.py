@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, model_options
+from wiw.cli.options import Options, model_options, task_options
 
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -33,6 +33,7 @@ def scale(
     out: Annotated[Path | None, arg(metavar="DIR")] = None,
     horizon: Annotated[int | None, arg(metavar="L")] = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     live: Count = 4,
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
@@ -62,6 +63,8 @@ def scale(
         out: Folder of the run; runs/scale-TIME if not given.
         horizon: Primitives in a plan; the task's own number if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        task_option: A rule of the preset, such as decisions=10, or another option of the task, such as per_scene=2; may
+            be given again.
         backend: Renderer.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         deadline: Most seconds for a call of the world model, 300 if not given.
@@ -78,7 +81,8 @@ def scale(
         absolute(policy), model, revision and absolute(revision), horizon=horizon,
         model_options=model_options(model, world_model_option),
     )  # fmt: skip
-    recipe = TaskRecipe(task, {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend})
+    flags = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
+    recipe = TaskRecipe(task, task_options(task, task_option, flags))
     folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")
 

@@ -76,7 +76,7 @@ class AR(NavigationTask):
 
     def __init__(self, *args: Any, categories: Sequence[str] | None = None, **options: Any) -> None:
         super().__init__(*args, **options)
-        if categories is not None and (isinstance(categories, str) or len(set(categories)) != len(categories)):
+        if categories is not None and not _different_names(categories):
             raise ArgumentError(f"ar: categories: expected different names, got {categories!r}")
         self.choices = tuple(categories or ar.CATEGORIES)
         self._named = categories
@@ -159,3 +159,8 @@ class AR(NavigationTask):
             return episode
         centre = ar.centre_of(world(episode.scene, self.backend), int(episode.info["target"]), where)
         return replace(episode, goal_position=(float(centre[0]), float(centre[1]), float(centre[2])))
+
+
+def _different_names(given: Any) -> bool:
+    names = given if isinstance(given, Sequence) and not isinstance(given, str) else ()
+    return len(names) > 0 and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
