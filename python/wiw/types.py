@@ -213,6 +213,8 @@ class Fidelity:
     psnr: NDArray[np.float64]
     """float64 [M] dB: mean over a plan's imagined frames, latitude-weighted for panoramas; NaN without any."""
     ssim: NDArray[np.float64]
+    lpips: NDArray[np.float64] | None = None
+    """float64 [M]: the same of perspective views, lower is truer; None where it is not measured."""
 
     def regret(self, chosen: int | None) -> float:
         """By how much the true future of the chosen plan scores less than the best one; NaN for a plan made anew."""

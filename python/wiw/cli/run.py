@@ -51,6 +51,7 @@ def run(
     cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
     fidelity: bool = False,
+    lpips: Annotated[str | None, arg(metavar="auto|DIR")] = None,
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -97,6 +98,8 @@ def run(
             themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
         fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
+        lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where
+            they are not there it says which files are needed.
         report: Whether to write report.html at the end.
     """
     from wiw.evaluation.evaluate import evaluate
@@ -119,7 +122,7 @@ def run(
         return evaluate(
             recipe, agent, episodes, seed, folder, workers,
             arms=names, live=live, keep_images=keep_images, deadline=deadline,
-            cache=cache, cache_gb=cache_gb, fidelity=fidelity,
+            cache=cache, cache_gb=cache_gb, fidelity=fidelity, lpips=lpips,
         )  # fmt: skip
 
     return finish(stoppable(work, folder), report)

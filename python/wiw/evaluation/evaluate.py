@@ -21,6 +21,7 @@ from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
+from wiw.metrics import Lpips
 from wiw.types import Episode, EpisodeResult, Wording
 
 
@@ -41,6 +42,7 @@ def evaluate(
     cache: str | Path | None = None,
     cache_gb: float | None = None,
     fidelity: bool = False,
+    lpips: str | Path | None = None,
     **task_options: Any,
 ) -> RunLog:
     """Runs an agent on the first `episodes` episodes of a task.
@@ -72,6 +74,7 @@ def evaluate(
         cache_gb: most gigabytes of that folder.
         fidelity: whether every imagined plan is also replayed in the simulator, to tell how true imagination was; see
             `RunLog.fidelity`. Changes no decision and no cost that is reported, but takes about as long as `oracle`.
+        lpips: folder of the weights of LPIPS, or "auto" (`~/.cache/wiw/weights`): measures fidelity by it as well.
         task_options: options of a task given by name, such as `scenes` and `preset`.
 
     Raises:
@@ -79,8 +82,9 @@ def evaluate(
         StoreError: `out` holds a run and `resume` is off, or a run of another configuration.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
+        WeightsError: those of LPIPS are not there; says which, and how to get them.
     """
-    limits = _Limits(deadline, cache, cache_gb, fidelity)
+    limits = _Limits(deadline, cache, cache_gb, fidelity, lpips)
     options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
     return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
 
@@ -101,9 +105,10 @@ def run_arms(
     cache: str | Path | None = None,
     cache_gb: float | None = None,
     fidelity: bool = False,
+    lpips: str | Path | None = None,
 ) -> RunLog:
     """Runs several named agents on the same episodes; see `evaluate` for the rest."""
-    limits = _Limits(deadline, cache, cache_gb, fidelity)
+    limits = _Limits(deadline, cache, cache_gb, fidelity, lpips)
     options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
     return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
 
@@ -167,20 +172,34 @@ class _Limits:
     cache: str | Path | None
     cache_gb: float | None
     fidelity: bool
+    lpips: str | Path | None
 
     def __post_init__(self) -> None:
         if self.deadline is not None and not self.deadline > 0:
             raise ArgumentError(f"evaluate: expected a deadline above 0 s, got {self.deadline}")
         if self.cache_gb is not None and not self.cache_gb > 0:
             raise ArgumentError(f"evaluate: expected a cache_gb above 0, got {self.cache_gb}")
+        if self.lpips is not None:
+            Lpips(self.lpips)  # what is missing is told before anything is run
 
     def as_dict(self) -> dict[str, Any]:
         """Options of `wiw.Agent`; those that are None are left to it."""
         deadline = None if self.deadline is None else min(self.deadline, FOR_EVER)
-        named = self.cache is None or str(self.cache) in ("auto", "off")
-        cache = self.cache if named else str(Path(str(self.cache)).expanduser().resolve())
-        limits = {"deadline": deadline, "cache": cache, "cache_gb": self.cache_gb, "fidelity": self.fidelity or None}
+        limits = {
+            "deadline": deadline,
+            "cache": _anywhere(self.cache, "auto", "off"),
+            "cache_gb": self.cache_gb,
+            "fidelity": self.fidelity or self.lpips is not None or None,
+            "lpips": _anywhere(self.lpips, "auto"),
+        }
         return {name: value for name, value in limits.items() if value is not None}
+
+
+def _anywhere(folder: str | Path | None, *names: str) -> str | None:
+    """A folder so that it means the same anywhere; None and `names`, which stand for something else, as they are."""
+    if folder is None or str(folder) in names:
+        return None if folder is None else str(folder)
+    return str(Path(folder).expanduser().resolve())
 
 
 @dataclass(frozen=True)

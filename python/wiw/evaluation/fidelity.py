@@ -13,15 +13,37 @@ import numpy as np
 if TYPE_CHECKING:
     from wiw.evaluation.runlog import RunLog
 
+
+@dataclass(frozen=True)
+class Column:
+    """Of the table."""
+
+    title: str
+    about: str
+    name: str
+    """Of the figure in `ArmFidelity`."""
+    form: str
+
+
 COLUMNS = (
-    ("SR %", "Success rate."),
-    ("rank", "Kendall's tau: how far imagined futures put the plans into the order that the true ones give."),
-    ("best chosen %", "Decisions for the plan whose true future scores best."),
-    ("regret", "By how much the chosen plan's true future scores less than the best one."),
-    ("PSNR dB", "Of imagined frames against what would have been seen, open loop, at the size the reviser sees."),
-    ("SSIM", "The same, structural similarity."),
+    Column("SR %", "Success rate.", "success", ".1f"),
+    Column(
+        "rank",
+        "Kendall's tau: how far imagined futures put the plans into the order that the true ones give.",
+        "rank",
+        ".2f",
+    ),
+    Column("best chosen %", "Decisions for the plan whose true future scores best.", "best", ".0f"),
+    Column("regret", "By how much the chosen plan's true future scores less than the best one.", "regret", ".3f"),
+    Column(
+        "PSNR dB",
+        "Of imagined frames against what would have been seen, open loop, at the size the reviser sees.",
+        "psnr",
+        ".1f",
+    ),
+    Column("SSIM", "The same, structural similarity.", "ssim", ".3f"),
+    Column("LPIPS", "The same of perspective views of 256x256: perceptual distance, lower is truer.", "lpips", ".3f"),
 )
-"""Columns of the table and what they mean."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +61,11 @@ class ArmFidelity:
     regret: float
     psnr: float
     ssim: float
+    lpips: float
 
-    def cells(self) -> list[str]:
-        """The columns of the table, in words."""
-        values = ((self.success, ".1f"), (self.rank, ".2f"), (self.best, ".0f"), (self.regret, ".3f"))
-        return [_shown(value, form) for value, form in (*values, (self.psnr, ".1f"), (self.ssim, ".3f"))]
+    def cells(self, columns: Sequence[Column]) -> list[str]:
+        """Columns of the table, in words."""
+        return [_shown(getattr(self, column.name), column.form) for column in columns]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values."""
@@ -53,6 +75,11 @@ class ArmFidelity:
 def fidelity(log: RunLog) -> list[ArmFidelity]:
     """One line for each arm that imagined and was replayed, in the order of the run's table."""
     return [line for arm in log.arms if (line := _arm(log, arm)) is not None]
+
+
+def shown_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
+    """All columns but LPIPS where no arm has it."""
+    return [column for column in COLUMNS if column.name != "lpips" or not all(math.isnan(o.lpips) for o in lines)]
 
 
 def _arm(log: RunLog, arm: str) -> ArmFidelity | None:
@@ -70,6 +97,7 @@ def _arm(log: RunLog, arm: str) -> ArmFidelity | None:
         _mean([one["regret"] for one in found]),
         _mean([value for one in found for value in one["psnr"]]),
         _mean([value for one in found for value in one["ssim"]]),
+        _mean([value for one in found for value in one.get("lpips", ())]),
     )
 
 

@@ -70,7 +70,7 @@ class AgentRecipe:
     def build(self, defaults: Mapping[str, Any], limits: Mapping[str, Any] = NO_LIMITS) -> Any:
         """The agent; what is None is taken from the task's defaults (M, L and the executed primitives).
 
-        `limits` are what a run gives every agent beyond its identity: `deadline`, `cache`, `cache_gb`.
+        `limits` are what a run gives every agent beyond its identity: deadline, cache, fidelity and the like.
         """
         from wiw.loop.agent import Agent
         from wiw.registry import WORLD_MODELS

@@ -124,6 +124,7 @@ def _fidelity(found: Fidelity, chosen: int | None) -> dict[str, Any]:
         "best": None if chosen is None else bool(found.scores[chosen] == found.scores.max()),
         "psnr": found.psnr,
         "ssim": found.ssim,
+        **({} if found.lpips is None else {"lpips": found.lpips}),
     }
 
 

@@ -40,7 +40,7 @@ CREATE TABLE decision (
     proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note}]
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
     answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
-    fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim}; NULL where it is not measured
+    fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim[, lpips]}; NULL: not measured
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
     seconds TEXT NOT NULL,          -- JSON: wall time by stage

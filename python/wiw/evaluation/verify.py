@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs some episodes of a run again and compares everything that was decided and measured with what the run recorded.
 
-Timings are left out, and so is a rollout cache, which would answer with what is to be checked.
+Timings are left out, and so is a rollout cache, which would answer with what is to be checked, and LPIPS, whose last
+digits depend on threads and device.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     built, info, all_episodes = task.build(), store.info, store.episodes()
     store.require_task(built.describe())
     require_scenes(built, store, [all_episodes[index] for _, index in keys])
-    limits = {**info.get("limits", {}), "cache": "off"}
+    limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
     pictures = frozenset(info["pictures"])
     plan = Plan(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
     runner, found = Runner(plan), dict[tuple[str, int], Facts]()
@@ -159,6 +160,8 @@ def _recorded(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
 
 def _decision(number: int, values: Mapping[str, Any], images: Mapping[str, bytes]) -> tuple[str, dict[str, Any]]:
     facts = {name: value for name, value in values.items() if name not in UNLIKE}
+    if facts["fidelity"] is not None:
+        facts["fidelity"] = {name: value for name, value in facts["fidelity"].items() if name != "lpips"}
     facts["calls"] = {name: values["calls"].get(name) for name in ("rows", "frames")}
     seen = {f"picture {name}": _digest(jpeg) for name, jpeg in images.items() if not name.startswith("true/")}
     return f"decision {number}", json.loads(to_json({**facts, **seen}))

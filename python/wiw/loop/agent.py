@@ -29,6 +29,7 @@ from wiw.loop.fidelity import remembered, replay
 from wiw.loop.imagine import Imagination, imagine, model_spec
 from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
+from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
 from wiw.types import Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout
@@ -100,9 +101,11 @@ class Agent:
             preference decides. Drawn by the decision's key: what a smaller share consults, a larger one does too.
         fidelity: whether every plan is also replayed in the simulator, to tell how true imagination was
             (`wiw.loop.fidelity`); changes no decision, and needs a simulator with every query.
+        lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
         placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
 
     Raises:
+        WeightsError: those of LPIPS are not there.
         ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
             that shows no panorama or a policy that needs depth, which no imagined place has, and does not say how to
             extend.
@@ -122,6 +125,7 @@ class Agent:
         cache: str | Path = "auto",
         cache_gb: float = BUDGET_GB,
         fidelity: bool = False,
+        lpips: str | Path | None = None,
         placebo: Placebo | None = None,
         pool: int | None = None,
         imagine_fraction: float = 1.0,
@@ -155,8 +159,10 @@ class Agent:
             raise ArgumentError(
                 f"Agent: expected placebo {' or '.join(PLACEBOS)}, with a world model, got '{placebo}' and {self.model}"
             )
-        self._limits = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb, "fidelity": fidelity}
-        self.fidelity = fidelity and self.model is not None
+        self._limits: dict[str, Any] = {"deadline": deadline, "cache": cache, "cache_gb": cache_gb}
+        self._limits |= {"fidelity": fidelity, "lpips": lpips}
+        self.fidelity = (fidelity or lpips is not None) and self.model is not None
+        self._lpips = None if lpips is None or not self.fidelity else Lpips(lpips)
         self._ask: Asking | None = None
         if self.model is not None:
             self._ask = remember(Attempts(self.model, deadline), cache, cache_gb)
@@ -290,7 +296,7 @@ class Agent:
         found: list[Fidelity | None] = [None] * len(queries)
         if self.fidelity:
             with clock("replay"):
-                found = [*replay(self.revision, queries, before, beams.proposals, imagined.rollouts, scores)]
+                found = [*replay(self.revision, queries, before, beams.proposals, imagined, scores, self._lpips)]
         rows = zip(beams.proposals, imagined.rollouts, scores, beams.calls, found, strict=True)
         return [_Future(plans, rollouts, score, dict(calls), true) for plans, rollouts, score, calls, true in rows]
 

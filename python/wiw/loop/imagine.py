@@ -17,7 +17,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.clock import Clock
 from wiw.loop.rollout_cache import Asking
 from wiw.policies.base import FrameSpec
-from wiw.types import Conditioning, Control, Proposal, Rollout
+from wiw.types import Conditioning, Control, Proposal, Rollout, View
 from wiw.world_models.base import Accepts
 
 
@@ -33,6 +33,13 @@ class Imagination:
     batch: Any
     answers: list[NDArray[np.uint8]]
     """What the world model gave, one array a part of the batch."""
+    view: View
+    """Of the answers."""
+
+    def seen(self, frames: FrameSpec) -> list[list[Rollout]]:
+        """The rollouts in other views than the reviser's."""
+        panoramas = np.stack([query.observation.panorama for query in self.queries])
+        return _shown(self.batch, panoramas, self.answers, self.view, frames)
 
     def ends(self, candidates: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """What the named candidates (counted over all episodes) end with: panoramas and front views, as observed."""
@@ -75,11 +82,22 @@ def imagine(
             answers.append(ask(observations, controls, seeds[part.rows]))
         clock.move(ask.cache_seconds - before, "world_model", "cache")
     with clock("platform"):
-        kind = "perspective" if accepts.view == "perspective" else "panorama"
-        view = "front" if kind == "perspective" else frames.view
-        size = frames.size if view == frames.view else (384, 384)
-        shown = batch.views(panoramas, answers, _maker(view, size), kind)
-        return Imagination(_unpack(batch, shown, view, proposals), _cost(batch, len(queries)), queries, batch, answers)
+        rollouts = _shown(batch, panoramas, answers, accepts.view, frames)
+        return Imagination(rollouts, _cost(batch, len(queries)), queries, batch, answers, accepts.view)
+
+
+def _shown(
+    batch: Any, panoramas: NDArray[np.uint8], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
+) -> list[list[Rollout]]:
+    """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
+    view = "front" if kind == "perspective" else frames.view
+    size = frames.size if view == frames.view else (384, 384)
+    shown = batch.views(panoramas, answers, _maker(view, size), kind)
+    real, lengths = batch.real, batch.lengths
+    rollouts: list[list[Rollout]] = [[] for _ in panoramas]
+    for i, episode in enumerate(batch.candidate_episode):
+        rollouts[episode].append(Rollout(shown[i, : lengths[i]], real[i, : lengths[i]], view))
+    return rollouts
 
 
 def model_spec(accepts: Accepts) -> Any:
@@ -168,17 +186,6 @@ def _seeds(batch: Any, queries: Sequence[Any], origins: Sequence[Sequence[int]])
         for candidate in numbers
     ]
     return np.array(keys, np.uint64)[batch.row_owner]
-
-
-def _unpack(
-    batch: Any, shown: NDArray[np.uint8], view: str, proposals: Sequence[Sequence[Proposal]]
-) -> list[list[Rollout]]:
-    real, lengths = batch.real, batch.lengths
-    flat = iter(range(len(lengths)))
-    return [
-        [Rollout(shown[i, : lengths[i]], real[i, : lengths[i]], view) for i in (next(flat) for _ in plans)]
-        for plans in proposals
-    ]
 
 
 def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:

@@ -3,10 +3,12 @@
 
 from wiw.metrics.answers import aeqa_score, aeqa_spl
 from wiw.metrics.images import psnr, ssim
+from wiw.metrics.lpips import Lpips
 from wiw.metrics.navigation import mean_trajectory, path_efficiency, spl, success_rate
 from wiw.metrics.poses import pose_error
 
 __all__ = [
+    "Lpips",
     "aeqa_score",
     "aeqa_spl",
     "mean_trajectory",

@@ -272,8 +272,9 @@ def _truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, bool]:
     """What is known of a candidate's true future, in words, and whether that scores best."""
     if found is None:
         return "", False
-    own = {name: found[name][index] for name in ("scores", "psnr", "ssim")}
+    own = {name: found[name][index] for name in ("scores", "psnr", "ssim", "lpips") if name in found}
     said = {"true score": ("scores", "{:.3f}"), "PSNR": ("psnr", "{:.1f} dB"), "SSIM": ("ssim", "{:.2f}")}
+    said["LPIPS"] = ("lpips", "{:.2f}")
     known = [score for score in found["scores"] if score is not None]
     return _spoken(own, said), own["scores"] is not None and own["scores"] == max(known)
 

@@ -13,8 +13,7 @@ from markupsafe import Markup
 
 from wiw.evaluation.costs import COLUMNS, costs
 from wiw.evaluation.faults import whole_file
-from wiw.evaluation.fidelity import COLUMNS as FIDELITY_COLUMNS
-from wiw.evaluation.fidelity import ArmFidelity, fidelity
+from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories, wording
 from wiw.evaluation.report.templating import environment, signed
@@ -42,6 +41,7 @@ def render(log: RunLog) -> str:
     summary, config, info = log.numbers(), log.store.config, log.store.info
     told, pictures = stories(log.store, log.arms)
     truths = fidelity(log)
+    measured = shown_columns(truths)
     return (
         environment()
         .get_template("page.html.j2")
@@ -58,8 +58,8 @@ def render(log: RunLog) -> str:
             pictures=pictures,
             costs=[(line, line.cells()) for line in costs(log)],
             cost_columns=COLUMNS,
-            fidelity=[(line, line.cells()) for line in truths],
-            fidelity_columns=FIDELITY_COLUMNS,
+            fidelity=[(line, line.cells(measured)) for line in truths],
+            fidelity_columns=[(column.title, column.about) for column in measured],
             failures=[row for row in log.episodes if row["status"] == "failed"],
             radius=config["task"].get("radius"),
             config=json.dumps(config, indent=2, ensure_ascii=False),
