@@ -2,11 +2,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import pytest
+
+import wiw
 
 ROOT = Path(__file__).parents[1]
 
@@ -56,6 +59,25 @@ def data_dir() -> Path:
         if folder and Path(folder).is_dir():
             return Path(folder)
     pytest.skip("no real data: set WIW_TEST_DATA to a folder with small_house, nav and openeqa")
+
+
+@pytest.fixture(scope="session")
+def world_model_options(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
+    """What a built-in world model is made with in tests: tiny random weights, saved once, where it needs any."""
+    folder, saved = tmp_path_factory.mktemp("weights"), set()
+
+    def options(name: str) -> dict[str, Any]:
+        if not wiw.registry.WORLD_MODELS.find(name).requires.packages:
+            return {}
+        pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+        import tiny_pipelines
+
+        if name not in saved:
+            tiny_pipelines.save(name, folder / name)
+            saved.add(name)
+        return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name]}
+
+    return options
 
 
 @pytest.fixture(scope="session")

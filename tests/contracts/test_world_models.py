@@ -24,32 +24,34 @@ NAMES = [name for name in wiw.registry.list_world_models() if name != "none"]
 PLANS = [[FORWARD] * 3, [TURN_LEFT, FORWARD], [FORWARD, TURN_LEFT, FORWARD, FORWARD]]
 
 
-def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS):
+def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS, first: int = 0, **options):
+    """Rollouts of the plans, whose seeds are those of candidates `first`, `first` + 1, ..."""
     task = ImageNav(scenes=two_rooms)
     queries = []
     for index in range(episodes):
         env = task.environment(depth=True)
         observation = env.begin(task.episode(index))
         queries.append(Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
-    model = wiw.world_model(name_or_model)
+    model = wiw.world_model(name_or_model, **options)
     proposals = [[Proposal(plan) for plan in plans] for _ in queries]
     return imagine(
         Attempts(model),
         queries,
         proposals,
-        [range(len(plans)) for plans in proposals],
+        [range(first, first + len(plans)) for plans in proposals],
         FrameSpec("panorama", (144, 256)),
         Clock(),
     ).rollouts
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_frames_follow_actions_and_do_not_depend_on_the_batch(name: str, two_rooms: str) -> None:
-    whole = imagined(name, two_rooms)
+def test_frames_follow_actions_and_do_not_depend_on_the_batch(name: str, two_rooms: str, world_model_options) -> None:
+    options = world_model_options(name)
+    whole = imagined(name, two_rooms, **options)
     assert [[len(r.frames) for r in rows] for rows in whole] == [[3, 2, 4]] * 2
-    alone = imagined(name, two_rooms, episodes=1, plans=PLANS[2:])
+    alone = imagined(name, two_rooms, episodes=1, plans=PLANS[2:], first=2, **options)
     np.testing.assert_array_equal(alone[0][0].frames, whole[0][2].frames)
-    again = imagined(name, two_rooms)
+    again = imagined(name, two_rooms, **options)
     for rows, others in zip(whole, again, strict=True):
         for a, b in zip(rows, others, strict=True):
             np.testing.assert_array_equal(a.frames, b.frames)

@@ -4,17 +4,30 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import Any, Literal
 
 from rich.markup import escape
+from tyro.conf import Positional
 
 
-def list_names() -> int:
+def list_names(what: Positional[Literal["all", "world-models"]] = "all", /) -> int:
     """Lists world models, policies, tasks, metrics and presets: built-in ones, and those of installed packages.
 
+    $ wiw list
+    $ wiw list world-models
+
     A package adds its own by entry points in the groups named beside the headings.
+
+    Args:
+        what: world-models tells more of each: what it takes and gives, and what it lacks on this machine.
     """
     from rich.console import Console
+
+    Console().print(_world_models() if what == "world-models" else _everything())
+    return 0
+
+
+def _everything() -> Any:
     from rich.table import Table
 
     from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS
@@ -33,8 +46,48 @@ def list_names() -> int:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
         for name in presets.names(task):
             table.add_row(f"  {name}", escape(presets.about(task, name)))
-    Console().print(table)
-    return 0
+    return table
+
+
+def _world_models() -> Any:
+    from rich.table import Table
+
+    from wiw.registry import WORLD_MODELS
+
+    table = Table(box=None, pad_edge=False)
+    for column in ("name", "control", "input", "output", "frames", "weights", "on this machine"):
+        table.add_column(column, overflow="fold", no_wrap=column in ("name", "control"))
+    for name in WORLD_MODELS.names():
+        try:
+            table.add_row(name, *_cells(WORLD_MODELS.find(name)))
+        except Exception as error:  # a broken plugin must not hide the others
+            table.add_row(name, *[""] * 5, f"[red]{escape(str(error))}[/]")
+    table.caption = escape(
+        "Weights are downloaded at first use, into the Hugging Face cache; --world-model-option weights=FOLDER takes "
+        "others. Packages: pip install 'wiw[diffusers]'."
+    )
+    table.caption_justify = "left"
+    return table
+
+
+def _cells(model: Any) -> list[str]:
+    """Of one row, from a class of world models or a factory (`none`, which imagines nothing)."""
+    from wiw.world_models.status import lacks
+
+    declared = getattr(model, "accepts", None)
+    if declared is None:
+        return ["-", "-", "-", "-", "-", "[green]ready[/]"]
+    height, width = declared.size
+    shown = f"{declared.view} {height}x{width}"
+    requires, lacking = model.requires, lacks(model.requires)
+    return [
+        declared.control,
+        " + ".join((shown, *declared.needs)),
+        shown,
+        str(declared.frames or "any"),
+        escape(requires.weights or "-"),
+        f"[yellow]lacks {escape(', '.join(lacking))}[/]" if lacking else "[green]ready[/]",
+    ]
 
 
 def _first_line(registry: Any, name: str) -> str:

@@ -27,12 +27,7 @@ def fingerprint(model: Any) -> str:
     Raises:
         ArgumentError: an attribute is of a kind whose content cannot be told; names it.
     """
-    digest = blake2b(digest_size=20)
-    for cls in type(model).__mro__:
-        if cls is object or cls.__module__ in ("wiw.world_models.base", "abc"):
-            continue
-        digest.update(f"{cls.__module__}.{cls.__qualname__}".encode())
-        digest.update(_source(cls))
+    digest = blake2b(code_digest(type(model)).encode(), digest_size=20)
     _add(digest, json.dumps(model.describe(), sort_keys=True, default=str), "describe()")
     for name, value in sorted(vars(model).items()):
         _add(digest, value, f"{type(model).__name__}.{name}")
@@ -47,6 +42,17 @@ def _precision() -> list[Any]:
         return ["highest", "torch.float32", False]
     matmul = torch.backends.cuda.matmul
     return [torch.get_float32_matmul_precision(), str(torch.get_default_dtype()), bool(matmul.allow_tf32)]
+
+
+def code_digest(model: type) -> str:
+    """Hex digest of a model's class: names and files of it and of what it derives from, below `WorldModel`."""
+    digest = blake2b(digest_size=20)
+    for cls in model.__mro__:
+        if cls is object or cls.__module__ in ("wiw.world_models.base", "abc"):
+            continue
+        digest.update(f"{cls.__module__}.{cls.__qualname__}".encode())
+        digest.update(_source(cls))
+    return digest.hexdigest()
 
 
 def _source(cls: type) -> bytes:

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cosmos-Predict2, video to world."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wiw.errors import ArgumentError, DependencyError
+from wiw.types import Control
+from wiw.world_models.base import Requirements, accepts
+from wiw.world_models.video import PACKAGES, VideoModel
+
+HUB = "nvidia/Cosmos-Predict2-2B-Video2World"
+
+
+@dataclass(kw_only=True, eq=False)
+class CosmosPredict2(VideoModel):
+    """Cosmos-Predict2 2B: the front view and the plan in words become a clip (NVIDIA 2025).
+
+    Args:
+        guardrail: whether NVIDIA's filter looks at prompts and frames. It has to be said: the licence of the weights
+            ends for who takes the filter away without one of their own, and the filter is a package
+            (`cosmos_guardrail`) with gated weights and needs of its own.
+        negative: what the clip is steered away from, in words.
+        fps: frames a second that the clip is made for.
+    """
+
+    accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
+    requires = Requirements(PACKAGES, "diffusers", HUB, gpu=True)
+    pipeline = "Cosmos2VideoToWorldPipeline"
+    stride = 4
+    most_rows = 16
+
+    weights: str = HUB
+    steps: int = 35
+    guidance: float = 7.0
+    frames: int = 33
+    guardrail: bool | None = None
+    negative: str = "static, motion blur, shaky footage, low resolution, distorted, flickering, jump cuts"
+    fps: int = 16
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.guardrail, bool):
+            raise ArgumentError(
+                "CosmosPredict2: say guardrail=True (NVIDIA's filter; pip install cosmos_guardrail) or guardrail=False "
+                "(without it; the licence of the weights asks for a filter of your own)"
+            )
+        super().__post_init__()
+
+    def components(self) -> dict[str, Any]:
+        """The filter's place in the pipeline, which has to be taken."""
+        from wiw.world_models.cosmos_predict2.stand_ins import no_filter, resize_without_torchvision
+
+        if self.guardrail and importlib.util.find_spec("cosmos_guardrail") is None:
+            raise DependencyError(
+                "cosmos_guardrail not installed; pip install cosmos_guardrail (which needs torchvision), or "
+                "guardrail=False"
+            )
+        resize_without_torchvision()
+        return {} if self.guardrail else {"safety_checker": no_filter()}
+
+    def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
+        """A picture and a prompt a row."""
+        return {
+            "image": list(images),
+            "prompt": [control.text for control in controls],
+            "negative_prompt": [self.negative] * len(images),
+            "fps": self.fps,
+        }

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""HunyuanVideo, image to video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from wiw.types import Control
+from wiw.world_models.base import Requirements, accepts
+from wiw.world_models.video import PACKAGES, Clips, VideoModel
+
+HUB = "hunyuanvideo-community/HunyuanVideo-I2V"
+DROPPED = 4
+"""Frames at the start that the pipeline leaves out where the observation was concatenated to the latents."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Hunyuan(VideoModel):
+    """HunyuanVideo I2V 13B: the front view and the plan in words become a clip (Kong et al. 2024).
+
+    Both kinds of checkpoint run: those that replace the first token by the observation, and those that concatenate it
+    (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the
+    observation stands in for them.
+    """
+
+    accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
+    requires = Requirements(PACKAGES, "diffusers", HUB, gpu=True)
+    pipeline = "HunyuanVideoImageToVideoPipeline"
+    parts = {"vae": "float16", "text_encoder": "float16", "text_encoder_2": "float16"}  # noqa: RUF012
+    stride = 4
+
+    weights: str = HUB
+    steps: int = 30
+    guidance: float = 6.0
+    frames: int = 33
+
+    def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
+        """One row: its picture and prompt, and as many frames as leave `frames` after the dropped ones."""
+        asked = self.frames + (DROPPED if self._concatenates else 0)
+        return {"image": images[0], "prompt": controls[0].text, "num_frames": asked}
+
+    def generate(self, images: Sequence[Any], controls: Sequence[Control], generators: Sequence[Any]) -> Clips:
+        """The clip, with the observation in front where the pipeline has dropped its beginning."""
+        clip = super().generate(images, controls, generators)
+        if not self._concatenates:
+            return clip
+        observation = np.asarray(images[0], np.float32)[None, None] / 255
+        return np.concatenate([observation, clip[:, :-1]], axis=1)
+
+    @property
+    def _concatenates(self) -> bool:
+        return bool(self._pipeline.transformer.config.image_condition_type == "latent_concat")

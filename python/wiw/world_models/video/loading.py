@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a folder of weights to a pipeline on its device, and what to do where it does not fit."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from wiw.errors import ArgumentError, WeightsError
+from wiw.world_models import devices
+
+if TYPE_CHECKING:
+    from wiw.world_models.video.model import VideoModel
+
+Precision = Literal["float32", "bfloat16", "float16"]
+Offload = Literal["none", "model", "sequential"]
+
+
+def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
+    """The pipeline, ready to be called; `components` are parts of it that are not in the folder.
+
+    Raises:
+        WeightsError: files are missing or damaged.
+        DeviceMemoryError: it does not fit on the device.
+    """
+    import diffusers
+
+    with memory_guard(model):
+        try:
+            pipeline = getattr(diffusers, model.pipeline).from_pretrained(
+                folder, dtype=_dtypes(model), variant=model.variant, local_files_only=True, **components
+            )
+        except (OSError, ValueError, KeyError, _safetensors_error()) as error:
+            raise WeightsError(
+                f"{folder} cannot be loaded as a {model.pipeline}: {type(error).__name__}: {error}; files may be "
+                f"missing, damaged, or of another variant than {model.variant}",
+                "unfit",
+            ) from error
+        pipeline.set_progress_bar_config(disable=True)
+        _place(pipeline, model)
+    return pipeline
+
+
+def _dtypes(model: VideoModel) -> dict[str, Any]:
+    """Precision of each network."""
+    import torch
+
+    assert model.precision is not None
+    parts = model.parts if model.precision == model.half else {}
+    return {name: getattr(torch, kind) for name, kind in {"default": model.precision, **parts}.items()}
+
+
+def _place(pipeline: Any, model: VideoModel) -> None:
+    if model.offload == "none":
+        pipeline.to(model.device)
+    elif model.device == "cpu":
+        raise ArgumentError(f"offload='{model.offload}' moves networks to a GPU and back; leave it out on the CPU")
+    elif model.offload == "model":
+        pipeline.enable_model_cpu_offload(device=model.device)
+    else:
+        pipeline.enable_sequential_cpu_offload(device=model.device)
+
+
+def memory_guard(model: VideoModel) -> AbstractContextManager[None]:
+    """Turns torch's error of a full GPU into one that says which options need less."""
+    return devices.memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_cures(model)))
+
+
+def _cures(model: VideoModel) -> list[str]:
+    """Options that need less memory than what the model has, the mildest first."""
+    height, width = model.size
+    cures = [f"batch=1 (now {model.batch})"] if model.batch > 1 else []
+    cures += [f"precision='{model.half}' (now float32)"] if model.precision == "float32" else []
+    cures += ["offload='model'"] if model.offload == "none" else []
+    cures += ["offload='sequential' (slow)"] if model.offload != "sequential" else []
+    return [*cures, f"a smaller size than {height}x{width}", f"fewer frames than {model.frames}"]
+
+
+def versions() -> dict[str, str]:
+    """Of the libraries that frames depend on."""
+    return {name: importlib.metadata.version(name) for name in ("torch", "diffusers", "transformers")}
+
+
+def _safetensors_error() -> type[Exception]:
+    from safetensors import SafetensorError
+
+    return SafetensorError

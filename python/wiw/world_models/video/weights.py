@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a pipeline's weights come from, what identifies them, and what to do where they cannot be had."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError, WeightsError
+
+SAMPLES, SAMPLE_BYTES = 16, 1 << 16
+"""Of each file of weights this much is read to identify it: training changes all of a network."""
+
+UNREACHABLE = {"ConnectionError", "TransportError"}
+"""Names of the errors of a network in `requests` and `httpx`, of which the hub's client has had either."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A pipeline's folder on this machine."""
+
+    folder: Path
+    identity: Mapping[str, str]
+    """What tells the weights from others: "commit" on the hub, or "digest" of a folder of the user's own."""
+
+
+def fetch(
+    name: str, pipeline: str, revision: str | None, variant: str | None, components: Mapping[str, Any]
+) -> Weights:
+    """Finds the folder of a pipeline, from the hub where it is not on this machine yet.
+
+    `components` are parts that the folder need not have.
+
+    Raises:
+        WeightsError: there is no such folder, repository or revision, or it may not be read.
+        ArgumentError: a revision of a folder.
+    """
+    folder = Path(name).expanduser()
+    if folder.is_dir():
+        if revision is not None:
+            raise ArgumentError(f"revision: '{revision}' names a state of a hub repository, but {folder} is a folder")
+        return Weights(folder, {"digest": digest(folder)})
+    if _is_path(name):
+        raise WeightsError(f"no folder {folder.resolve()}; give the folder of a pipeline, or its name on the hub")
+    snapshot = _download(name, pipeline, revision, variant, components)
+    return Weights(snapshot, {"commit": snapshot.name})
+
+
+def _is_path(name: str) -> bool:
+    return name.startswith(("/", ".", "~")) or name.count("/") != 1
+
+
+def _download(
+    name: str, pipeline: str, revision: str | None, variant: str | None, components: Mapping[str, Any]
+) -> Path:
+    import diffusers
+
+    try:
+        return Path(getattr(diffusers, pipeline).download(name, revision=revision, variant=variant, **components))
+    except Exception as error:
+        raise _explained(error, name, revision) from error
+
+
+def _explained(error: BaseException, name: str, revision: str | None) -> WeightsError:
+    """What an error of the hub's client means for the user."""
+    from huggingface_hub import errors
+
+    chain = list(_chain(error))
+
+    def met(*kinds: type[BaseException]) -> bool:
+        return any(isinstance(link, kinds) for link in chain)
+
+    by_hand = f"or download it elsewhere (hf download {name} --local-dir FOLDER) and give weights=FOLDER"
+    if met(errors.GatedRepoError):
+        text = f"'{name}' is gated: accept its terms at https://huggingface.co/{name}, then `hf auth login`"
+        return WeightsError(text, "gated")
+    if met(errors.RevisionNotFoundError):
+        text = f"'{name}' has no revision '{revision}'; https://huggingface.co/{name}/commits/main lists its commits"
+        return WeightsError(text, "revision")
+    if met(errors.RepositoryNotFoundError):
+        text = (
+            f"the hub has no repository '{name}', or it is private: check the name, or `hf auth login`; "
+            "weights= also takes a folder"
+        )
+        return WeightsError(text, "missing")
+    unreachable = any(kind.__name__ in UNREACHABLE for link in chain for kind in type(link).__mro__)
+    if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
+        text = f"'{name}' is not on this machine and the hub is out of reach: connect (unset HF_HUB_OFFLINE), {by_hand}"
+        return WeightsError(text, "network")
+    return WeightsError(f"'{name}' cannot be downloaded: {error}; try again, {by_hand}")
+
+
+def _chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An error and what it was raised from or while handling, the last one first."""
+    seen: set[int] = set()
+    pending = [error]
+    while pending:
+        link = pending.pop()
+        if link is not None and id(link) not in seen:
+            seen.add(id(link))
+            yield link
+            pending += [link.__context__, link.__cause__]
+
+
+def require_kind(folder: Path, pipelines: Sequence[str], marks: Mapping[str, bool]) -> None:
+    """Raises WeightsError unless the folder holds one of these pipelines, with these settings set or not set."""
+    index = folder / "model_index.json"
+    if not index.is_file():
+        raise WeightsError(
+            f"{folder} has no model_index.json: expected a folder in the layout of diffusers, as save_pretrained writes"
+        )
+    try:
+        said = json.loads(index.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise WeightsError(f"{index} is damaged ({error}); fetch the weights again", "unfit") from error
+    found = {name: said.get(name) for name in ("_class_name", *marks)}
+    if found["_class_name"] not in pipelines or any(bool(found[name]) != mark for name, mark in marks.items()):
+        wanted = {"_class_name": " or ".join(pipelines), **{name: mark or None for name, mark in marks.items()}}
+        raise WeightsError(f"{folder} holds another model: expected {wanted}, found {found}", "unfit")
+
+
+def digest(folder: Path) -> str:
+    """Hex digest of a pipeline's files: small ones by content, weights by name, size and `SAMPLES` pieces of them."""
+    total = blake2b(digest_size=20)
+    for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in SUFFIXES):
+        size = path.stat().st_size
+        total.update(f"{path.relative_to(folder)} {size}\n".encode())
+        with path.open("rb") as file:
+            if size <= SAMPLES * SAMPLE_BYTES:
+                total.update(file.read())
+                continue
+            for sample in range(SAMPLES):
+                file.seek((size - SAMPLE_BYTES) * sample // (SAMPLES - 1))
+                total.update(file.read(SAMPLE_BYTES))
+    return total.hexdigest()
+
+
+SUFFIXES = {".json", ".safetensors", ".bin", ".model", ".txt"}
+"""Of what a pipeline is read from; cards and pictures beside it do not count."""

@@ -1,0 +1,400 @@
+# SPDX-License-Identifier: Apache-2.0
+"""World models that run diffusers' pipelines: options, alignment of frames and actions, weights, errors.
+
+The contract test asks them as the loop does; here is what only they have.
+"""
+
+from __future__ import annotations
+
+import http.server
+import importlib.util
+import json
+import pickle
+import shutil
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw import action
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.cli import main
+from wiw.errors import ArgumentError, ContractError, DependencyError, DeviceMemoryError, RegistryError, WeightsError
+from wiw.evaluation.runlog import load_run
+from wiw.types import Conditioning, Control
+
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+
+from wiw.world_models.sana_wm import camera_path
+from wiw.world_models.video.weights import SAMPLE_BYTES, SAMPLES, digest
+
+NAMES = ["svd", "ltx", "hunyuan", "wan2.1", "wan2.2-5b", "wan2.2-a14b", "cosmos-predict2", "sana-wm"]
+BATCHED = ["svd", "ltx", "cosmos-predict2"]
+
+
+@pytest.fixture
+def made(world_model_options):
+    """A world model with tiny weights and the options of the test."""
+    return lambda name, **options: wiw.world_model(name, **{**world_model_options(name), **options})
+
+
+def control(actions, frames: int) -> Control:
+    plan = action.pad(actions, frames - 1)
+    views = action.to_trajectory(plan), action.to_viewpoints(plan)
+    return Control(plan, *views, action.to_text(actions), length=len(actions))
+
+
+def picture(model, rows: int = 1) -> Conditioning:
+    return Conditioning(np.random.default_rng(0).integers(0, 256, (rows, *model.size, 3), np.uint8))
+
+
+def rollout(model, plans=((FORWARD, FORWARD),), seeds=(7,)):
+    controls = [control(plan, model.frames) for plan in plans]
+    return model.rollout(picture(model, len(plans)), controls, np.array(seeds, np.uint64))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_episode_from_the_command_line(name, world_model_options, two_rooms, tmp_path):
+    (tmp_path / "short.yaml").write_text("base: paper\ndecisions: 1\n")
+    command = ["run", "imagenav", "--scenes", two_rooms, "--preset", str(tmp_path / "short.yaml"), "--episodes", "1"]
+    for key, value in world_model_options(name).items():
+        command += ["--world-model-option", f"{key}={list(value) if isinstance(value, tuple) else value}"]
+    assert main([*command, "--world-model", name, "--out", str(tmp_path / "run"), "--no-report", "--cache", "off"]) == 0
+    log = load_run(tmp_path / "run")
+    assert [episode["status"] for episode in log.episodes] == ["done"]
+    assert log.decisions[0]["calls"]["rows"] > 0
+    said = log.store.info["built"][name]["model"]
+    assert said["steps"] == world_model_options(name)["steps"] and said["digest"] and said["diffusers"]
+    assert "torchvision" not in sys.modules
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_frames_are_a_function_of_the_seed_and_survive_pickling(name, made):
+    model = made(name)
+    frames = rollout(model)
+    np.testing.assert_array_equal(frames[:, 0], picture(model).image)
+    again = pickle.loads(pickle.dumps(model))
+    assert again.describe() == model.describe() and again.fingerprint() == model.fingerprint()
+    np.testing.assert_array_equal(rollout(again), frames)
+    assert np.abs(rollout(model, seeds=[2**64 - 1]).astype(float) - frames).max() > 2
+
+
+@pytest.mark.parametrize("name", BATCHED)
+def test_rows_of_one_call_do_not_meet(name, made):
+    plans, seeds = ((FORWARD, TURN_LEFT), (TURN_RIGHT,), (FORWARD,)), (1, 2, 3)
+    one, three = made(name), made(name, batch=3)
+    apart, together = rollout(one, plans, seeds), rollout(three, plans, seeds)
+    assert np.abs(apart.astype(int) - together).max() <= 1
+    assert three.accepts.best_batch == 3 and three.fingerprint() == one.fingerprint()
+
+
+def test_a_clip_shows_the_plan_evenly(made):
+    model = made("ltx", frames=17)
+    shades = np.linspace(0, 1, 17, dtype=np.float32)
+    model.generate = lambda images, controls, generators: np.broadcast_to(
+        shades[None, :, None, None, None], (len(images), 17, *model.size, 3)
+    )
+    for length, expected in ((1, [16]), (2, [8, 16]), (5, [3, 6, 10, 13, 16]), (16, list(range(1, 17)))):
+        frames = rollout(model, [(FORWARD,) * length])[0]
+        np.testing.assert_array_equal(frames[1 : 1 + length, 0, 0, 0], np.rint(shades[expected] * 255))
+        assert (frames[1 + length :] == 255).all(), "padding is the plan's end"
+
+
+def test_a_model_that_knows_no_plan_gives_its_frames_in_order(made):
+    model = made("svd")
+    shades = np.linspace(0, 1, model.frames, dtype=np.float32)
+    model.generate = lambda *_: np.broadcast_to(shades[None, :, None, None, None], (1, model.frames, *model.size, 3))
+    np.testing.assert_array_equal(rollout(model)[0, 1:, 0, 0, 0], np.rint(shades[1:] * 255))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("svd", "sana-wm")])
+def test_the_plan_reaches_the_pipeline_in_words(name, made):
+    model = made(name)
+    pipeline, asked = model._pipeline, {}
+
+    def listening(**given):
+        asked.update(given)
+        return pipeline(**given)
+
+    model._pipeline = listening
+    listening.transformer = pipeline.transformer
+    rollout(model)
+    prompt = asked["prompt"] if isinstance(asked["prompt"], str) else asked["prompt"][0]
+    assert "move forward 0.2 m, then move forward 0.2 m." in prompt
+    assert asked["guidance_scale"] == model.guidance and asked["num_inference_steps"] == model.steps
+
+
+def test_the_camera_path_is_interpolated_in_the_pipelines_axes():
+    path = camera_path(control([TURN_LEFT, FORWARD], 9), 9)
+    angle = np.deg2rad(22.5)
+    ahead = np.array([-np.sin(angle), 0, np.cos(angle)])  # x right, y down, z ahead
+    np.testing.assert_allclose(path[0], np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(path[4, :3, 2], ahead, atol=1e-6)
+    np.testing.assert_allclose(path[8, :3, 3], 0.2 * ahead, atol=1e-6)
+    np.testing.assert_allclose(path[6, :3, 3], 0.1 * ahead, atol=1e-6)
+    np.testing.assert_allclose(path[2, :3, 2], [-np.sin(angle / 2), 0, np.cos(angle / 2)], atol=1e-6)
+
+
+def test_hunyuan_keeps_the_frames_of_both_kinds_of_checkpoint(made, tmp_path):
+    import tiny_pipelines
+
+    concatenating = made("hunyuan")
+    assert rollout(concatenating).shape == (1, 5, *concatenating.size, 3)
+    tiny_pipelines.hunyuan("token_replace").save_pretrained(tmp_path)
+    assert rollout(made("hunyuan", weights=str(tmp_path))).shape == (1, 5, *concatenating.size, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "size", "frames"),
+    [
+        ("svd", {"size": (100, 60), "frames": 6}, (128, 64), 6),
+        ("ltx", {"size": [50, 40], "frames": 10}, (64, 32), 17),
+        ("wan2.1", {"size": (40, 33), "frames": 6}, (32, 32), 9),
+        ("wan2.2-5b", {"size": (40, 56), "frames": 5}, (32, 64), 5),
+    ],
+)
+def test_sizes_and_frames_are_rounded_to_what_the_networks_divide(name, asked, size, frames, made):
+    model = made(name, **asked)
+    assert (model.size, model.frames) == (size, frames) == (model.accepts.size, model.accepts.frames)
+    assert rollout(model).shape == (1, frames, *size, 3)
+
+
+def test_long_plans_go_on_from_the_last_frame(made, two_rooms):
+    from wiw.loop.agent import Query
+    from wiw.loop.attempts import Attempts
+    from wiw.loop.clock import Clock
+    from wiw.loop.imagine import imagine
+    from wiw.policies.base import FrameSpec
+    from wiw.tasks.imagenav import ImageNav
+    from wiw.types import Key, Proposal
+
+    model = made("wan2.2-5b")
+    starts, answers, whole = [], [], model.rollout
+
+    def watched(observations, controls, seeds):
+        starts.append(observations.image)
+        answers.append(whole(observations, controls, seeds))
+        return answers[-1]
+
+    model.rollout = watched
+    task = ImageNav(scenes=two_rooms)
+    env = task.environment(depth=False)
+    query = Query(env.begin(task.episode(0)), env.goal, Key(0, 0))
+    plan = Proposal([FORWARD] * 10)
+    futures = imagine(Attempts(model), [query], [[plan]], [range(1)], FrameSpec("front", (32, 32)), Clock())
+    assert len(futures.rollouts[0][0].frames) == 10
+    assert len(answers) == 3, "four actions a clip"
+    np.testing.assert_array_equal(starts[1], answers[0][:, 4])
+    np.testing.assert_array_equal(starts[2], answers[1][:, 4])
+
+
+def test_half_precision_leaves_some_networks_whole(made):
+    import torch
+
+    networks = made("wan2.1", precision="bfloat16")._pipeline.components
+    assert networks["transformer"].dtype == networks["text_encoder"].dtype == torch.bfloat16
+    assert networks["vae"].dtype == networks["image_encoder"].dtype == torch.float32
+
+
+def test_the_weights_tell_models_apart_and_their_place_does_not(made, world_model_options, tmp_path):
+    import torch
+    from safetensors.torch import load_file, save_file
+
+    there = Path(world_model_options("ltx")["weights"])
+    here = shutil.copytree(there, tmp_path / "copy")
+    (here / "README.md").write_text("a card")
+    first, second = made("ltx"), made("ltx", weights=here)
+    assert first.fingerprint() == second.fingerprint() and first.describe() != second.describe()
+    assert first.fingerprint() != made("ltx", steps=2).fingerprint()
+    file = here / "transformer/diffusion_pytorch_model.safetensors"
+    save_file({name: torch.add(tensor, 1e-3) for name, tensor in load_file(file).items()}, file)
+    assert made("ltx", weights=here).fingerprint() != first.fingerprint()
+
+
+def test_large_weights_are_told_apart_by_samples(tmp_path):
+    size = 2 * SAMPLES * SAMPLE_BYTES
+    weights = np.random.default_rng(0).integers(0, 256, size, np.uint8)
+    file = tmp_path / "a.safetensors"
+    found = set()
+    for place in (None, 0, size // 2 - size // 60, size - 1):
+        changed = weights.copy()
+        if place is not None:
+            changed[place : place + size // 20] += 1
+        file.write_bytes(changed.tobytes())
+        found.add(digest(tmp_path))
+    assert len(found) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"steps": 0}, "steps"),
+        ({"frames": 1}, "frames"),
+        ({"frames": "many"}, "frames"),
+        ({"size": 32}, "size"),
+        ({"size": (32, 0)}, "size"),
+        ({"batch": 2}, "takes 1 at a time"),
+        ({"precision": "int8"}, "float32, bfloat16, float16"),
+        ({"offload": "disk"}, "none, model, sequential"),
+        ({"offload": "model"}, "leave it out on the CPU"),
+        ({"device": "tpu"}, "device"),
+        ({"device": "cuda:99"}, "device='cpu'"),
+        ({"revision": "main"}, "is a folder"),
+    ],
+)
+def test_options_out_of_range_are_named(options, said, made):
+    with pytest.raises(ArgumentError, match=said):
+        made("wan2.2-5b", **options)
+
+
+def test_unknown_options_are_answered_with_the_known_ones(made):
+    with pytest.raises(RegistryError, match=r"it takes .*weights.*steps"):
+        made("svd", speed=3)
+
+
+def test_the_filter_of_cosmos_is_the_users_choice(made):
+    with pytest.raises(ArgumentError, match="guardrail=False"):
+        made("cosmos-predict2", guardrail=None)
+    with pytest.raises(DependencyError, match="pip install cosmos_guardrail"):
+        made("cosmos-predict2", guardrail=True)
+
+
+def test_a_missing_package_is_named_with_the_extra(made, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ftfy" else find(name))
+    with pytest.raises(DependencyError, match=r"ftfy not installed; pip install 'wiw\[diffusers\]'"):
+        made("wan2.1")
+
+
+def test_weights_that_are_not_there_or_of_another_model(made, world_model_options, tmp_path):
+    def refused(name: str, weights, kind: str, said: str) -> None:
+        with pytest.raises(WeightsError, match=said) as refusal:
+            made(name, weights=str(weights))
+        assert refusal.value.kind == kind
+
+    refused("svd", tmp_path / "nowhere", "missing", "no folder")
+    refused("svd", "somewhere", "missing", "no folder")
+    refused("svd", tmp_path, "missing", "model_index.json")
+    refused("svd", world_model_options("ltx")["weights"], "unfit", "expected .*StableVideo.* found .*LTX")
+    refused("wan2.1", world_model_options("wan2.2-a14b")["weights"], "unfit", "boundary_ratio")
+    refused("wan2.2-5b", world_model_options("wan2.1")["weights"], "unfit", "expand_timesteps")
+    copy = shutil.copytree(world_model_options("ltx")["weights"], tmp_path / "copy")
+    file = copy / "transformer/diffusion_pytorch_model.safetensors"
+    file.write_bytes(file.read_bytes()[:1000])
+    refused("ltx", copy, "unfit", "damaged")
+    file.unlink()
+    refused("ltx", copy, "unfit", "missing")
+    (copy / "model_index.json").write_text("{")
+    refused("ltx", copy, "unfit", "is damaged")
+
+
+REFUSALS = {"gated": (403, "GatedRepo"), "absent": (404, "RepoNotFound"), "old": (404, "RevisionNotFound")}
+
+
+class Hub(http.server.BaseHTTPRequestHandler):
+    """Says no as the Hugging Face hub does."""
+
+    def do_GET(self) -> None:
+        status, code = next(REFUSALS[name] for name in REFUSALS if f"/some/{name}" in self.path)
+        body = json.dumps({"error": code}).encode()
+        self.send_response(status)
+        self.send_header("X-Error-Code", code)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    do_HEAD = do_GET  # noqa: N815
+
+    def log_message(self, *_) -> None:
+        pass
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    from huggingface_hub import constants, hf_api
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Hub)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    url = f"http://127.0.0.1:{server.server_port}"
+    monkeypatch.setattr(constants, "ENDPOINT", url)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr(hf_api.api, "endpoint", url)
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "said"),
+    [
+        ("gated", "gated", "accept its terms"),
+        ("absent", "missing", "no repository"),
+        ("old", "revision", "no revision 'abc'"),
+    ],
+)
+def test_what_the_hub_refuses_is_said_in_plain_words(name, kind, said, hub, made):
+    with pytest.raises(WeightsError, match=said) as refusal:
+        made("ltx", weights=f"some/{name}", revision="abc")
+    assert refusal.value.kind == kind
+
+
+def test_without_a_network_the_error_says_how_to_do_without(hub, made):
+    hub.shutdown()
+    hub.server_close()
+    with pytest.raises(WeightsError, match="hf download some/gated --local-dir") as refusal:
+        made("ltx", weights="some/gated")
+    assert refusal.value.kind == "network"
+
+
+def test_weights_in_the_hubs_cache_need_no_network(hub, made, world_model_options, tmp_path, monkeypatch):
+    from huggingface_hub import constants
+
+    commit = "0123456789abcdef0123456789abcdef01234567"
+    repository = tmp_path / "hub/models--some--model"
+    shutil.copytree(world_model_options("ltx")["weights"], repository / "snapshots" / commit)
+    (repository / "refs").mkdir()
+    (repository / "refs/main").write_text(commit)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    model = made("ltx", weights="some/model", revision=commit)
+    assert model.describe()["commit"] == commit
+    np.testing.assert_array_equal(rollout(model), rollout(made("ltx")))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    from wiw.world_models.status import in_hub_cache
+
+    assert in_hub_cache("some/model") and not in_hub_cache("some/other")
+
+
+def test_a_full_gpu_is_answered_with_the_options_that_need_less(made):
+    import torch
+
+    model = made("ltx", batch=4)
+
+    def full(**_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nmore")
+
+    model._pipeline = full
+    with pytest.raises(DeviceMemoryError, match=r"2\.00 GiB.*batch=1.*bfloat16.*offload='model'.*smaller size.*frames"):
+        rollout(model)
+
+
+def test_nan_is_no_picture(made):
+    model = made("ltx")
+    model.generate = lambda *_: np.full((1, model.frames, *model.size, 3), np.nan, np.float32)
+    with pytest.raises(ContractError, match="NaN in float32") as breach:
+        rollout(model)
+    assert breach.value.kind == "nan"
+
+
+def test_list_says_what_each_model_takes_and_lacks(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    assert main(["list", "world-models"]) == 0
+    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+    for name in NAMES:
+        control_kind = {"svd": "image", "sana-wm": "trajectory"}.get(name, "text")
+        assert control_kind in rows[name] and "perspective" in rows[name] and "lacks weights" in rows[name]
+    assert "576x1024 + depth" in rows["warp"] and "ready" in rows["warp"]
+    assert "Wan-AI/Wan2.2-I2V-A14B-Diffusers" in rows["wan2.2-a14b"] and "480x480" in rows["wan2.2-a14b"]
