@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -128,6 +129,9 @@ class LineAgent:
 
     def forget(self, key: Any) -> None:
         pass
+
+    def meter(self) -> Counter[str]:
+        return Counter()
 
     def _decide(self, query: Any) -> Decision:
         key = query.key

@@ -142,6 +142,9 @@ class Sink:
     def again(self, episodes: Any) -> None:
         raise AssertionError(episodes)
 
+    def lost(self, spent: Any) -> None:
+        raise AssertionError(spent)
+
 
 @pytest.mark.parametrize(("execute", "carried_out"), [("primitive", 1), ("sequence", 2)])
 def test_the_budget_ends_an_episode_after_the_last_answer(file: Path, execute: str, carried_out: int) -> None:

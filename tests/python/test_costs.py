@@ -14,6 +14,8 @@ from wiw.cli.app import main
 from wiw.errors import ArgumentError
 from wiw.evaluation.costs import Costs
 from wiw.evaluation.evaluate import run_arms
+from wiw.evaluation.store import RunStore
+from wiw.loop.attempts import TRIES
 
 
 class Counted(wiw.WorldModel):
@@ -63,12 +65,53 @@ def test_the_ledger_adds_up(log) -> None:
         assert line["seconds"] <= sum(row["seconds"] for row in log.episodes if row["arm"] == line["arm"])
 
 
+class Moody(wiw.WorldModel):
+    """Repeats the observation; from its fourth call on it fails all tries of one question."""
+
+    accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective")
+
+    def __init__(self) -> None:
+        self._asked: list[int] = []
+
+    def fingerprint(self) -> str:
+        return "moody"
+
+    def rollout(self, observations, controls, seeds):
+        self._asked.append(len(controls))
+        if 3 < len(self._asked) <= 3 + TRIES:
+            raise ConnectionError("not now")
+        return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+
+
+@pytest.mark.parametrize("live", [1, 3])
+def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypatch, capsys, live) -> None:
+    monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
+    model, task = Moody(), wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
+    agent = wiw.Agent("heuristic", model, revision="matcher", candidates=3)
+
+    def run(**options):
+        log = wiw.evaluate(task, agent, 3, out=tmp_path / "run", progress=False, live=live, **options)
+        (line,) = log.costs()
+        assert line["spent_calls"] + line["lost_calls"] == pytest.approx(len(model._asked))
+        assert line["spent_rows"] + line["lost_rows"] == pytest.approx(sum(model._asked))
+        return line, [row["episode"] for row in log.episodes if row["status"] == "failed"]
+
+    line, failed = run()
+    assert len(failed) == (live == 1)  # more at a time: each is run again by itself
+    assert line["lost_calls"] >= TRIES and line["lost_seconds"] > 0 and line["spent_retries"] == 0
+    with RunStore.resume(tmp_path / "run") as store:
+        store.discard("moody", failed)
+    assert main(["report", str(tmp_path / "run")]) == 0 and "lost calls" in capsys.readouterr().out
+    after, failed = run(resume=True)
+    assert not failed and after["lost_calls"] >= line["lost_calls"] + (live == 1)  # what the failed one had done before
+
+
 def test_a_success_has_its_price() -> None:
     costs = Costs("warp", 4, 2.0, 20, {"rows": 60.0, "consultations": 20.0}, {"calls": 5.0}, {"world_model": 3.0})
     assert costs.as_dict()["rollouts_per_success"] == 30.0 and costs.as_dict()["seconds_per_success"] == 1.5
     assert "15.0" in costs.cells() and "30.0" in costs.cells()
     none = Costs("none", 4, 0.0, 20, {}, {}, {"propose": 1.0})
-    assert math.isinf(none.per_success(1.0)) and none.cells()[-2:] == ["–", "∞"]
+    assert math.isinf(none.per_success(1.0)) and none.cells()[-4:] == ["–", "∞", "0.0", "0.00"]
 
 
 def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:
@@ -88,6 +131,7 @@ def test_table_and_report_show_the_ledger(log, capsys) -> None:
     assert main(["report", str(log.path)]) == 0
     shown = capsys.readouterr().out
     assert "Costs, an episode" in shown and "rollouts / success" in shown and "100 %" in shown
+    assert "lost calls" not in shown
     page = (log.path / "report.html").read_text()
     assert '<section id="costs">' in page and "rollouts / success" in page
     with pytest.raises(ArgumentError, match="seconds, calls or spent"):

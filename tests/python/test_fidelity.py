@@ -32,6 +32,9 @@ class Records:
     def again(self, episodes) -> None:
         raise AssertionError
 
+    def lost(self, spent) -> None:
+        raise AssertionError
+
 
 def decisions(two_rooms: str, agent: wiw.Agent, decisions: int = 2, live: int = 2):
     task = ImageNav(scenes=two_rooms, decisions=decisions)

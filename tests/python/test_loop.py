@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections import Counter
 from typing import ClassVar
 
 import numpy as np
@@ -23,7 +24,7 @@ from wiw.types import Answer, DecisionRecord, Goal, Key, Observation, Proposal, 
 
 class Recorder:
     def __init__(self) -> None:
-        self.decisions, self.results = {}, {}
+        self.decisions, self.results, self.wasted = {}, {}, Counter()
 
     def decision(self, record) -> None:
         self.decisions[record.episode, record.index] = record
@@ -33,6 +34,9 @@ class Recorder:
 
     def again(self, episodes) -> None:
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
+
+    def lost(self, spent) -> None:
+        self.wasted.update(spent)
 
 
 @pytest.fixture(autouse=True)

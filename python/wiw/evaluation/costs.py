@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -24,6 +24,11 @@ COLUMNS = (
     ("s / success", "All seconds of the arm over its successes."),
 )
 """Columns of the table and what they mean."""
+LOST_COLUMNS = (
+    ("lost calls", "Calls an episode for decisions that failed or were begun again; in no other column."),
+    ("lost s", "Seconds an episode on them."),
+)
+"""The same, where anything was lost."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,8 @@ class Costs:
     """Taken: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens."""
     seconds: Mapping[str, float]
     """Wall time by stage; it depends on the machine and on what else ran."""
+    lost: Mapping[str, float] = field(default_factory=dict)
+    """Spent on decisions that failed or were begun again, as `spent`, and their seconds; in no other figure."""
 
     @property
     def all_seconds(self) -> float:
@@ -52,7 +59,7 @@ class Costs:
         return total / self.successes if self.successes else math.inf
 
     def as_dict(self) -> dict[str, Any]:
-        """Totals as plain values: `asked_<what>`, `spent_<what>`, `seconds_<stage>`, and two figures a success."""
+        """Totals as plain values: `asked_<what>`, `spent_<what>`, `seconds_<stage>`, `lost_<what>`, two a success."""
         return {
             "arm": self.arm,
             "episodes": self.episodes,
@@ -61,13 +68,14 @@ class Costs:
             **{f"asked_{name}": value for name, value in self.calls.items()},
             **{f"spent_{name}": value for name, value in self.spent.items()},
             **{f"seconds_{stage}": value for stage, value in self.seconds.items()},
+            **{f"lost_{name}": value for name, value in self.lost.items()},
             "seconds": self.all_seconds,
             "rollouts_per_success": self.per_success(self.calls.get("rows", 0.0)),
             "seconds_per_success": self.per_success(self.all_seconds),
         }
 
     def cells(self) -> list[str]:
-        """The columns of the table, in words."""
+        """The columns of the table, in words, with those of what was lost."""
         each = max(1, self.episodes)
         asked, spent = self.calls, self.spent
         rows = asked.get("rows", 0.0)
@@ -82,12 +90,15 @@ class Costs:
             f"{self.all_seconds / each:.2f}",
             _number(self.per_success(rows)) if rows else "–",
             _number(self.per_success(self.all_seconds)),
+            f"{self.lost.get('calls', 0.0) / each:.1f}",
+            f"{self.lost.get('seconds', 0.0) / each:.2f}",
         ]
 
 
 def costs(log: RunLog) -> list[Costs]:
     """What each arm of a run cost, in the order of its table; arms without an ended episode are left out."""
     calls, spent, seconds = (log.store.totals(column) for column in ("calls", "spent", "seconds"))
+    lost = log.store.lost()
     ended: dict[str, list[float]] = {}
     for outcome in log.store.outcomes():
         ended.setdefault(outcome["arm"], []).append(float(outcome["metrics"].get("success", 0.0)))
@@ -99,7 +110,7 @@ def costs(log: RunLog) -> list[Costs]:
             int(calls.get(arm, {}).get("decisions", 0)),
             *({name: value for name, value in of.get(arm, {}).items() if name != "decisions"} for of in found),
         )
-        for found in [(calls, spent, seconds)]
+        for found in [(calls, spent, seconds, lost)]
         for arm in log.arms
         if arm in ended
     ]
@@ -116,12 +127,18 @@ def print_costs(log: RunLog) -> None:
         return
     table = Table(title="Costs, an episode", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
     table.add_column("arm", style="bold")
-    for title, _ in COLUMNS:
+    columns = cost_columns(lines)
+    for title, _ in columns:
         table.add_column(title, justify="right")
     for line in lines:
-        table.add_row(line.arm, *line.cells())
+        table.add_row(line.arm, *line.cells()[: len(columns)])
     console = Console()
-    Console(width=None if console.is_terminal else max(console.width, 140)).print(table)
+    Console(width=None if console.is_terminal else max(console.width, 160)).print(table)
+
+
+def cost_columns(lines: Sequence[Costs]) -> tuple[tuple[str, str], ...]:
+    """The columns that these arms need."""
+    return COLUMNS + LOST_COLUMNS if any(line.lost for line in lines) else COLUMNS
 
 
 def _number(value: float) -> str:

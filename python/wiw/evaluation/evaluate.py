@@ -16,7 +16,7 @@ from wiw.errors import ArgumentError, Error, InfrastructureError, StoreError
 from wiw.evaluation.platform import describe_platform
 from wiw.evaluation.progress import Tracker, make_board
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
-from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow
+from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, LostRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore
@@ -369,6 +369,9 @@ class _Desk:
             return
         if isinstance(row, AgainRow):
             self.discard(row.arm, row.episodes)
+            return
+        if isinstance(row, LostRow):
+            self._store.write_lost(row)
             return
         self._store.write(row)
         if isinstance(row, DecisionRow):

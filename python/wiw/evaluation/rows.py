@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,6 +47,14 @@ class AgainRow:
 
     arm: str
     episodes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class LostRow:
+    """What a decision of an arm had asked for when it failed."""
+
+    arm: str
+    spent: Mapping[str, float]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 5 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 6 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -51,6 +51,13 @@ CREATE TABLE decision (
     after_x REAL NOT NULL, after_y REAL NOT NULL, after_z REAL NOT NULL, after_yaw REAL NOT NULL,
     after_distance REAL, after_geodesic REAL,
     PRIMARY KEY (arm, episode, decision)
+) WITHOUT ROWID;
+
+CREATE TABLE lost (                 -- what an arm spent on decisions that failed or were begun again; in no row above
+    arm TEXT NOT NULL,
+    name TEXT NOT NULL,             -- as in decision.spent, or seconds
+    value REAL NOT NULL,
+    PRIMARY KEY (arm, name)
 ) WITHOUT ROWID;
 
 CREATE TABLE image (

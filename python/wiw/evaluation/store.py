@@ -21,10 +21,10 @@ from typing import Any
 import wiw
 from wiw.errors import ArgumentError, StoreError
 from wiw.evaluation.faults import explained, remedy
-from wiw.evaluation.rows import AgentRow, DecisionRow, OutcomeRow, to_json
+from wiw.evaluation.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 DECISION_JSON = (
     "actions",
     "executed",
@@ -239,6 +239,13 @@ class RunStore:
             found[row["arm"]][row["key"]] = float(row["total"] or 0)
         return found
 
+    def lost(self) -> dict[str, dict[str, float]]:
+        """By arm and name, what was spent on decisions that failed or were begun again."""
+        found: dict[str, dict[str, float]] = {}
+        for row in self._rows("SELECT arm, name, value FROM lost"):
+            found.setdefault(row["arm"], {})[row["name"]] = row["value"]
+        return found
+
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
         """JPEG by name, empty where no pictures were kept."""
         rows = self._rows(
@@ -314,13 +321,19 @@ class RunStore:
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
-    def discard(self, arm: str, episodes: Iterable[int]) -> None:
-        """Forgets what was written of episodes that are to be run again."""
+    def write_lost(self, row: LostRow) -> None:
+        """Books what a failed decision had spent."""
         with self._writing() as connection:
-            for table in ("decision", "image", "outcome"):
-                connection.executemany(
-                    f"DELETE FROM {table} WHERE arm = ? AND episode = ?", [(arm, i) for i in episodes]
-                )
+            connection.executemany(
+                f"INSERT INTO lost VALUES (?, ?, ?) {_ADD}", [(row.arm, *item) for item in row.spent.items()]
+            )
+
+    def discard(self, arm: str, episodes: Iterable[int]) -> None:
+        """Forgets what was written of episodes that are to be run again, but for what it cost."""
+        with self._writing() as connection:
+            for episode in episodes:
+                _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
+                connection.execute("DELETE FROM outcome WHERE arm = ? AND episode = ?", (arm, episode))
 
     def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
         """Keeps how a scene looks from above."""
@@ -346,11 +359,9 @@ class RunStore:
 
     def _discard_partial(self) -> None:
         with self._writing() as connection:
-            for table in ("decision", "image"):
-                connection.execute(
-                    f"DELETE FROM {table} AS d WHERE NOT EXISTS "
-                    "(SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)"
-                )
+            _forget(
+                connection, "NOT EXISTS (SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)", ()
+            )
 
     @contextmanager
     def _closed_on_error(self) -> Iterator[None]:
@@ -447,6 +458,21 @@ def _lock(path: Path) -> Any:
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
     marks = ", ".join("?" for _ in values)
     connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values()))
+
+
+_ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
+
+
+def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
+    """Deletes decisions and pictures `d` that meet a condition; what they cost is booked as lost."""
+    for column, name in (("spent", "key"), ("seconds", "'seconds'")):
+        connection.execute(
+            f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "
+            f"WHERE ({condition}) AND key != 'replay' GROUP BY arm, {name} {_ADD}",
+            values,
+        )
+    for table in ("decision", "image"):
+        connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
 
 
 def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
 from wiw.evaluation.evaluate import recipes_of, require_scenes
-from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, OutcomeRow, to_json
+from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.evaluation.store import DECISION_JSON, RunStore
 from wiw.evaluation.workers import Job, Plan, Runner
 
@@ -126,7 +126,7 @@ class _Collected:
         self._agent: Facts = []
         self._episodes: dict[int, Facts] = {}
 
-    def __call__(self, row: AgentRow | AgainRow | DecisionRow | OutcomeRow) -> None:
+    def __call__(self, row: AgentRow | AgainRow | DecisionRow | LostRow | OutcomeRow) -> None:
         if isinstance(row, AgentRow):
             self._agent = [("agent", json.loads(to_json(row.agent)))]
         elif isinstance(row, AgainRow):
@@ -138,7 +138,7 @@ class _Collected:
                 for name, value in row.values.items()
             }
             self._of(row.episode).append(_decision(row.decision, values, row.images))
-        else:
+        elif isinstance(row, OutcomeRow):
             self._of(row.result.episode).append(_outcome(row.result.status, row.result.metrics, row.result.error))
 
     def facts(self, index: int) -> Facts:

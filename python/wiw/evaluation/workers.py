@@ -20,10 +20,10 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, Error, InfrastructureError
-from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, OutcomeRow, decision_row
+from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
-Row = AgainRow | AgentRow | DecisionRow | OutcomeRow
+Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
 class Desk(Protocol):
@@ -94,6 +94,10 @@ class RowSink:
     def again(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew."""
         self._send(AgainRow(self._job.arm, tuple(episodes)))
+
+    def lost(self, spent: Mapping[str, float]) -> None:
+        """A decision has failed."""
+        self._send(LostRow(self._job.arm, dict(spent)))
 
 
 class Runner:

@@ -192,7 +192,7 @@ class Agent:
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
         """One decision for each live episode; model and reviser see all candidates of all of them at once."""
-        clock, meter = Clock(), self._meter()
+        clock, meter = Clock(), self.meter()
         proposing, revising = self._situations(queries)
         with clock("propose"):
             self.policy.observe(proposing)
@@ -205,7 +205,7 @@ class Agent:
         with clock("revise"):
             shown = [future.proposals for future in futures], [future.rollouts for future in futures]
             answers = checked_answers(self.revision, self.revision.answer(revising, *shown), revising)
-        spent = {name: (count - meter[name]) / len(queries) for name, count in self._meter().items()}
+        spent = {name: (count - meter[name]) / len(queries) for name, count in self.meter().items()}
         costs = {"seconds": clock.share(len(queries)), "spent": spent}
         return [
             self._decision(query, situation, future, answer, costs)
@@ -242,7 +242,7 @@ class Agent:
             **({} if self.imagine_fraction == 1 else {"imagine_fraction": self.imagine_fraction}),
         }
 
-    def _meter(self) -> Counter[str]:
+    def meter(self) -> Counter[str]:
         """What the agent's model and policies have been asked for so far."""
         policies = [self.policy] if self.revision is self.policy else [self.policy, self.revision]
         counts = Counter({"vlm_tokens": sum(policy.tokens for policy in policies)})

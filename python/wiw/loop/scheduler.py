@@ -29,6 +29,9 @@ class Sink(Protocol):
     def again(self, episodes: Sequence[int]) -> None:
         """These episodes begin anew; what was reported of them does not count."""
 
+    def lost(self, spent: Mapping[str, float]) -> None:
+        """A decision has failed; what was asked for it, and its "seconds"."""
+
 
 @dataclass
 class Trial:
@@ -133,12 +136,14 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
     """One decision for every live episode; returns those that have to be run again, one at a time."""
     if not trials:
         return []
+    before, begin = agent.meter(), time.perf_counter()
     try:
         decisions = agent.decide_batch([trial.query(agent) for trial in trials])
     except (ArgumentError, ContractError):
         raise
     except Exception as error:
         kind = f"world_model/{error.kind}" if isinstance(error, RolloutError) else "agent"
+        sink.lost({**(agent.meter() - before), "seconds": time.perf_counter() - begin})
         for trial in trials:
             trial.done = True
         if len(trials) > 1:
@@ -152,6 +157,7 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
             result = _finished(trial) if trial.done else None
         except Exception as error:
             trial.done = True
+            sink.lost({**decision.spent, "seconds": sum(decision.seconds.values())})
             sink.episode(_failed(trial.index, trial.episode, trial.begin, "environment", error))
             continue
         sink.decision(record)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from wiw.evaluation.costs import COLUMNS, costs
+from wiw.evaluation.costs import cost_columns, costs
 from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
 from wiw.evaluation.report import plots
@@ -40,8 +40,8 @@ def render(log: RunLog) -> str:
     """A run's report as HTML, without anything outside the page. All text from the run is escaped."""
     summary, config, info = log.numbers(), log.store.config, log.store.info
     told, pictures = stories(log.store, log.arms)
-    truths = fidelity(log)
-    measured = shown_columns(truths)
+    truths, ledger = fidelity(log), costs(log)
+    measured, paid = shown_columns(truths), cost_columns(ledger)
     return (
         environment()
         .get_template("page.html.j2")
@@ -56,8 +56,8 @@ def render(log: RunLog) -> str:
             plots=_plots(log, summary, truths),
             stories=told,
             pictures=pictures,
-            costs=[(line, line.cells()) for line in costs(log)],
-            cost_columns=COLUMNS,
+            costs=[(line, line.cells()[: len(paid)]) for line in ledger],
+            cost_columns=paid,
             fidelity=[(line, line.cells(measured)) for line in truths],
             fidelity_columns=[(column.title, column.about) for column in measured],
             failures=[row for row in log.episodes if row["status"] == "failed"],
