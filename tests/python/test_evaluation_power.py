@@ -52,6 +52,29 @@ def test_what_costs_episodes():
     assert wiw.power(-15, base=60).scenes == wiw.power(15, base=60).scenes
 
 
+@pytest.mark.parametrize(
+    "numbers", [{"scenes": 12}, {"scenes": 40, "losses": 6}, {"scenes": 40, "arms": 4, "per_scene": 2}]
+)
+def test_the_least_difference_is_the_one_that_needs_so_many_scenes(numbers):
+    found = wiw.power(**numbers)
+    options = {name: value for name, value in numbers.items() if name != "scenes"}
+    assert found.scenes == numbers["scenes"] and 0.8 <= found.by_interval < 0.85
+    assert (
+        wiw.power(found.difference + 1, **options).scenes
+        <= found.scenes
+        <= wiw.power(found.difference - 1, **options).scenes
+    )
+
+
+def test_what_shows_less():
+    plain = wiw.power(scenes=20).difference
+    assert wiw.power(scenes=40).difference < plain
+    assert wiw.power(scenes=20, losses=8).difference > plain
+    assert wiw.power(scenes=20, correlation=0.3).difference > plain
+    assert wiw.power(scenes=20, arms=5).difference > plain
+    assert wiw.power(scenes=20, chance=0.95).difference > plain
+
+
 def test_several_arms_are_reckoned_with_as_holm_does():
     assert holm([0.05 / 4, 0.5, 0.6, 0.7])[0] == pytest.approx(0.05)
     assert "as one of 4 arms" in str(wiw.power(15, arms=4))
@@ -66,6 +89,11 @@ def test_several_arms_are_reckoned_with_as_holm_does():
         ({"difference": 10, "correlation": 1.0}, "correlation in [0, 1)"),
         ({"difference": 10, "chance": 1.0}, "chance between 0 and 1"),
         ({"difference": 0.01}, "more than 100000 scenes"),
+        ({}, "either a difference"),
+        ({"difference": 10, "scenes": 20}, "either a difference"),
+        ({"scenes": 1}, "at least 2 scenes"),
+        ({"scenes": 2, "per_scene": 1}, "no difference up to 78 points"),
+        ({"scenes": 20, "arms": 0}, "arms of at least 1"),
     ],
 )
 def test_numbers_that_no_run_could_have(numbers, message):
@@ -78,6 +106,9 @@ def test_command_line(capsys):
     assert main(["power", "15", "--arms", "3"]) == 0
     assert str(wiw.power(15, arms=3)) == capsys.readouterr().out.strip()
     assert main(["power", "-15", "--base", "50"]) == 0 and "-15 points" in capsys.readouterr().out
+    assert main(["power", "--scenes", "40"]) == 0
+    assert str(wiw.power(scenes=40)) == capsys.readouterr().out.strip()
+    assert main(["power", "10", "--scenes", "40"]) == 2 and "either a difference" in capsys.readouterr().err
     assert main(["power"]) == 0 and "12/2" in capsys.readouterr().out
     assert main(["power", "90"]) == 2 and "80 %" in capsys.readouterr().err
     with pytest.raises(SystemExit):

@@ -20,6 +20,7 @@ def power(
     difference: Positional[Annotated[float | None, arg(metavar="POINTS")]] = None,
     /,
     *,
+    scenes: Annotated[int | None, arg(metavar="N")] = None,
     base: Number = 20.0,
     losses: Number = 2.0,
     correlation: Number = 0.05,
@@ -27,12 +28,13 @@ def power(
     chance: Number = 0.8,
     arms: Count = 1,
 ) -> int:
-    """How many episodes a run needs to show that one arm succeeds more often than another.
+    """How many episodes a run needs to show that one arm succeeds more often than another, or what it can show.
 
       $ wiw power                        # for differences from 5 to 30 points
       $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
       $ wiw power 10 --arms 4            # as one of four arms compared with the same base
       $ wiw power -5 --base 50         # an arm that is 5 points worse
+      $ wiw power --scenes 40            # the least difference that 40 scenes of 5 episodes can show
 
     Two arms of a run meet on the same episodes, so only those count in which one succeeds and the other does not: won
     or lost. 30 % won and 20 % lost are as many points as 12 % won and 2 % lost, and far weaker evidence, so --losses
@@ -43,7 +45,8 @@ def power(
     oracle 36 % won and 2 % lost; differences correlate within an apartment by -0.06 to 0.06.
 
     Args:
-        difference: In points of success rate; a table of usual ones if not given.
+        difference: In points of success rate; a table of usual ones if neither it nor --scenes is given.
+        scenes: Of the run; asks for the least difference that it can show.
         base: Success rate of the arm compared with, percent.
         losses: Percent of episodes that the better arm loses.
         correlation: Between the differences of two episodes of a scene.
@@ -53,13 +56,14 @@ def power(
     """
     from wiw.evaluation.power import power as plan
 
-    def planned(points: float) -> Power:
+    def planned(points: float | None, scenes: int | None = None) -> Power:
         return plan(
-            points, base=base, losses=losses, correlation=correlation, per_scene=per_scene, chance=chance, arms=arms
-        )
+            points, scenes=scenes, base=base, losses=losses, correlation=correlation, per_scene=per_scene,
+            chance=chance, arms=arms,
+        )  # fmt: skip
 
-    if difference is not None:
-        print(planned(difference))
+    if difference is not None or scenes is not None:
+        print(planned(difference, scenes))
         return 0
     _table([planned(points) for points in USUAL if base + points + losses <= 100], chance)
     return 0

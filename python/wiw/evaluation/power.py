@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many episodes a run needs, before it is run."""
+"""How many episodes a run needs, or what it can show, before it is run."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
 """Near what 210 test episodes of Image-Goal Navigation in 42 apartments gave (`docs/results.md`): 18 % succeed without
 a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by -0.06 to 0.06."""
 MOST_SCENES = 100_000
+LEAST = 0.1
+"""Points; differences are sought in such steps."""
 _DRAWS = 2_000_000
 
 
@@ -26,7 +28,7 @@ class Power:
     """What `wiw.power` returns; shows itself as a sentence or two."""
 
     difference: float
-    """Points of success rate between two arms that the run is to show."""
+    """Points of success rate between two arms that the run shows."""
     base: float
     """Success rate of the arm compared with, percent."""
     losses: float
@@ -68,8 +70,9 @@ class Power:
 
 
 def power(
-    difference: float,
+    difference: float | None = None,
     *,
+    scenes: int | None = None,
     base: float = BASE,
     losses: float = LOSSES,
     correlation: float = CORRELATION,
@@ -78,16 +81,19 @@ def power(
     arms: int = 1,
     seed: int = 0,
 ) -> Power:
-    """Episodes and scenes that a run needs to show a paired difference of success rates.
+    """Scenes that a run needs to show a paired difference of success rates, or the least that a run can show.
 
         wiw.power(10)              # +10 points to 20 %, in apartments
         wiw.power(10, arms=4)      # the same as one of four arms, whose p values Holm adjusts
+        wiw.power(scenes=40)       # what 200 episodes in 40 scenes can show
 
     The fewest scenes for which the t interval of the difference excludes 0 often enough are found by its noncentral t
     distribution, and the chance is then measured in simulated runs; scenes are added until it is what was asked for.
+    The least difference is sought in simulated runs, to a tenth of a point.
 
     Args:
-        difference: in points; positive if the arm under test is better.
+        difference: in points; positive if the arm under test is better. None: the least that `scenes` can show.
+        scenes: of the run; None: as many as `difference` needs.
         base: success rate of the arm it is compared with, percent.
         losses: percent of episodes in which the worse arm succeeds and the better one does not. Fewer: arms are more
             alike, so that less is left to chance.
@@ -98,21 +104,90 @@ def power(
         seed: of the simulation.
 
     Raises:
-        ArgumentError: numbers that no run could have.
+        ArgumentError: numbers that no run could have; both a difference and scenes, or neither.
     """
-    _check(difference, base, losses, correlation, per_scene, chance, arms)
-    confidence = 1 - 0.05 / arms
-    lost, won = losses / 100, (losses + abs(difference)) / 100
-    scenes = _by_formula(won, lost, correlation, per_scene, chance, confidence)
-    rng = np.random.Generator(np.random.Philox(key=seed))
-    while True:
-        by_interval, by_test = simulated_power(won, lost, scenes, per_scene, correlation, confidence, rng)
-        if by_interval >= chance:
-            break
-        scenes = scenes + max(1, scenes // 25)
-    return Power(
-        difference, base, losses, correlation, per_scene, arms, chance, scenes, float(by_interval), float(by_test)
-    )
+    if (difference is None) == (scenes is None):
+        raise ArgumentError(
+            "power: expected either a difference, for the scenes it needs, or scenes, for what they show"
+        )
+    plan = _Plan(losses, correlation, per_scene, chance, 1 - 0.05 / arms if arms > 0 else 0.0, seed)
+    if difference is not None:
+        _check(difference, base, losses, correlation, per_scene, chance, arms)
+        needed, shares = plan.scenes_for(abs(difference))
+    else:
+        assert scenes is not None
+        _check(LEAST, base, losses, correlation, per_scene, chance, arms)
+        if scenes < 2:
+            raise ArgumentError(f"power: expected at least 2 scenes, got {scenes}")
+        difference, shares = plan.difference_for(scenes, 100 - base - losses)
+        needed = scenes
+    return Power(difference, base, losses, correlation, per_scene, arms, chance, needed, *shares)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What does not change while scenes, or the difference, are sought."""
+
+    losses: float
+    correlation: float
+    per_scene: int
+    chance: float
+    confidence: float
+    seed: int
+
+    def scenes_for(self, difference: float) -> tuple[int, tuple[float, float]]:
+        """Fewest scenes, and what they give by interval and by test."""
+        rng = self._rng()
+        scenes = self._fewest(difference)
+        while (shares := self._simulated(difference, scenes, rng))[0] < self.chance:
+            scenes += max(1, scenes // 25)
+        return scenes, shares
+
+    def difference_for(self, scenes: int, most: float) -> tuple[float, tuple[float, float]]:
+        """Least difference up to `most`, to a tenth of a point, and what the scenes give for it."""
+
+        def shown(tenths: int) -> tuple[float, float]:
+            return self._simulated(tenths / 10, scenes, self._rng())
+
+        least, end = 1, int(10 * most + 1e-9)
+        if end < least or shown(end)[0] < self.chance:
+            raise ArgumentError(
+                f"power: {scenes * self.per_scene} episodes in {scenes} scenes show no difference up to {most:g} "
+                f"points with a chance of {100 * self.chance:g} %; take more scenes"
+            )
+        while least < end:
+            middle = (least + end) // 2
+            least, end = (least, middle) if shown(middle)[0] >= self.chance else (middle + 1, end)
+        return end / 10, shown(end)
+
+    def _rng(self) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=self.seed))
+
+    def _simulated(self, difference: float, scenes: int, rng: np.random.Generator) -> tuple[float, float]:
+        lost, won = self.losses / 100, (self.losses + difference) / 100
+        return simulated_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
+
+    def _fewest(self, difference: float) -> int:
+        """Fewest scenes by the formula."""
+        least, most = 2, 2
+        while not self._enough(difference, most):
+            if most > MOST_SCENES:
+                raise ArgumentError(
+                    f"power: a difference of {difference:g} points needs more than {MOST_SCENES} scenes"
+                )
+            least, most = most, 2 * most
+        while least < most:
+            middle = (least + most) // 2
+            least, most = (least, middle) if self._enough(difference, middle) else (middle + 1, most)
+        return most
+
+    def _enough(self, difference: float, scenes: int) -> bool:
+        """Whether scenes show a difference often enough, by the noncentral t distribution of the mean over scenes."""
+        gain, discordant = difference / 100, (2 * self.losses + difference) / 100
+        spread = (discordant - gain**2) * (1 + (self.per_scene - 1) * self.correlation) / self.per_scene
+        limit = stats.t.ppf(0.5 + self.confidence / 2, scenes - 1)
+        shift = gain * math.sqrt(scenes / max(spread, 1e-12))
+        return bool(stats.nct.sf(limit, scenes - 1, shift) >= self.chance)
 
 
 def simulated_power(
@@ -132,26 +207,6 @@ def simulated_power(
     wins, losses, _ = counts.sum(1).T
     p_values = np.minimum(1.0, 2 * stats.binom.cdf(np.minimum(wins, losses), wins + losses, 0.5))
     return float(np.mean(low > 0)), float(np.mean((p_values <= 1 - confidence) & (wins > losses)))
-
-
-def _by_formula(won: float, lost: float, correlation: float, per_scene: int, chance: float, confidence: float) -> int:
-    """Fewest scenes by the noncentral t distribution of the mean over scenes."""
-    gain = won - lost
-    spread = (won + lost - gain**2) * (1 + (per_scene - 1) * correlation) / per_scene
-
-    def enough(scenes: int) -> bool:
-        limit = stats.t.ppf(0.5 + confidence / 2, scenes - 1)
-        return bool(stats.nct.sf(limit, scenes - 1, gain * math.sqrt(scenes / max(spread, 1e-12))) >= chance)
-
-    least, most = 2, 2
-    while not enough(most):
-        if most > MOST_SCENES:
-            raise ArgumentError(f"power: a difference of {100 * gain:g} points needs more than {MOST_SCENES} scenes")
-        least, most = most, 2 * most
-    while least < most:
-        middle = (least + most) // 2
-        least, most = (least, middle) if enough(middle) else (middle + 1, most)
-    return most
 
 
 def _check(
