@@ -26,19 +26,18 @@ class SVD(VideoModel):
         noise: standard deviation of the noise on the observation; more of it, more motion.
     """
 
-    accepts = accepts(control="image", view="perspective", size=(448, 448), frames=14, cacheable=True)
+    accepts = accepts(control="image", view="perspective", frames=14, cacheable=True)
     requires = Requirements(PACKAGES, "diffusers", HUB, gpu=True)
     pipeline = "StableVideoDiffusionPipeline"
     guided_by = "max_guidance_scale"
     half = "float16"
-    multiple = 64
+    multiple = 8
     most_rows = 16
     every_frame = True
 
     weights: str = HUB
     steps: int = 30
     guidance: float = 3.0
-    size: tuple[int, int] = (448, 448)
     frames: int = 14
     fps: int = 7
     motion: int = 127
