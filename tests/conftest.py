@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +64,24 @@ def data_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
-def world_model_options(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], dict[str, Any]]:
-    """What a built-in world model is made with in tests: tiny random weights, saved once, where it needs any."""
+def world_model_options(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Callable[[str], dict[str, Any]]]:
+    """What a built-in world model is made with in tests: tiny random weights, saved once, or a service on the loopback.
+
+    Skips a model whose packages are not installed.
+    """
     folder, saved = tmp_path_factory.mktemp("weights"), set()
+    stack = ExitStack()
 
     def options(name: str) -> dict[str, Any]:
-        if not wiw.registry.WORLD_MODELS.find(name).requires.packages:
+        requires = wiw.registry.WORLD_MODELS.find(name).requires
+        if missing := requires.missing():
+            pytest.skip(f"no {', '.join(missing)}: pip install 'wiw[{requires.extra}]'")
+        if name == "runway-gen4":
+            return runway()
+        if not requires.packages:
             return {}
-        pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
         import tiny_pipelines
 
         if name not in saved:
@@ -77,7 +89,16 @@ def world_model_options(tmp_path_factory: pytest.TempPathFactory) -> Callable[[s
             saved.add(name)
         return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name]}
 
-    return options
+    @cache
+    def runway() -> dict[str, Any]:
+        import fake_runway
+
+        stack.enter_context(pytest.MonkeyPatch.context()).setenv("RUNWAYML_API_SECRET", "a key")
+        server = stack.enter_context(fake_runway.serving())
+        return {"url": server.url, "poll": 0.0, "size": (64, 64)}
+
+    with stack:
+        yield options
 
 
 @pytest.fixture(scope="session")

@@ -164,6 +164,7 @@ WORLD_MODELS = Registry(
         "wan2.2-a14b": "wiw.world_models.wan2_2_a14b:Wan22",
         "cosmos-predict2": "wiw.world_models.cosmos_predict2:CosmosPredict2",
         "sana-wm": "wiw.world_models.sana_wm:SanaWM",
+        "runway-gen4": "wiw.world_models.runway_gen4:RunwayGen4",
     },
     "wiw.world_models.base:WorldModel",
 )

@@ -250,7 +250,7 @@ class Decision:
     """How true imagination was, where the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
     """What answering took, an equal share of the batch's: calls of the world model with their rows and frames, retries
-    among the calls, cached_rows that needed none, vlm_tokens."""
+    among the calls, cached_rows that needed none, vlm_tokens; credits where a paid service imagines."""
 
 
 @dataclass(frozen=True)

@@ -262,11 +262,11 @@ def test_the_filter_of_cosmos_is_the_users_choice(made):
         made("cosmos-predict2", guardrail=True)
 
 
-def test_a_missing_package_is_named_with_the_extra(made, monkeypatch):
+def test_a_missing_package_is_named_with_the_extra(monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ftfy" else find(name))
     with pytest.raises(DependencyError, match=r"ftfy not installed; pip install 'wiw\[diffusers\]'"):
-        made("wan2.1")
+        wiw.world_model("wan2.1", weights="/models/wan")
 
 
 def test_weights_that_are_not_there_or_of_another_model(made, world_model_options, tmp_path):
@@ -391,10 +391,12 @@ def test_nan_is_no_picture(made):
 def test_list_says_what_each_model_takes_and_lacks(capsys, monkeypatch, tmp_path):
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.delenv("RUNWAYML_API_SECRET", raising=False)
     assert main(["list", "world-models"]) == 0
     rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
     for name in NAMES:
         control_kind = {"svd": "image", "sana-wm": "trajectory"}.get(name, "text")
         assert control_kind in rows[name] and "perspective" in rows[name] and "lacks weights" in rows[name]
+    assert "RUNWAYML_API_SECRET" in rows["runway-gen4"]
     assert "576x1024 + depth" in rows["warp"] and "ready" in rows["warp"]
     assert "Wan-AI/Wan2.2-I2V-A14B-Diffusers" in rows["wan2.2-a14b"] and "480x480" in rows["wan2.2-a14b"]

@@ -64,7 +64,7 @@ def _world_models() -> Any:
             table.add_row(name, *[""] * 5, f"[red]{escape(str(error))}[/]")
     table.caption = escape(
         "Weights are downloaded at first use, into the Hugging Face cache; --world-model-option weights=FOLDER takes "
-        "others. Packages: pip install 'wiw[diffusers]'."
+        "others. Packages: pip install 'wiw[diffusers,runway]'."
     )
     table.caption_justify = "left"
     return table

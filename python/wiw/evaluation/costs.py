@@ -43,7 +43,7 @@ class Costs:
     calls: Mapping[str, float]
     """Asked for: consultations, rows (rollouts), frames. A function of the decisions alone."""
     spent: Mapping[str, float]
-    """Taken: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens."""
+    """Taken: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens, credits of a service."""
     seconds: Mapping[str, float]
     """Wall time by stage; it depends on the machine and on what else ran."""
     lost: Mapping[str, float] = field(default_factory=dict)

@@ -248,6 +248,8 @@ class Agent:
         counts = Counter({"vlm_tokens": sum(policy.tokens for policy in policies)})
         if self._ask is not None:
             counts.update(self._ask.tally)
+        if (charged := getattr(self.model, "credits", None)) is not None:
+            counts["credits"] = charged
         return counts
 
     def _futures(

@@ -122,6 +122,8 @@ class Requirements:
     """Name on the Hugging Face hub of what is loaded by default."""
     gpu: bool = False
     """Whether it is of no practical use without one."""
+    variables: tuple[str, ...] = ()
+    """Of the environment, such as the key of a service."""
 
     def missing(self) -> list[str]:
         """Packages that are not installed; nothing is imported."""

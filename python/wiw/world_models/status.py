@@ -16,7 +16,7 @@ def lacks(requires: Requirements) -> list[str]:
         found.append("weights")
     if requires.gpu and not has_gpu():
         found.append("a GPU")
-    return found
+    return found + [name for name in requires.variables if not os.environ.get(name)]
 
 
 def in_hub_cache(repository: str) -> bool:

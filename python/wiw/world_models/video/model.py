@@ -13,11 +13,11 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import action
 from wiw.errors import ArgumentError, ContractError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import WorldModel, accepts
+from wiw.world_models.clips import shown
 from wiw.world_models.fingerprint import code_digest
 from wiw.world_models.video import loading
 from wiw.world_models.video.loading import Offload, Precision
@@ -146,7 +146,8 @@ class VideoModel(WorldModel):
             with loading.memory_guard(self):
                 clips = self._clips(observations.image[rows], controls[rows], seeds[rows])
             for frame, clip, control in zip(frames[rows], clips, controls[rows], strict=True):
-                frame[:] = np.rint(clip[self._shown(control)] * 255)
+                chosen = slice(None) if self.every_frame else shown(control.length, self.frames, self.frames)
+                frame[:] = np.rint(clip[chosen] * 255)
         frames[:, 0] = observations.image
         return frames
 
@@ -164,15 +165,6 @@ class VideoModel(WorldModel):
         if clips.shape != expected:
             raise ContractError(f"{type(self).__name__}: expected clips {expected}, got {clips.shape}", "frames")
         return clips
-
-    def _shown(self, control: Control) -> NDArray[np.int64]:
-        """int64 [frames]: the frame of the clip that each frame of the rollout is."""
-        if self.every_frame:
-            return np.arange(self.frames)
-        shown = np.full(self.frames, self.frames - 1)
-        shown[0] = 0
-        shown[1 : 1 + control.length] = action.frames_of_actions(control.length, self.frames, "resample")[:, 1]
-        return shown
 
     def describe(self) -> dict[str, Any]:
         """Options, and what identifies the weights: the hub's commit or a digest of the folder."""

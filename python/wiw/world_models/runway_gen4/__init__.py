@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runway Gen-4, a paid service."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from hashlib import blake2b
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.types import Conditioning, Control
+from wiw.world_models import devices
+from wiw.world_models.base import Requirements, WorldModel, accepts
+from wiw.world_models.clips import shown
+from wiw.world_models.fingerprint import code_digest
+from wiw.world_models.runway_gen4.tasks import Tasks
+from wiw.world_models.runway_gen4.videos import data_uri, fetch
+
+LONGEST_PROMPT = 1000
+"""UTF-16 code units that the service takes."""
+
+
+@dataclass(kw_only=True, eq=False)
+class RunwayGen4(WorldModel):
+    """Runway Gen-4: the front view and the plan in words become a clip, on Runway's servers, for money.
+
+    The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
+    together. A row that was begun is never begun again: a repeated question goes on waiting for it.
+
+    Args:
+        model: "gen4_turbo", or "gen4.5".
+        duration: seconds of a clip, 2 to 10; each costs credits.
+        size: (height, width) of input and output; the service makes 960x960 of it.
+        frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
+        batch: rows that are begun at once.
+        budget: credits after which nothing more is begun; None is without end.
+        poll: seconds between two looks at the tasks.
+        patience: seconds after which a task that has not ended counts as lost.
+        url: of the service; RUNWAYML_BASE_URL if not given, else Runway's own.
+
+    Raises:
+        DependencyError: `runwayml` is not installed.
+        ArgumentError: no key in the environment, or an option out of range.
+    """
+
+    accepts = accepts(control="text", view="perspective", frames=25)
+    requires = Requirements(("runwayml",), "runway", variables=("RUNWAYML_API_SECRET",))
+
+    model: Literal["gen4_turbo", "gen4.5"] = "gen4_turbo"
+    duration: int = 5
+    size: tuple[int, int] = (480, 480)
+    frames: int = 25
+    batch: int = 4
+    budget: float | None = None
+    poll: float = 5.0
+    patience: float = 600.0
+    url: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.model not in ("gen4_turbo", "gen4.5") or not 2 <= self.duration <= 10:
+            raise ArgumentError(
+                f"RunwayGen4: expected model gen4_turbo or gen4.5 and a duration of 2 to 10 seconds, got "
+                f"{self.model!r} and {self.duration!r}"
+            )
+        if self.batch < 1 or self.poll < 0 or not self.patience > 0:
+            raise ArgumentError(
+                f"RunwayGen4: expected a batch of at least 1, poll of at least 0 s and patience above 0 s, got "
+                f"{self.batch}, {self.poll} and {self.patience}"
+            )
+        self.size = (int(self.size[0]), int(self.size[1]))
+        self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
+        devices.require(self.requires)
+        self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)
+
+    @property
+    def credits(self) -> int:
+        """What the service has charged so far."""
+        return self._tasks.credits
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """One clip a row, evenly sampled; padding repeats the last frame of the plan.
+
+        Raises:
+            InfrastructureError: the service refused, failed or took too long, or the budget is spent.
+        """
+        orders = [
+            self._order(image, control, int(seed))
+            for image, control, seed in zip(observations.image, controls, seeds, strict=True)
+        ]
+        frames = np.empty((len(controls), self.frames, *observations.image.shape[1:]), np.uint8)
+        for row, (url, control) in enumerate(zip(self._tasks.outputs(orders), controls, strict=True)):
+            clip = fetch(url, self.size)
+            frames[row] = clip[shown(control.length, len(clip), self.frames)]
+        frames[:, 0] = observations.image
+        return frames
+
+    def _order(self, image: NDArray[np.uint8], control: Control, seed: int) -> dict[str, Any]:
+        """What the service is asked for one row."""
+        if len(control.text.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
+            raise ArgumentError(
+                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, and {control.length} "
+                f"actions take {len(control.text)}; lower frames (now {self.frames})"
+            )
+        return {
+            "model": self.model,
+            "prompt_image": data_uri(image),
+            "prompt_text": control.text,
+            "ratio": "960:960",
+            "duration": self.duration,
+            "seed": seed % 2**32,
+        }
+
+    def fingerprint(self) -> str:
+        """Digest of code and options; the service may change without notice."""
+        said = {name: value for name, value in self.describe().items() if name not in ("batch", "budget", "poll")}
+        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+
+    def __reduce__(self) -> Any:
+        """As options: another process opens its own connection."""
+        return partial(type(self), **{field.name: getattr(self, field.name) for field in fields(self)}), ()
