@@ -56,6 +56,8 @@ from transformers import (
     UMT5EncoderModel,
 )
 
+from tiny_nwm import TinyNWM
+
 PIECES = ["<pad>", "</s>", "<unk>", "▁", *string.ascii_letters, *string.digits, *string.punctuation]
 OPTIONS: dict[str, dict[str, Any]] = {
     "svd": {"size": (64, 64), "frames": 5, "steps": 1},
@@ -66,6 +68,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "wan2.2-a14b": {"size": (32, 32), "frames": 5, "steps": 2},
     "cosmos-predict2": {"size": (32, 32), "frames": 5, "steps": 1, "guardrail": False},
     "sana-wm": {"size": (64, 64), "frames": 9, "steps": 1},
+    "nwm": {"steps": 2, "batch": 1},
 }
 """What makes a rollout of each cheap; `weights` is the folder that `save` has written."""
 
@@ -385,4 +388,5 @@ BUILDERS: dict[str, Callable[[], Any]] = {
     "wan2.2-a14b": wan22_a14b,
     "cosmos-predict2": cosmos,
     "sana-wm": sana_wm,
+    "nwm": TinyNWM,
 }

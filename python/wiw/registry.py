@@ -165,6 +165,7 @@ WORLD_MODELS = Registry(
         "cosmos-predict2": "wiw.world_models.cosmos_predict2:CosmosPredict2",
         "sana-wm": "wiw.world_models.sana_wm:SanaWM",
         "runway-gen4": "wiw.world_models.runway_gen4:RunwayGen4",
+        "nwm": "wiw.world_models.nwm:NWM",
     },
     "wiw.world_models.base:WorldModel",
 )

@@ -220,6 +220,15 @@ def test_networks_count_by_content() -> None:
     assert prints[0] == prints[1] and len(set(prints)) == 3
 
 
+def test_an_instances_own_declaration_counts() -> None:
+    def declared(**changes):
+        made = Counting()
+        made.accepts = replace(made.accepts, **changes)
+        return made.fingerprint()
+
+    assert declared(frames=9) == declared(frames=9) != declared(frames=5)
+
+
 def test_what_needs_no_torch_has_one_name_with_and_without_it(monkeypatch) -> None:
     torch = pytest.importorskip("torch")
     there = Counting().fingerprint()

@@ -7,6 +7,7 @@ import inspect
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from hashlib import blake2b
 from pathlib import Path
 from types import BuiltinFunctionType, FunctionType, ModuleType
@@ -89,6 +90,8 @@ def _add(digest: Any, value: Any, where: str) -> None:
         for name in value:
             _add(digest, str(name), where)
             _add(digest, value[name], f"{where}[{name!r}]")
+    elif is_dataclass(value):
+        _add(digest, {each.name: getattr(value, each.name) for each in fields(value)}, where)
     elif isinstance(value, list | tuple | set | frozenset):
         for index, item in enumerate(sorted(value, key=repr) if isinstance(value, set | frozenset) else value):
             _add(digest, item, f"{where}[{index}]")

@@ -44,13 +44,14 @@ def fetch(
         if revision is not None:
             raise ArgumentError(f"revision: '{revision}' names a state of a hub repository, but {folder} is a folder")
         return Weights(folder, {"digest": digest(folder)})
-    if _is_path(name):
+    if is_path(name):
         raise WeightsError(f"no folder {folder.resolve()}; give the folder of a pipeline, or its name on the hub")
     snapshot = _download(name, pipeline, revision, variant, components)
     return Weights(snapshot, {"commit": snapshot.name})
 
 
-def _is_path(name: str) -> bool:
+def is_path(name: str) -> bool:
+    """Whether a name is a path and not a hub repository, OWNER/NAME."""
     return name.startswith(("/", ".", "~")) or name.count("/") != 1
 
 
@@ -62,10 +63,10 @@ def _download(
     try:
         return Path(getattr(diffusers, pipeline).download(name, revision=revision, variant=variant, **components))
     except Exception as error:
-        raise _explained(error, name, revision) from error
+        raise explained(error, name, revision) from error
 
 
-def _explained(error: BaseException, name: str, revision: str | None) -> WeightsError:
+def explained(error: BaseException, name: str, revision: str | None) -> WeightsError:
     """What an error of the hub's client means for the user."""
     from huggingface_hub import errors
 
