@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the recogniser is shown of a target: a close and a wide view centred on its box, and the box's angles."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw import panorama
+from wiw.errors import ArgumentError
+from wiw.panorama import PerspectivePlan
+from wiw.perception.boxes import Mask, box_of, width_of
+
+SIDE = 64
+"""Pixels of a view."""
+FILL = 0.6
+"""Which part of the close view the box fills, in the axis where it is longer."""
+CONTEXT = 2.5
+"""How many times as wide the wide view is."""
+NARROWEST, WIDEST = np.tan(np.radians([4.0, 65.0]))
+"""Half fields of view, as tangents."""
+STEP = 1.2
+"""Fields of view are powers of it, so that look-up tables are shared."""
+PITCH_STEP = 3.0
+"""Degrees; views look up and down in whole steps, for the same reason."""
+SCALARS = 5
+"""Width and height of the box, elevation of its upper and lower edge (radians), whether the view is real."""
+
+
+@dataclass(frozen=True)
+class Glimpses:
+    """N looks at targets."""
+
+    images: NDArray[np.uint8]
+    """uint8 [N, 2, 64, 64, 3]: close and wide."""
+    boxes: NDArray[np.float32]
+    """float32 [N, 2, 4]: left, top, right, bottom in each, 0 to 1."""
+    scalars: NDArray[np.float32]
+    """float32 [N, 5], see `SCALARS`."""
+
+    def __post_init__(self) -> None:
+        count = len(self.images)
+        shapes = ((count, 2, SIDE, SIDE, 3), (count, 2, 4), (count, SCALARS))
+        given = tuple(np.shape(values) for values in (self.images, self.boxes, self.scalars))
+        if given != shapes or self.images.dtype != np.uint8:
+            raise ArgumentError(
+                f"Glimpses: expected images uint8 {shapes[0]}, boxes {shapes[1]}, scalars {shapes[2]}, "
+                f"got {self.images.dtype} {given[0]}, {given[1]}, {given[2]}"
+            )
+        if not (np.isfinite(self.boxes).all() and np.isfinite(self.scalars).all()):
+            raise ArgumentError("Glimpses: expected finite boxes and scalars, got NaN or infinity")
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def __getitem__(self, rows: NDArray[np.int64]) -> Glimpses:
+        return Glimpses(self.images[rows], self.boxes[rows], self.scalars[rows])
+
+
+def joined(parts: Sequence[Glimpses]) -> Glimpses:
+    """All of several in one; none of none."""
+    empty = np.zeros((0, 2, SIDE, SIDE, 3), np.uint8), np.zeros((0, 2, 4)), np.zeros((0, SCALARS))
+    columns = zip(*((part.images, part.boxes, part.scalars) for part in parts), strict=True)
+    images, boxes, scalars = (np.concatenate(column) for column in columns) if parts else empty
+    return Glimpses(images, boxes.astype(np.float32), scalars.astype(np.float32))
+
+
+def glimpses(
+    panoramas: NDArray[np.uint8], masks: NDArray[np.bool_], real: NDArray[np.bool_]
+) -> tuple[Glimpses, NDArray[np.int64]]:
+    """Looks at the target in those of K panoramas that show it, and which of them these are.
+
+    Args:
+        panoramas: uint8 [K, H, W, 3].
+        masks: bool [K, H, W]: the target's pixels; only the box around them is used.
+        real: bool [K]: True where the panorama is an observation, not imagination.
+
+    Raises:
+        ArgumentError: arrays of other shapes.
+    """
+    if panoramas.ndim != 4 or panoramas.shape[3] != 3 or masks.shape != panoramas.shape[:3]:
+        raise ArgumentError(
+            f"glimpses: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape}, {masks.shape}"
+        )
+    if np.shape(real) != (len(panoramas),):
+        raise ArgumentError(f"glimpses: expected one flag a panorama [{len(panoramas)}], got {np.shape(real)}")
+    frames = np.flatnonzero(masks.any(axis=(1, 2)))
+    return joined([_glimpse(panoramas[k], masks[k], bool(real[k])) for k in frames]), frames
+
+
+def _glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimpses:
+    yaw, pitch = _direction(mask)
+    x, y, elevation = _angles(mask, yaw, pitch)
+    close = _quantised(max(np.abs(x).max(), np.abs(y).max()) / FILL)
+    fields = [close, _quantised(close * CONTEXT)]
+    extent = np.array([x.min(), -y.max(), x.max(), -y.min()])
+    scalars = [np.arctan(np.ptp(x)), np.arctan(np.ptp(y)), elevation.max(), elevation.min(), float(real)]
+    return Glimpses(
+        np.stack([_view(image, yaw, pitch, field) for field in fields])[None],
+        np.stack([np.clip((extent / field + 1) / 2, 0, 1) for field in fields])[None].astype(np.float32),
+        np.array([scalars], np.float32),
+    )
+
+
+def _direction(mask: Mask) -> tuple[float, float]:
+    """Yaw (a whole column) and pitch (a whole step) of the middle of the mask's box; left and up positive."""
+    rows, columns = mask.shape
+    box = box_of(mask, wraps=True)
+    assert box is not None
+    middle = round(box[0] + width_of(box, columns) / 2) % columns
+    pitch = 90 - 90 * (box[1] + box[3]) / rows
+    return (columns / 2 - middle) * 360 / columns, round(pitch / PITCH_STEP) * PITCH_STEP
+
+
+def _angles(mask: Mask, yaw_deg: float, pitch_deg: float) -> tuple[NDArray[np.float64], ...]:
+    """Of the mask's pixels: tangents to the right and up in a view of this direction, and elevation in radians."""
+    rays = _rays(mask.shape[0], mask.shape[1])[np.flatnonzero(mask)]
+    yaw, pitch = np.radians([yaw_deg, pitch_deg])
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    ahead = np.array([-sin * np.cos(pitch), np.sin(pitch), -cos * np.cos(pitch)])
+    right = np.array([cos, 0.0, -sin])
+    x, y, z = (rays @ np.stack([right, np.cross(right, ahead), ahead], axis=1)).T
+    z = np.maximum(z, 0.1)  # what is aside or behind lies at the view's edge
+    return x / z, y / z, np.arcsin(np.clip(rays[:, 1], -1, 1))
+
+
+def _quantised(field: float) -> float:
+    field = float(np.clip(field, NARROWEST, WIDEST))
+    return float(STEP ** np.ceil(np.log(field) / np.log(STEP) - 1e-9))
+
+
+def _view(image: NDArray[np.uint8], yaw: float, pitch: float, field: float) -> NDArray[np.uint8]:
+    """A square view; where its pixels are coarser than the panorama's, a mean of finer ones."""
+    coarser = (2 * field / SIDE) / (2 * np.pi / image.shape[1])
+    finer = 1 if coarser < 1.4 else 2 if coarser < 2.8 else 4
+    plan = _plan((image.shape[0], image.shape[1]), finer * SIDE, field, pitch)
+    view = plan(image, yaw)
+    return view if finer == 1 else panorama.resize(view, (SIDE, SIDE))
+
+
+@lru_cache(maxsize=256)
+def _plan(size: tuple[int, int], side: int, field: float, pitch: float) -> PerspectivePlan:
+    return PerspectivePlan(size, (side, side), float(np.degrees(2 * np.arctan(field))), pitch)
+
+
+@lru_cache(maxsize=4)
+def _rays(rows: int, columns: int) -> NDArray[np.float32]:
+    rays = panorama.directions((rows, columns)).reshape(-1, 3)
+    rays.setflags(write=False)
+    return rays

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The built-in recogniser: what a boxed thing is, from any number of real and imagined looks at it, with no VLM."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, BackendError, FileError
+from wiw.perception.calibration import softmax
+from wiw.perception.glimpses import Glimpses, joined
+
+if TYPE_CHECKING:
+    from wiw.perception.recognition_network import Network
+
+FORMAT = "wiw-recogniser-1"
+
+
+class Recogniser:
+    """A trained network with its temperature.
+
+    Args:
+        network: `wiw.perception.recognition_network.Network`; its weights are rounded to half precision, in which they
+            are stored, so that a loaded recogniser answers exactly as the saved one.
+        categories: what its logits stand for.
+        temperature: the logits are divided by it.
+        card: how it was made and measured, JSON-able: recipe, accuracy, calibration.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        categories: Sequence[str],
+        temperature: float = 1.0,
+        card: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.categories, self.temperature, self.card = tuple(categories), float(temperature), dict(card or {})
+        self.network = network.eval()
+        if len(set(self.categories)) != network.categories or len(self.categories) != network.categories:
+            raise ArgumentError(
+                f"Recogniser: expected {network.categories} different categories, got {list(self.categories)}"
+            )
+        if not (np.isfinite(self.temperature) and self.temperature > 0):
+            raise ArgumentError(f"Recogniser: expected a temperature above 0, got {temperature}")
+        for value in (*network.parameters(), *network.buffers()):
+            if value.is_floating_point():
+                value.data = value.data.half().float()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Recogniser:
+        """A recogniser from its file.
+
+        Raises:
+            BackendError: torch or safetensors is not installed.
+            FileError: there is no such file, or it is damaged or not one of these.
+        """
+        _require_torch()
+        from safetensors import SafetensorError, safe_open
+
+        from wiw.perception.recognition_network import Network
+
+        try:
+            with safe_open(path, framework="pt") as file:
+                header = _header(file.metadata(), path)
+                weights = {name: file.get_tensor(name).float() for name in file.keys()}
+        except (OSError, SafetensorError) as error:
+            raise FileError(
+                f"{path}: expected weights of a recogniser (safetensors): {error}; train some with "
+                f"`wiw train recogniser --out {path}`"
+            ) from error
+        try:
+            network = Network(len(header["categories"]), int(header["width"]))
+            missing, unknown = network.load_state_dict(weights, strict=False)
+            absent = [name for name in missing if not name.endswith("num_batches_tracked")]
+            if absent or unknown:
+                raise ValueError(f"missing {absent}, unknown {list(unknown)}")
+            return cls(network, header["categories"], header["temperature"], header["card"])
+        except (KeyError, TypeError, ValueError, RuntimeError, ArgumentError) as error:
+            raise FileError(
+                f"{path}: header and weights do not make a recogniser ({error}); train it anew with "
+                f"`wiw train recogniser --out {path}`"
+            ) from error
+
+    def save(self, path: str | Path) -> None:
+        """Writes half-precision weights with a JSON header, whole or not at all.
+
+        Raises:
+            FileError: the file cannot be written.
+        """
+        from safetensors.torch import save
+
+        from wiw.perception.recognition_network import state
+
+        header = {
+            "categories": list(self.categories),
+            "width": self.network.width,
+            "temperature": self.temperature,
+            "card": self.card,
+        }
+        weights = {name: value.half().contiguous() for name, value in state(self.network).items()}
+        metadata = {"format": FORMAT, "header": json.dumps(header, sort_keys=True)}
+        path = Path(path)
+        half = path.with_name(f"{path.name}.{os.getpid()}.part")
+        try:
+            half.write_bytes(save(weights, metadata))
+            half.replace(path)
+        except OSError as error:
+            half.unlink(missing_ok=True)
+            raise FileError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+
+    def __call__(self, sets: Sequence[Glimpses], choices: Sequence[str] | None = None) -> NDArray[np.float64]:
+        """What each target is, from all looks at it: float64 [sets, choices], rows sum to 1.
+
+        A target without any look gets equal probabilities. Rows do not depend on what else is asked.
+
+        Args:
+            sets: looks at one target each, real and imagined.
+            choices: what is to be chosen from; None means `categories`. Probabilities of other categories are left out,
+                and the rest scaled to sum to 1.
+
+        Raises:
+            ArgumentError: a choice that the recogniser was not trained on.
+        """
+        columns = self._columns(self.categories if choices is None else choices)
+        return softmax(self.logits(sets)[:, columns], self.temperature)
+
+    def logits(self, sets: Sequence[Glimpses]) -> NDArray[np.float64]:
+        """Float64 [sets, categories], before the temperature."""
+        import torch
+
+        from wiw.perception.recognition_network import pictures
+
+        looks = joined(sets)
+        owners = torch.from_numpy(np.repeat(np.arange(len(sets)), [len(each) for each in sets]))
+        with torch.inference_mode():
+            rows = [
+                self.network.looks(  # one at a time: how rows round may hang on how many there are
+                    pictures(torch.from_numpy(looks.images[i : i + 1]), torch.from_numpy(looks.boxes[i : i + 1])),
+                    torch.from_numpy(looks.scalars[i : i + 1]),
+                )
+                for i in range(len(looks))
+            ]
+            if not rows:
+                return np.zeros((len(sets), len(self.categories)))
+            logits, weights = (torch.cat(column) for column in zip(*rows, strict=True))
+            return self.network.fused(logits, weights, owners, len(sets)).double().numpy()
+
+    def _columns(self, choices: Sequence[str]) -> list[int]:
+        unknown = sorted(set(choices) - set(self.categories))
+        if unknown or not choices:
+            raise ArgumentError(
+                f"the recogniser does not know {', '.join(unknown) or 'an empty list of choices'}; it was trained on "
+                f"{', '.join(self.categories)}: choose among these (categories=[...]), or train another with "
+                "`wiw train recogniser`"
+            )
+        return [self.categories.index(name) for name in choices]
+
+
+def _require_torch() -> None:
+    try:
+        import safetensors  # noqa: F401
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise BackendError(
+            f"the recogniser needs torch and safetensors ({error}): pip install 'wiw[torch]', or for a CPU alone "
+            "pip install torch safetensors --extra-index-url https://download.pytorch.org/whl/cpu"
+        ) from error
+
+
+def _header(metadata: Mapping[str, str] | None, path: str | Path) -> dict[str, Any]:
+    if not metadata or metadata.get("format") != FORMAT:
+        raise FileError(
+            f"{path}: expected the format '{FORMAT}' in its header, got {(metadata or {}).get('format')!r}; these are "
+            "weights of something else, or of another version"
+        )
+    try:
+        header = json.loads(metadata["header"])
+    except (KeyError, ValueError) as error:
+        raise FileError(f"{path}: its header cannot be read ({error}); train it anew") from error
+    if not isinstance(header, dict):
+        raise FileError(f"{path}: expected an object as its header, got {type(header).__name__}; train it anew")
+    return header
