@@ -49,6 +49,7 @@ def calibration_error(probabilities: ArrayLike, labels: ArrayLike, bins: int = 1
     Args:
         probabilities: [N, C], N >= 1.
         labels: int [N].
+        bins: how many.
 
     Raises:
         ArgumentError: arrays of other shapes, or none at all.

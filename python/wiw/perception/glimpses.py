@@ -95,10 +95,12 @@ def glimpses(
 def _glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimpses:
     yaw, pitch = _direction(mask)
     x, y, elevation = _angles(mask, yaw, pitch)
-    close = _quantised(max(np.abs(x).max(), np.abs(y).max()) / FILL)
+    close = _quantised(float(max(np.abs(x).max(), np.abs(y).max())) / FILL)
     fields = [close, _quantised(close * CONTEXT)]
-    extent = np.array([x.min(), -y.max(), x.max(), -y.min()])
-    scalars = [np.arctan(np.ptp(x)), np.arctan(np.ptp(y)), elevation.max(), elevation.min(), float(real)]
+    half = np.pi / image.shape[1]  # of a pixel, whose rays pass through its middle
+    extent = np.array([x.min() - half, -y.max() - half, x.max() + half, half - y.min()])
+    width, height = np.arctan([extent[2] - extent[0], extent[3] - extent[1]])
+    scalars = [width, height, elevation.max() + half, elevation.min() - half, float(real)]
     return Glimpses(
         np.stack([_view(image, yaw, pitch, field) for field in fields])[None],
         np.stack([np.clip((extent / field + 1) / 2, 0, 1) for field in fields])[None].astype(np.float32),

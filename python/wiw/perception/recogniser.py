@@ -68,7 +68,7 @@ class Recogniser:
         try:
             with safe_open(path, framework="pt") as file:
                 header = _header(file.metadata(), path)
-                weights = {name: file.get_tensor(name).float() for name in file.keys()}
+                weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - it is no mapping
         except (OSError, SafetensorError) as error:
             raise FileError(
                 f"{path}: expected weights of a recogniser (safetensors): {error}; train some with "
