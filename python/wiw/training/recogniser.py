@@ -1,0 +1,217 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trains the recogniser: every step shows it sets of looks of changing size, so that it learns what to trust."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wiw._core import core
+from wiw.errors import ArgumentError
+from wiw.perception.calibration import calibration_error, fitted_temperature, softmax
+from wiw.perception.recogniser import Recogniser
+from wiw.perception.recognition_network import Network, pictures
+from wiw.training.looks import IMAGINED, START, TRUE, Looks
+
+COLOURS = [0, 1, 2, 4, 5, 6]
+"""Channels of `pictures` that are not boxes."""
+REAL = 4
+"""Column of `Glimpses.scalars`."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the network is trained."""
+
+    epochs: int = 12
+    batch: int = 48
+    """Sets a step."""
+    width: int = 32
+    """Channels of the first layer."""
+    rate: float = 3e-3
+    decay: float = 0.02
+    smoothing: float = 0.05
+    alone: float = 0.5
+    """Weight of the loss of single looks beside that of sets."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.batch, self.width) < 1:
+            raise ArgumentError(f"Recipe: epochs, batch and width must be positive, got {self}")
+
+
+def train(
+    looks: Looks,
+    categories: Sequence[str],
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    show: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+) -> tuple[Network, Recipe]:
+    """A trained network, and the recipe that would give the same one again.
+
+    Args:
+        looks: to learn from.
+        categories: what `looks.labels` count.
+        recipe: see there.
+        minutes: if given, epochs are left out so that training takes about as long, by the speed of the first steps.
+        show: called after each step with its number, how many there are, and a running mean of the loss.
+    """
+    torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
+    rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
+    network = Network(len(categories), recipe.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=recipe.decay)
+    chances = _chances(looks.labels)
+    an_epoch = max(1, len(looks) // recipe.batch)
+    steps, mean, begin = recipe.epochs * an_epoch, float("nan"), time.monotonic()
+    step = 0
+    while step < steps:
+        for group in optimiser.param_groups:
+            group["lr"] = recipe.rate * _pace(step / steps)
+        sets = rng.choice(len(looks), recipe.batch, p=chances)
+        loss = _loss(network, looks, sets, recipe, rng)
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        step, now = step + 1, float(loss.detach())
+        mean = now if step == 1 else 0.98 * mean + 0.02 * now
+        show(step, steps, mean)
+        if minutes is not None and step == min(25, an_epoch):
+            fitting = minutes * 60 / ((time.monotonic() - begin) / step * an_epoch)
+            steps = max(1, min(recipe.epochs, int(fitting))) * an_epoch
+    return network.eval(), Recipe(**{**asdict(recipe), "epochs": steps // an_epoch})
+
+
+def _pace(done: float) -> float:
+    """Of the learning rate: up over the first 15 %, then down along a cosine."""
+    return done / 0.15 + 0.02 if done < 0.15 else 0.01 + 0.5 * (1 + np.cos(np.pi * (done - 0.15) / 0.85))
+
+
+def _chances(labels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Of each set to be drawn: categories weigh as the square root of their number."""
+    weights = np.bincount(labels)[labels] ** -0.5
+    return weights / weights.sum()
+
+
+def _loss(network: Network, looks: Looks, sets: NDArray[np.int64], recipe: Recipe, rng: np.random.Generator) -> Tensor:
+    rows, owners, real = _drawn(looks, sets, rng)
+    shown, scalars = _varied(looks, rows, owners, real, rng)
+    logits, weights = network.train().looks(shown, scalars)
+    places = torch.from_numpy(owners)
+    targets = torch.from_numpy(looks.labels[sets])
+    entropy = torch.nn.functional.cross_entropy
+    together = entropy(network.fused(logits, weights, places, len(sets)), targets, label_smoothing=recipe.smoothing)
+    return together + recipe.alone * entropy(logits, targets[places], label_smoothing=recipe.smoothing)
+
+
+def _drawn(
+    looks: Looks, sets: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Rows of looks, which of `sets` they are of, and whether they pass for real: the first look, and up to three more.
+
+    What is rendered near by passes for real or for imagined, as an agent may meet it as either.
+    """
+    first = np.searchsorted(looks.owners, sets)
+    behind = np.searchsorted(looks.owners, sets, side="right")
+    rows, owners = [], []
+    for i, (start, end, more) in enumerate(zip(first, behind, rng.integers(0, 4, len(sets)), strict=True)):
+        others = rng.permutation(np.arange(start + 1, end))[:more]
+        rows.append(np.concatenate([[start], others]))
+        owners.append(np.full(len(rows[-1]), i))
+    chosen = np.concatenate(rows)
+    kinds = looks.kinds[chosen]
+    real = (kinds == START) | ((kinds == TRUE) & (rng.random(len(kinds)) < 0.5))
+    return chosen, np.concatenate(owners), real.astype(np.float32)
+
+
+def _varied(
+    looks: Looks,
+    rows: NDArray[np.int64],
+    owners: NDArray[np.int64],
+    real: NDArray[np.float32],
+    rng: np.random.Generator,
+) -> tuple[Tensor, Tensor]:
+    """Pictures and scalars in other light, with boxes a little off, and half of them mirrored."""
+    found = looks.glimpses[rows]
+    extent = found.boxes[..., 2:] - found.boxes[..., :2]
+    off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
+    scalars = found.scalars * rng.uniform(0.96, 1.04, found.scalars.shape)
+    scalars[:, REAL] = real
+    shown = pictures(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
+    light = rng.uniform(0.8, 1.2, (owners.max() + 1, 1)) * rng.uniform(0.92, 1.08, (owners.max() + 1, 3))
+    gain = torch.from_numpy(np.tile(light[owners], 2).astype(np.float32))[:, :, None, None]
+    shown[:, COLOURS] = (shown[:, COLOURS] + 1) * gain - 1
+    mirrored = torch.from_numpy(rng.random(len(rows)) < 0.5)
+    shown = torch.where(mirrored[:, None, None, None], shown.flip(3), shown)
+    return shown.contiguous(memory_format=torch.channels_last), torch.from_numpy(scalars.astype(np.float32))
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+def rows_of(looks: Looks, kind: int, most: int) -> NDArray[np.int64]:
+    """Rows of the first look of each set and of up to `most` more of a kind."""
+    extra = looks.kinds == kind
+    before = np.concatenate([[0], np.cumsum(extra)])
+    rank = before[:-1] - before[np.searchsorted(looks.owners, looks.owners)]
+    return np.flatnonzero((looks.kinds == START) | (extra & (rank < most)))
+
+
+def set_logits(network: Network, looks: Looks, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Float64 [sets, categories] from the looks at `rows`; those that are not the set's first pass for imagined."""
+    found = looks.glimpses[rows]
+    scalars = found.scalars.copy()
+    scalars[:, REAL] = looks.kinds[rows] == START
+    parts = []
+    with torch.inference_mode():
+        for i in range(0, len(rows), 256):
+            part = slice(i, i + 256)
+            shown = pictures(torch.from_numpy(found.images[part]), torch.from_numpy(found.boxes[part]))
+            parts.append(network.eval().looks(shown, torch.from_numpy(scalars[part])))
+        logits, weights = (torch.cat(column) for column in zip(*parts, strict=True))
+        return network.fused(logits, weights, torch.from_numpy(looks.owners[rows]), len(looks)).double().numpy()
+
+
+VIEWS = {"start": (START, 0)} | {
+    f"start + {count} {name}": (kind, count)
+    for name, kind in (("imagined", IMAGINED), ("true", TRUE))
+    for count in (1, 2, 3)
+}
+"""What accuracy is measured with; true ones are what a perfect world model would imagine."""
+
+
+def calibrated(
+    network: Network, categories: Sequence[str], calibration: Looks, held_out: Looks, card: dict[str, Any]
+) -> Recogniser:
+    """A recogniser whose temperature suits `calibration`, with its accuracy and calibration error on `held_out`."""
+    recogniser = Recogniser(network, categories)
+    few = [VIEWS["start"], VIEWS["start + 3 imagined"], VIEWS["start + 3 true"]]
+    fitting = np.concatenate([set_logits(network, calibration, rows_of(calibration, *view)) for view in few])
+    recogniser.temperature = fitted_temperature(fitting, np.tile(calibration.labels, len(few)))
+    logits = {name: set_logits(network, held_out, rows_of(held_out, *view)) for name, view in VIEWS.items()}
+    pooled, labels = np.concatenate(list(logits.values())), np.tile(held_out.labels, len(logits))
+    recogniser.card = {
+        **card,
+        "held_out_sets": len(held_out),
+        "accuracy": {name: _accuracy(values, held_out.labels) for name, values in logits.items()},
+        "calibration_error": {
+            "before": round(calibration_error(softmax(pooled), labels), 4),
+            "after": round(calibration_error(softmax(pooled, recogniser.temperature), labels), 4),
+        },
+        "accuracy_by_category": {
+            name: _accuracy(logits["start"][held_out.labels == i], held_out.labels[held_out.labels == i])
+            for i, name in enumerate(categories)
+            if (held_out.labels == i).any()
+        },
+    }
+    return recogniser
+
+
+def _accuracy(logits: NDArray[np.float64], labels: NDArray[np.int64]) -> float:
+    return round(float((logits.argmax(axis=1) == labels).mean()), 4)
