@@ -22,7 +22,7 @@ PYTHON_ROWS = [
     FACES,
     {"datasets", "metrics", "perception"},
     {"envs", "policies", "world_models"},
-    {"tasks", "loop"},
+    {"tasks", "loop", "training"},
     {"evaluation"},
     {"viz"},
     {"cli"},

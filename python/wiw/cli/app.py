@@ -22,6 +22,7 @@ from wiw.cli.run import resume, run
 from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
+from wiw.cli.train import train
 from wiw.cli.verify import verify
 from wiw.cli.view import view
 from wiw.errors import Error
@@ -52,6 +53,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
+    (train, "train", "Train the recogniser of Active Recognition."),
 )
 
 EXIT_ERROR, EXIT_INTERRUPTED = 2, 130

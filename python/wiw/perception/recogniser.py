@@ -60,7 +60,7 @@ class Recogniser:
             BackendError: torch or safetensors is not installed.
             FileError: there is no such file, or it is damaged or not one of these.
         """
-        _require_torch()
+        require_torch()
         from safetensors import SafetensorError, safe_open
 
         from wiw.perception.recognition_network import Network
@@ -162,7 +162,8 @@ class Recogniser:
         return [self.categories.index(name) for name in choices]
 
 
-def _require_torch() -> None:
+def require_torch() -> None:
+    """Raises a BackendError that says how to install torch and safetensors, unless they are."""
     try:
         import safetensors  # noqa: F401
         import torch  # noqa: F401

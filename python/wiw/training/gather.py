@@ -75,16 +75,13 @@ def _made(
 
 def _make(name: str, file: Path, categories: Sequence[str], seed: int, rules: LookRules) -> str:
     looks = look_around(world(name), seed, categories, rules)
-    values = (*_columns(looks.glimpses), looks.owners, looks.kinds, looks.labels)
+    found = looks.glimpses
+    values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
     part = file.with_name(f"{file.stem}.{os.getpid()}.part")
     with part.open("wb") as stream:
-        np.savez(stream, **dict(zip(FIELDS, values, strict=True)))
+        np.savez(stream, allow_pickle=False, **dict(zip(FIELDS, values, strict=True)))
     part.replace(file)
     return name
-
-
-def _columns(found: Glimpses) -> tuple[np.ndarray, ...]:
-    return found.images, found.boxes, found.scalars
 
 
 def _read(file: Path) -> Looks | None:

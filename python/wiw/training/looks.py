@@ -77,6 +77,23 @@ def merged(parts: Sequence[Looks]) -> Looks:
     )
 
 
+def halves(looks: Looks) -> tuple[Looks, Looks]:
+    """The first half of the sets and the second: other scenes, as sets come scene by scene.
+
+    Raises:
+        ArgumentError: there is but one set.
+    """
+    middle = len(looks) // 2
+    if not middle:
+        raise ArgumentError("expected at least two sets of looks to calibrate with and to measure on; name more scenes")
+    cut = int(np.searchsorted(looks.owners, middle))
+    rows = np.arange(len(looks.owners))
+    return (
+        Looks(looks.glimpses[rows[:cut]], looks.owners[:cut], looks.kinds[:cut], looks.labels[:middle]),
+        Looks(looks.glimpses[rows[cut:]], looks.owners[cut:] - middle, looks.kinds[cut:], looks.labels[middle:]),
+    )
+
+
 def look_around(
     world: World, seed: int, categories: Sequence[str] = CATEGORIES, rules: LookRules = LookRules()
 ) -> Looks:

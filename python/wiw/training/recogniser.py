@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -60,32 +60,48 @@ def train(
         looks: to learn from.
         categories: what `looks.labels` count.
         recipe: see there.
-        minutes: if given, epochs are left out so that training takes about as long, by the speed of the first steps.
+        minutes: if given, epochs are left out so that training takes about as long, by the speed of some trial steps.
         show: called after each step with its number, how many there are, and a running mean of the loss.
     """
-    torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
-    rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
-    network = Network(len(categories), recipe.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    optimiser = torch.optim.AdamW(network.parameters(), recipe.rate, weight_decay=recipe.decay)
-    chances = _chances(looks.labels)
     an_epoch = max(1, len(looks) // recipe.batch)
-    steps, mean, begin = recipe.epochs * an_epoch, float("nan"), time.monotonic()
-    step = 0
-    while step < steps:
-        for group in optimiser.param_groups:
-            group["lr"] = recipe.rate * _pace(step / steps)
-        sets = rng.choice(len(looks), recipe.batch, p=chances)
-        loss = _loss(network, looks, sets, recipe, rng)
-        optimiser.zero_grad(set_to_none=True)
+    if minutes is not None:
+        seconds = _Lesson(looks, categories, recipe).seconds_a_step()
+        recipe = replace(recipe, epochs=max(1, min(recipe.epochs, int(60 * minutes / (seconds * an_epoch)))))
+    lesson = _Lesson(looks, categories, recipe)
+    steps, mean = recipe.epochs * an_epoch, float("nan")
+    for step in range(steps):
+        loss = lesson.step(recipe.rate * _pace(step / steps))
+        mean = loss if step == 0 else 0.98 * mean + 0.02 * loss
+        show(step + 1, steps, mean)
+    return lesson.network.eval(), recipe
+
+
+class _Lesson:
+    """A network in training, with all that its next step depends on."""
+
+    def __init__(self, looks: Looks, categories: Sequence[str], recipe: Recipe) -> None:
+        torch.manual_seed(core.fold_key([recipe.seed, 0x4C01]) % 2**63)
+        self.looks, self.recipe = looks, recipe
+        self.network = Network(len(categories), recipe.width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C02]))
+        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self._chances = _chances(looks.labels)
+
+    def step(self, rate: float) -> float:
+        """Learns from one batch of sets; its loss."""
+        for group in self._optimiser.param_groups:
+            group["lr"] = rate
+        sets = self._rng.choice(len(self.looks), self.recipe.batch, p=self._chances)
+        loss = _loss(self.network, self.looks, sets, self.recipe, self._rng)
+        self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        optimiser.step()
-        step, now = step + 1, float(loss.detach())
-        mean = now if step == 1 else 0.98 * mean + 0.02 * now
-        show(step, steps, mean)
-        if minutes is not None and step == min(25, an_epoch):
-            fitting = minutes * 60 / ((time.monotonic() - begin) / step * an_epoch)
-            steps = max(1, min(recipe.epochs, int(fitting))) * an_epoch
-    return network.eval(), Recipe(**{**asdict(recipe), "epochs": steps // an_epoch})
+        self._optimiser.step()
+        return float(loss.detach())
+
+    def seconds_a_step(self, trials: int = 10) -> float:
+        """Median time of some steps after the first two, which are slow."""
+        moments = [time.monotonic() for _ in range(trials) if self.step(0.0) is not None]
+        return float(np.median(np.diff(moments[1:])))
 
 
 def _pace(done: float) -> float:
