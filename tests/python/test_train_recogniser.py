@@ -48,6 +48,15 @@ def made_up(sets: int, seed: int) -> Looks:
     return Looks(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Threads that wait for each other spin: on a busy machine two are slower than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
 def lesson() -> Any:
     from wiw.training.recogniser import Recipe, calibrated, train
@@ -77,18 +86,23 @@ def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
     with torch.inference_mode():
         shown = pictures(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
         weights = lesson[0].network.looks(shown, torch.from_numpy(looks.scalars))[1].numpy()
-    telling = ~red & (np.ptp(looks.images[:, 0, ..., 1].reshape(len(red), -1), axis=1) > 0)
+    blocks = looks.images[:, 0, ..., 1].reshape(-1, SIDE // 4, 4, SIDE // 4, 4).mean(axis=(2, 4))
+    telling = ~red & (blocks.std(axis=(1, 2)) > 15)
     assert weights[red].mean() < 0.7 * weights[telling].mean()
 
 
 def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
     from wiw.perception.calibration import calibration_error, softmax
-    from wiw.training.recogniser import set_logits
+    from wiw.training.recogniser import Recipe, calibrated, set_logits, train
 
     recogniser, held_out = lesson
-    error = recogniser.card["calibration_error"]
-    assert error["after"] <= error["before"] + 0.005
-    assert error["after"] < 0.08
+    assert recogniser.card["calibration_error"]["after"] < 0.08
+    few = made_up(40, 7)  # learnt by heart
+    network, _ = train(few, NAMES, Recipe(epochs=40, batch=20, width=8, smoothing=0.0))
+    overfitted = calibrated(network, NAMES, *halves(made_up(400, 8)), {})
+    assert overfitted.temperature > 1.2
+    error = overfitted.card["calibration_error"]
+    assert error["after"] < 0.7 * error["before"]
     rows = np.flatnonzero(held_out.kinds == START)
     logits = set_logits(recogniser.network, held_out, rows)
     for wrong in (0.3 * recogniser.temperature, 4 * recogniser.temperature):
@@ -127,31 +141,30 @@ def test_looks_are_counted_through(lesson: Any) -> None:
         halves(first)
 
 
-def test_the_command_trains_on_apartments(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.slow
+def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from wiw.perception.recogniser import Recogniser
 
     names = ["bed", "chair", "plant", "shower", "television", "toilet"]
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
-    command = ["train", "recogniser", "--scenes", "apartments:train:1", "--val", "apartments:val:1", "--places", "16"]
+    command = ["train", "recogniser", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "20"]
     options = ["--out", str(out), "--cache", str(cache), "--workers", "1", "--categories", *names]
-    assert main([*command, *options, "--epochs", "40", "--minutes", "0.15"]) == 0
+    assert main([*command, *options, "--epochs", "60", "--minutes", "None"]) == 0
     assert "calibration error" in capsys.readouterr().out
     card = Recogniser.load(out).card
     assert card["accuracy"]["start"] > 2.5 / len(names)
     assert card["accuracy"]["start + 3 true"] > 2.5 / len(names)
     assert out.stat().st_size < 2 * 2**20
-    assert card["scenes"] == "apartments:train:1"
+    assert card["scenes"] == "apartments:train:2"
 
     made = sorted(cache.iterdir())  # the second time nothing is looked at anew, but what was damaged
-    assert [file.suffix for file in made] == [".npz"] * 2
+    assert [file.suffix for file in made] == [".npz"] * 3
     whole = [file.read_bytes() for file in made]
     made[0].write_bytes(whole[0][:1000])
-    before = made[1].stat().st_mtime_ns
+    before = made[2].stat().st_mtime_ns
     assert main([*command, *options, "--epochs", "1"]) == 0
     assert np.load(made[0])["images"].tobytes() == np.load(_written(tmp_path, whole[0]))["images"].tobytes()
-    assert made[1].stat().st_mtime_ns == before
+    assert made[2].stat().st_mtime_ns == before
 
 
 def _written(folder: Path, content: bytes) -> Path:

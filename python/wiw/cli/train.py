@@ -18,7 +18,7 @@ def train(
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:train:50",
     val: Annotated[str, arg(metavar="SPEC")] = "apartments:val:12",
     categories: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
-    epochs: Annotated[int, arg(metavar="N")] = 12,
+    epochs: Annotated[int, arg(metavar="N")] = 25,
     minutes: Annotated[float | None, arg(metavar="MIN")] = 6.0,
     places: Annotated[int, arg(metavar="N")] = 16,
     seed: Annotated[int, arg(metavar="N")] = 0,

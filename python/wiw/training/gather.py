@@ -79,7 +79,7 @@ def _make(name: str, file: Path, categories: Sequence[str], seed: int, rules: Lo
     values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
     part = file.with_name(f"{file.stem}.{os.getpid()}.part")
     with part.open("wb") as stream:
-        np.savez(stream, allow_pickle=False, **dict(zip(FIELDS, values, strict=True)))
+        np.savez(stream, **dict(zip(FIELDS, values, strict=True)))  # type: ignore[arg-type]
     part.replace(file)
     return name
 

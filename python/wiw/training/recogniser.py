@@ -30,7 +30,7 @@ REAL = 4
 class Recipe:
     """How the network is trained."""
 
-    epochs: int = 12
+    epochs: int = 25
     batch: int = 48
     """Sets a step."""
     width: int = 32
@@ -207,9 +207,8 @@ def calibrated(
 ) -> Recogniser:
     """A recogniser whose temperature suits `calibration`, with its accuracy and calibration error on `held_out`."""
     recogniser = Recogniser(network, categories)
-    few = [VIEWS["start"], VIEWS["start + 3 imagined"], VIEWS["start + 3 true"]]
-    fitting = np.concatenate([set_logits(network, calibration, rows_of(calibration, *view)) for view in few])
-    recogniser.temperature = fitted_temperature(fitting, np.tile(calibration.labels, len(few)))
+    fitting = np.concatenate([set_logits(network, calibration, rows_of(calibration, *view)) for view in VIEWS.values()])
+    recogniser.temperature = fitted_temperature(fitting, np.tile(calibration.labels, len(VIEWS)))
     logits = {name: set_logits(network, held_out, rows_of(held_out, *view)) for name, view in VIEWS.items()}
     pooled, labels = np.concatenate(list(logits.values())), np.tile(held_out.labels, len(logits))
     recogniser.card = {
