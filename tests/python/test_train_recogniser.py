@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -93,16 +94,16 @@ def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
 
 def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
     from wiw.perception.calibration import calibration_error, softmax
-    from wiw.training.recogniser import Recipe, calibrated, set_logits, train
+    from wiw.training.recogniser import calibrated, set_logits
 
     recogniser, held_out = lesson
     assert recogniser.card["calibration_error"]["after"] < 0.08
-    few = made_up(40, 7)  # learnt by heart
-    network, _ = train(few, NAMES, Recipe(epochs=40, batch=20, width=8, smoothing=0.0))
-    overfitted = calibrated(network, NAMES, *halves(made_up(400, 8)), {})
-    assert overfitted.temperature > 1.2
-    error = overfitted.card["calibration_error"]
-    assert error["after"] < 0.7 * error["before"]
+    rng = np.random.default_rng(9)  # where every fourth thing is another than it seems, the network is too sure
+    odd = rng.random(len(held_out)) < 0.25
+    strange = replace(held_out, labels=np.where(odd, (held_out.labels + 1) % 3, held_out.labels))
+    modest = calibrated(recogniser.network, NAMES, *halves(strange), {})
+    assert modest.temperature > 1.3 * recogniser.temperature
+    assert modest.card["calibration_error"]["after"] < 0.7 * modest.card["calibration_error"]["before"]
     rows = np.flatnonzero(held_out.kinds == START)
     logits = set_logits(recogniser.network, held_out, rows)
     for wrong in (0.3 * recogniser.temperature, 4 * recogniser.temperature):
