@@ -93,8 +93,7 @@ def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
 
 
 def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
-    from wiw.perception.calibration import calibration_error, softmax
-    from wiw.training.recogniser import calibrated, set_logits
+    from wiw.training.recogniser import calibrated
 
     recogniser, held_out = lesson
     assert recogniser.card["calibration_error"]["after"] < 0.08
@@ -104,11 +103,6 @@ def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
     modest = calibrated(recogniser.network, NAMES, *halves(strange), {})
     assert modest.temperature > 1.3 * recogniser.temperature
     assert modest.card["calibration_error"]["after"] < 0.7 * modest.card["calibration_error"]["before"]
-    rows = np.flatnonzero(held_out.kinds == START)
-    logits = set_logits(recogniser.network, held_out, rows)
-    for wrong in (0.3 * recogniser.temperature, 4 * recogniser.temperature):
-        off = calibration_error(softmax(logits, wrong), held_out.labels)
-        assert off > calibration_error(softmax(logits, recogniser.temperature), held_out.labels) + 0.05
 
 
 def test_the_same_lesson_gives_the_same_network() -> None:
