@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Active Recognition without a language model: the trained recogniser answers, and imagines what a plan would tell it."""
+"""Active Recognition without a language model: the trained recogniser answers, and judges plans by it."""
 
 from __future__ import annotations
 

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recogniser as a policy: it steers to where more is to be seen, and answers from real and imagined looks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_active_recognition import CHOICES, Sink, a_file
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.visibility import visible_share
+from wiw.datasets.worlds import world
+from wiw.loop.scheduler import run_episodes
+from wiw.policies.recogniser import steering
+from wiw.tasks.ar import AR
+from wiw.types import Proposal
+
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+
+def panorama_of(place: Any, position: Any, yaw: float, name: str) -> tuple[Any, Any, int]:
+    thing = next(int(i["id"]) for i in place.scene.instances if i["name"] == name)
+    shown = place.renderer.panorama(camera_pose(np.asarray(position, float), yaw), outputs=("depth", "instance"))
+    return shown["instance"][0] == thing, shown["depth"][0], thing
+
+
+# -- steering ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.2, -2.5])
+def test_sight_is_where_the_thing_is(two_rooms: str, yaw: float) -> None:
+    mask, depth, _ = panorama_of(world(two_rooms), (-1.2, 0, -1.2), yaw, "table")
+    seen = steering.sight(mask, depth)
+    assert np.degrees(seen.bearing) == pytest.approx((90 - np.degrees(yaw) + 180) % 360 - 180, abs=3)  # 1 m to the west
+    assert 1.0 < seen.distance < 1.8
+    assert seen.side == 0
+    assert steering.sight(np.zeros_like(mask), depth) is None
+
+
+@pytest.mark.parametrize("start", [(-1.0, 0, 1.2), (-0.6, 0, 1.0)])
+def test_the_side_of_a_detour_is_where_more_is_seen(two_rooms: str, start: Any) -> None:
+    place = world(two_rooms)
+    mask, depth, thing = panorama_of(place, start, -np.pi / 2, "shelf")  # through the door, behind the wall beside it
+    seen = steering.sight(mask, depth)
+    assert seen.side != 0
+    left, right = (visible_share(place, np.array(start) + [0, 0, step], thing) for step in (-0.15, 0.15))
+    assert seen.side == (1 if left > right else -1)
+    assert abs(left - right) > 0.05
+    first = steering.headings(seen, seen.bearing, 0)[0]
+    assert (first - seen.bearing) * seen.side > 0
+
+
+def test_clearance_is_the_way_to_the_walls(two_rooms: str) -> None:
+    _, depth, _ = panorama_of(world(two_rooms), (-1.2, 0, -1.2), 0.0, "table")
+    free = steering.clearance(depth)
+    assert free[0] == pytest.approx(0.8, abs=0.05)  # the wall in the north
+    assert free[8] == pytest.approx(3.2, abs=0.1)
+    assert free[4] == pytest.approx(1.0, abs=0.1)  # the table in the west
+    assert free[12] == pytest.approx(1.15, abs=0.1)  # the partition in the east
+
+
+@given(st.floats(-4, 4), st.lists(st.floats(0, 5), min_size=16, max_size=16), st.integers(1, 6))
+def test_plans_are_turns_and_then_steps_where_it_is_free(heading: float, free: list[float], horizon: int) -> None:
+    plan = steering.plan(heading, np.array(free), horizon).tolist()
+    assert 1 <= len(plan) <= horizon
+    turns = [action for action in plan if action != FORWARD]
+    assert plan == turns + [FORWARD] * (len(plan) - len(turns))
+    assert len(set(turns)) <= 1
+    steps = len(plan) - len(turns)
+    if steps:
+        assert set(turns) <= {TURN_LEFT, TURN_RIGHT}
+        direction = len(turns) * (1 if TURN_LEFT in turns else -1)
+        assert 0.2 * steps <= free[direction % 16]
+
+
+def test_a_plan_goes_round_what_is_in_the_way() -> None:
+    free = np.full(16, 3.0)
+    assert steering.plan(np.pi / 4, free, 4).tolist() == [TURN_LEFT, TURN_LEFT, FORWARD, FORWARD]
+    free[2] = 0.3
+    assert steering.plan(np.pi / 4, free, 4).tolist() == [TURN_LEFT, FORWARD, FORWARD, FORWARD]
+    assert steering.plan(np.pi, np.zeros(16), 3).tolist().count(FORWARD) == 0
+
+
+def test_what_is_large_or_hidden_is_passed_aside_and_what_is_small_is_neared() -> None:
+    small = steering.Sight(0.5, 3.0, np.radians(10), 0.0, 0.0)
+    assert steering.headings(small, 0.5, 0)[0] == 0.5
+    assert steering.headings(replace(small, size=np.radians(60)), 0.5, -1)[0] < 0.5
+    assert steering.headings(replace(small, hidden_left=0.8), 0.5, 1)[0] < 0.5
+    assert steering.headings(None, -1.0, 1)[0] == -1.0
+
+
+# -- answers -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of a network that has learnt nothing, but tells different looks apart."""
+    from wiw.perception.recogniser import Recogniser
+    from wiw.perception.recognition_network import Network
+
+    torch.manual_seed(2)
+    network = Network(len(CHOICES), 8)
+    torch.nn.init.normal_(network.logits.weight)
+    file = tmp_path_factory.mktemp("weights") / "weights.safetensors"
+    Recogniser(network, CHOICES).save(file)
+    return file
+
+
+def policy(weights: Path, **options: Any) -> Any:
+    from wiw.policies.recogniser import Recognition
+
+    return Recognition(weights, **options)
+
+
+def answers(task: Any, agent: Any, live: int = 4, episodes: int = 1) -> list[list[float]]:
+    sink = Sink()
+    numbered = [(i, replace(task.episodes(1)[0], start_yaw=0.7 * i)) for i in range(episodes)]
+    run_episodes(task, agent.settled(task.defaults), numbered, seed=0, live=live, sink=sink)
+    assert [result.status for result in sink.results] == ["done"] * episodes
+    return [
+        [list(row.decision.answer.probabilities) for row in sink.decisions if row.episode == i] for i in range(episodes)
+    ]
+
+
+@pytest.mark.parametrize("model", [None, "warp"])
+def test_answers_do_not_depend_on_what_else_is_live(two_rooms: str, tmp_path: Path, weights: Path, model: Any) -> None:
+    task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=3)
+    agent = wiw.Agent(policy(weights), model)
+    together, alone = answers(task, agent, 2, 2), answers(task, agent, 1, 2)
+    assert together == alone
+    assert together[0] != together[1]
+
+
+def test_imagined_looks_change_the_answer_and_turned_real_ones_do_not(
+    two_rooms: str, tmp_path: Path, weights: Path
+) -> None:
+    task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=1)
+    blind = answers(task, wiw.Agent(policy(weights)))
+    imagined = answers(task, wiw.Agent(policy(weights), "warp"))
+    assert np.abs(np.subtract(blind, imagined)).max() > 1e-3
+
+    class Turner(type(policy(weights))):  # type: ignore[misc]
+        def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+            return [[Proposal(np.array([TURN_LEFT, TURN_LEFT], np.int8))] for _ in situations]
+
+    assert answers(task, wiw.Agent(Turner(weights), "warp")) == blind
+
+
+def test_a_plan_that_loses_the_target_scores_less(two_rooms: str, tmp_path: Path, weights: Path) -> None:
+    from wiw.policies.base import Situation
+    from wiw.types import Rollout
+
+    task = AR(episode_file=a_file(tmp_path, two_rooms))
+    env = task.environment(depth=True)
+    observation = env.begin(task.episode(0))
+    answerer = policy(weights)
+    situation = Situation(observation, env.goal, wiw.Key(0, 0), answerer.begin(env.goal, wiw.Key(0, 0)))
+    answerer.observe([situation])
+    gone = replace(observation, target=replace(observation.target, mask=np.zeros_like(observation.target.mask)))
+    plans = [Proposal(np.array([FORWARD], np.int8))]
+    futures = [Rollout(observation.panorama[None], np.zeros(1, bool), "panorama")]
+    (kept,), (lost,) = (
+        answerer.score([replace(situation, observation=seen)], [plans], [futures])[0] for seen in (observation, gone)
+    )
+    sure = answerer.recogniser([situation.memory.looks[0][1]], CHOICES).max()
+    assert lost == pytest.approx(sure - answerer.lost)
+    assert kept > lost
+
+
+def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: Path) -> None:
+    from wiw.perception.tracking import Track
+    from wiw.types import Rollout
+
+    task = AR(episode_file=a_file(tmp_path, two_rooms, yaw=np.pi / 2))
+    observation = task.environment(depth=True).begin(task.episode(0))
+    frames = observation.front[None]
+    mask = wiw.panorama.to_perspective(observation.target.mask.astype(np.uint8), 90.0, (480, 480), 0.0, 0.0, "nearest")
+    track = Track(mask[None] > 0, (observation.target.front_box,))
+    look = policy(weights)._looks(Rollout(frames, np.zeros(1, bool), "front"), track)
+    from wiw.perception.glimpses import glimpses
+
+    real, _ = glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
+    np.testing.assert_allclose(look.scalars, real.scalars, atol=0.02)
+    assert np.abs(look.images[0, 0].astype(int) - real.images[0, 0]).mean() < 6
+
+
+def test_it_is_told_by_its_weights(weights: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.safetensors"
+    from wiw.perception.recogniser import Recogniser
+    from wiw.perception.recognition_network import Network
+
+    Recogniser(Network(4, 8), CHOICES).save(other)
+    assert policy(weights).describe() == policy(weights).describe() != policy(other).describe()
