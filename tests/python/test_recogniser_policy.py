@@ -21,7 +21,7 @@ from wiw.datasets.worlds import world
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.recogniser import steering
 from wiw.tasks.ar import AR
-from wiw.types import Proposal
+from wiw.types import Key, Proposal, Rollout
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
@@ -51,7 +51,7 @@ def test_the_side_of_a_detour_is_where_more_is_seen(two_rooms: str, start: Any) 
     mask, depth, thing = panorama_of(place, start, -np.pi / 2, "shelf")  # through the door, behind the wall beside it
     seen = steering.sight(mask, depth)
     assert seen.side != 0
-    left, right = (visible_share(place, np.array(start) + [0, 0, step], thing) for step in (-0.15, 0.15))
+    left, right = (visible_share(place, np.add(start, (0, 0, step)), thing) for step in (-0.15, 0.15))
     assert seen.side == (1 if left > right else -1)
     assert abs(left - right) > 0.05
     first = steering.headings(seen, seen.bearing, 0)[0]
@@ -62,7 +62,7 @@ def test_clearance_is_the_way_to_the_walls(two_rooms: str) -> None:
     _, depth, _ = panorama_of(world(two_rooms), (-1.2, 0, -1.2), 0.0, "table")
     free = steering.clearance(depth)
     assert free[0] == pytest.approx(0.8, abs=0.05)  # the wall in the north
-    assert free[8] == pytest.approx(3.2, abs=0.1)
+    assert free[8] == pytest.approx(3.0, abs=0.1)  # the partition, beside the way to the wall in the south
     assert free[4] == pytest.approx(1.0, abs=0.1)  # the table in the west
     assert free[12] == pytest.approx(1.15, abs=0.1)  # the partition in the east
 
@@ -156,13 +156,12 @@ def test_imagined_looks_change_the_answer_and_turned_real_ones_do_not(
 
 def test_a_plan_that_loses_the_target_scores_less(two_rooms: str, tmp_path: Path, weights: Path) -> None:
     from wiw.policies.base import Situation
-    from wiw.types import Rollout
 
     task = AR(episode_file=a_file(tmp_path, two_rooms))
     env = task.environment(depth=True)
     observation = env.begin(task.episode(0))
     answerer = policy(weights)
-    situation = Situation(observation, env.goal, wiw.Key(0, 0), answerer.begin(env.goal, wiw.Key(0, 0)))
+    situation = Situation(observation, env.goal, Key(0, 0), answerer.begin(env.goal, Key(0, 0)))
     answerer.observe([situation])
     gone = replace(observation, target=replace(observation.target, mask=np.zeros_like(observation.target.mask)))
     plans = [Proposal(np.array([FORWARD], np.int8))]
@@ -177,7 +176,6 @@ def test_a_plan_that_loses_the_target_scores_less(two_rooms: str, tmp_path: Path
 
 def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: Path) -> None:
     from wiw.perception.tracking import Track
-    from wiw.types import Rollout
 
     task = AR(episode_file=a_file(tmp_path, two_rooms, yaw=np.pi / 2))
     observation = task.environment(depth=True).begin(task.episode(0))
@@ -189,7 +187,9 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
 
     real, _ = glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
     np.testing.assert_allclose(look.scalars, real.scalars, atol=0.02)
-    assert np.abs(look.images[0, 0].astype(int) - real.images[0, 0]).mean() < 6
+    inside = look.images[0, 0].max(axis=-1) > 0  # nothing is known of what lies beyond the front view
+    assert 0.3 < inside.mean() < 1
+    assert np.abs(look.images[0, 0].astype(int) - real.images[0, 0])[inside].mean() < 6
 
 
 def test_it_is_told_by_its_weights(weights: Path, tmp_path: Path) -> None:
