@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.panorama import directions
 from wiw.perception.boxes import box_of, largest_part, scaled, width_of
 from wiw.perception.growing import Growing, grown
-from wiw.perception.tracking import Reprojection, Tracker, _without_specks, track_rollouts
+from wiw.perception.tracking import Reprojection, Tracker, moved_masks, track_rollouts, without_specks
 from wiw.perception.views import target_views
 from wiw.registry import TRACKERS
 from wiw.types import Observation, Proposal, Rollout, Target
@@ -114,7 +114,7 @@ def test_growth_keeps_the_seed_and_stays_in_what_was_not_seen(seed: int, shift: 
 def test_a_hairline_is_no_sight_of_a_target() -> None:
     masks = np.zeros((3, 6, 8), bool)
     masks[0, 1:5, 3] = masks[1, 2, 1:6] = masks[2, 1:5, 3:5] = True
-    np.testing.assert_array_equal(_without_specks(masks).any(axis=(1, 2)), [False, False, True])
+    np.testing.assert_array_equal(without_specks(masks).any(axis=(1, 2)), [False, False, True])
 
 
 def test_a_lost_target_has_no_box(two_rooms: str) -> None:
@@ -153,6 +153,18 @@ def test_rows_do_not_depend_on_what_else_is_tracked(two_rooms: str) -> None:
             assert track.boxes == alone.boxes
     with pytest.raises(ArgumentError, match="all 'panorama' or all 'front'"):
         track_rollouts(Reprojection(), [one], [plans[:1]], [[Rollout(frames[:6, None], np.zeros(6, bool), "surround")]])
+
+
+def test_several_masks_are_moved_at_once_as_one_by_one(two_rooms: str) -> None:
+    observation, frames, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
+    poses = to_viewpoints(PLAN[:3])
+    masks = np.stack([np.roll(observation.target.mask, shift, axis=1) for shift in (0, 200, 400, 600)])
+    together, _ = moved_masks(masks, observation.depth, poses, (576, 1024))
+    for mask, moved in zip(masks, together, strict=True):
+        alone = replace(observation, target=replace(observation.target, mask=mask))
+        tracked = Reprojection().track([alone], [poses], [frames[:3]])[0].masks
+        np.testing.assert_array_equal(without_specks(moved), tracked)
+    assert together.any(axis=(1, 2, 3)).all()
 
 
 def test_a_tracker_says_what_it_lacks(two_rooms: str) -> None:

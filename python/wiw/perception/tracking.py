@@ -71,7 +71,7 @@ class Tracker(ABC):
             ArgumentError: an observation without a target, or without what the tracker needs; arrays of other shapes.
         """
         _check(self, observations, viewpoints, frames)
-        found = [_without_specks(masks) for masks in self.masks(observations, viewpoints, frames, panoramic)]
+        found = [without_specks(masks) for masks in self.masks(observations, viewpoints, frames, panoramic)]
         return [Track(masks, tuple(box_of(mask, wraps=panoramic) for mask in masks)) for masks in found]
 
 
@@ -150,11 +150,38 @@ def _moved(
     assert depth is not None
     if not len(poses) or not mask.any():
         return np.zeros((len(poses), *size), bool), np.ones((len(poses), *size), bool)
-    painted = np.repeat(mask[None, :, :, None], 3, axis=3).astype(np.uint8) * 255
-    hfov = None if panoramic else FRONT_HFOV
-    shown = warp(painted, depth[None], poses[None], size=size, target_hfov_deg=hfov, outputs=("color", "hole"))
-    hole = shown["hole"][0]
-    return (shown["color"][0, ..., 0] > 127) & ~hole, hole
+    seen, hole = moved_masks(mask[None], depth, poses, size, None if panoramic else FRONT_HFOV)
+    return seen[0], hole
+
+
+def moved_masks(
+    masks: NDArray[np.bool_],
+    depth: NDArray[np.float32],
+    poses: NDArray[np.float64],
+    size: tuple[int, int],
+    hfov_deg: float | None = None,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Masks of a panorama as seen from other poses, bool [T, K, h, w], three for the price of one.
+
+    Also what the panorama did not show of the new views, bool [K, h, w].
+
+    Args:
+        masks: bool [T, H, W], T >= 1.
+        depth: float32 [H, W], distance along the ray.
+        poses: float64 [K, 4, 4], K >= 1, in the frame of the panorama.
+        size: (h, w) of the results.
+        hfov_deg: of perspective results; None for panoramas.
+    """
+    seen = np.empty((len(masks), len(poses), *size), bool)
+    for first in range(0, len(masks), 3):
+        some = masks[first : first + 3]
+        painted = np.zeros((1, *depth.shape, 3), np.uint8)
+        painted[0, ..., : len(some)] = np.moveaxis(some, 0, -1) * np.uint8(255)
+        shown = warp(painted, depth[None], poses[None], size=size, target_hfov_deg=hfov_deg, outputs=("color", "hole"))
+        hole = shown["hole"][0]
+        marked = (shown["color"][0, ..., : len(some)] > 127) & ~hole[..., None]
+        seen[first : first + 3] = np.moveaxis(marked, -1, 0)
+    return seen, hole
 
 
 def target_of(observation: Observation) -> Target:
@@ -180,7 +207,7 @@ def _size(frames: NDArray[np.uint8]) -> tuple[int, int]:
     return int(frames.shape[1]), int(frames.shape[2])
 
 
-def _without_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def without_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The masks, emptied where nothing is two pixels wide and high: specks at the rims of things are no sight of it."""
     wide = masks[:, :, :-1] & masks[:, :, 1:]
     seen = np.asarray((wide[:, :-1] & wide[:, 1:]).any(axis=(1, 2)))

@@ -16,11 +16,9 @@ from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.visibility import COARSE, seen
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
-from wiw.perception.boxes import box_of
 from wiw.perception.glimpses import Glimpses, glimpses, joined
-from wiw.perception.tracking import Reprojection
+from wiw.perception.tracking import moved_masks, without_specks
 from wiw.reproject import warp
-from wiw.types import Observation, Target
 
 START, TRUE, IMAGINED = 0, 1, 2
 """Kinds of looks: from the place itself; rendered, or reprojected from the place, at one near by."""
@@ -144,14 +142,15 @@ def _from_place(
     imagined = warp(color[:1], depth[None], relative[None])[0] if len(relative) else color[1:]
     panoramas = np.concatenate([color, imagined])
     kinds = np.repeat([START, TRUE, IMAGINED], [1, len(relative), len(relative)])
+    things = _things(ids[0], labels, tally, rules)
+    if not things:
+        return []
+    here = np.array([ids[0] == thing for thing in things])
+    moved = moved_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
     sets = []
-    for thing in _things(ids[0], labels, tally, rules):
-        target = Target(ids[0] == thing, box_of(ids[0] == thing, wraps=True), None)
-        seen_now = Observation(color[0], color[0, :1, :1], np.zeros(3), depth, target)
-        moved = Reprojection().track([seen_now], [relative], [imagined])[0].masks
-        found, frames = glimpses(panoramas, np.concatenate([ids == thing, moved]), kinds != IMAGINED)
-        owners = np.zeros(len(frames), np.int64)
-        sets.append(Looks(found, owners, kinds[frames], labels[[thing]]))
+    for thing, masks in zip(things, moved, strict=True):
+        found, frames = glimpses(panoramas, np.concatenate([ids == thing, without_specks(masks)]), kinds != IMAGINED)
+        sets.append(Looks(found, np.zeros(len(frames), np.int64), kinds[frames], labels[[thing]]))
         tally[int(labels[thing])] += 1
     return sets
 
