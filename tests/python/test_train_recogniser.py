@@ -13,12 +13,12 @@ import pytest
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
 from wiw.perception.glimpses import SIDE, Glimpses
-from wiw.training.looks import IMAGINED, START, TRUE, Looks, halves, merged
+from wiw.training.looks import PERFECT, START, WARPED, Looks, halves, merged
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 NAMES = ("bars", "dots", "plain")
-KINDS = (START, TRUE, TRUE, TRUE, IMAGINED, IMAGINED, IMAGINED)
+KINDS = (START, PERFECT, PERFECT, PERFECT, WARPED, WARPED, WARPED)
 
 
 def drawn(label: int, rng: Any, hidden: bool, wrong: bool) -> Any:
@@ -32,12 +32,12 @@ def drawn(label: int, rng: Any, hidden: bool, wrong: bool) -> Any:
 
 
 def made_up(sets: int, seed: int) -> Looks:
-    """Looks of which 60 % show nothing; of the imagined ones every other is red, which no true one is, and misleads."""
+    """Looks of which 60 % show nothing; of the warped ones every other is red, which no other is, and misleads."""
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 3, sets)
     images = np.array(
         [
-            [drawn(label, rng, rng.random() < 0.6, kind == IMAGINED and rng.random() < 0.5)] * 2
+            [drawn(label, rng, rng.random() < 0.6, kind == WARPED and rng.random() < 0.5)] * 2
             for label in labels
             for kind in KINDS
         ]
@@ -45,7 +45,7 @@ def made_up(sets: int, seed: int) -> Looks:
     count = sets * len(KINDS)
     boxes = np.tile(np.array([0.2, 0.2, 0.8, 0.8], np.float32), (count, 2, 1))
     kinds = np.tile(KINDS, sets)
-    scalars = np.column_stack([np.zeros((count, 4)), kinds != IMAGINED]).astype(np.float32)
+    scalars = np.column_stack([np.zeros((count, 4)), kinds == START]).astype(np.float32)
     return Looks(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
 
 
@@ -73,13 +73,13 @@ def test_views_together_tell_more_than_one(lesson: Any) -> None:
     accuracy = lesson[0].card["accuracy"]
     # 40 % of looks tell; the rest is a guess of three: 60 % at most with one, 1 - 0.6^4 * 2/3 = 91 % with four
     assert 0.45 < accuracy["start"] < 0.72
-    assert accuracy["start"] + 0.08 < accuracy["start + 1 true"] < accuracy["start + 3 true"]
-    assert accuracy["start + 3 true"] > 0.82
+    assert accuracy["start"] + 0.08 < accuracy["start + 1 perfect"] < accuracy["start + 3 perfect"]
+    assert accuracy["start + 3 perfect"] > 0.82
 
 
 def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
     accuracy = lesson[0].card["accuracy"]
-    assert accuracy["start + 3 imagined"] > accuracy["start"] + 0.06  # half of the imagined ones help
+    assert accuracy["start + 3 warped"] > accuracy["start"] + 0.06  # half of them help
     looks = lesson[1].glimpses
     red = looks.images[..., 0].mean(axis=(1, 2, 3)) > 1.5 * looks.images[..., 1].mean(axis=(1, 2, 3))
     from wiw.perception.recognition_network import pictures
@@ -125,7 +125,7 @@ def test_looks_are_counted_through(lesson: Any) -> None:
 
     looks = merged([made_up(2, 0), made_up(1, 1)])
     assert looks.owners.tolist() == [0] * 7 + [1] * 7 + [2] * 7
-    assert rows_of(looks, IMAGINED, 2).tolist() == [0, 4, 5, 7, 11, 12, 14, 18, 19]
+    assert rows_of(looks, WARPED, 2).tolist() == [0, 4, 5, 7, 11, 12, 14, 18, 19]
     assert rows_of(looks, START, 0).tolist() == [0, 7, 14]
     first, second = halves(looks)
     assert (len(first), len(second), second.owners.tolist()) == (1, 2, [0] * 7 + [1] * 7)
@@ -148,7 +148,7 @@ def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.Capture
     assert "calibration error" in capsys.readouterr().out
     card = Recogniser.load(out).card
     assert card["accuracy"]["start"] > 2.5 / len(names)
-    assert card["accuracy"]["start + 3 true"] > 2.5 / len(names)
+    assert card["accuracy"]["start + 3 perfect"] > 2.5 / len(names)
     assert out.stat().st_size < 2 * 2**20
     assert card["scenes"] == "apartments:train:2"
 

@@ -20,8 +20,9 @@ from wiw.perception.glimpses import Glimpses, glimpses, joined
 from wiw.perception.tracking import moved_masks, without_specks
 from wiw.reproject import warp
 
-START, TRUE, IMAGINED = 0, 1, 2
-"""Kinds of looks: from the place itself; rendered, or reprojected from the place, at one near by."""
+START, NEAR, PERFECT, WARPED = 0, 1, 2, 3
+"""Kinds of looks: from the place itself; from one near by, as an agent that went there would see it; and as a perfect
+world model or reprojection would let it imagine that, with the box that the tracker gives."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Looks:
     owners: NDArray[np.int64]
     """int64 [looks]: which set each is of, ascending."""
     kinds: NDArray[np.int64]
-    """int64 [looks]: `START`, `TRUE` or `IMAGINED`; each set begins with its one `START`."""
+    """int64 [looks]: `START`, `NEAR`, `PERFECT` or `WARPED`; each set begins with its one `START`."""
     labels: NDArray[np.int64]
     """int64 [sets]: numbers of categories."""
 
@@ -140,8 +141,8 @@ def _from_place(
     color, depth, ids = shown["color"], shown["depth"][0], shown["instance"]
     relative = np.linalg.inv(poses[0]) @ poses[1:]
     imagined = warp(color[:1], depth[None], relative[None])[0] if len(relative) else color[1:]
-    panoramas = np.concatenate([color, imagined])
-    kinds = np.repeat([START, TRUE, IMAGINED], [1, len(relative), len(relative)])
+    panoramas = np.concatenate([color, color[1:], imagined])
+    kinds = np.repeat([START, NEAR, PERFECT, WARPED], [1, *[len(relative)] * 3])
     things = _things(ids[0], labels, tally, rules)
     if not things:
         return []
@@ -149,7 +150,8 @@ def _from_place(
     moved = moved_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
     sets = []
     for thing, masks in zip(things, moved, strict=True):
-        found, frames = glimpses(panoramas, np.concatenate([ids == thing, without_specks(masks)]), kinds != IMAGINED)
+        tracked = without_specks(masks)
+        found, frames = glimpses(panoramas, np.concatenate([ids == thing, tracked, tracked]), kinds <= NEAR)
         sets.append(Looks(found, np.zeros(len(frames), np.int64), kinds[frames], labels[[thing]]))
         tally[int(labels[thing])] += 1
     return sets

@@ -18,12 +18,14 @@ from wiw.errors import ArgumentError
 from wiw.perception.calibration import calibration_error, fitted_temperature, softmax
 from wiw.perception.recogniser import Recogniser
 from wiw.perception.recognition_network import Network, pictures
-from wiw.training.looks import IMAGINED, START, TRUE, Looks
+from wiw.training.looks import NEAR, PERFECT, START, WARPED, Looks
 
 COLOURS = [0, 1, 2, 4, 5, 6]
 """Channels of `pictures` that are not boxes."""
 REAL = 4
 """Column of `Glimpses.scalars`."""
+MOST = 4
+"""Looks of a set that training adds to the first."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +118,8 @@ def _chances(labels: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def _loss(network: Network, looks: Looks, sets: NDArray[np.int64], recipe: Recipe, rng: np.random.Generator) -> Tensor:
-    rows, owners, real = _drawn(looks, sets, rng)
-    shown, scalars = _varied(looks, rows, owners, real, rng)
+    rows, owners = _drawn(looks, sets, rng)
+    shown, scalars = _varied(looks, rows, owners, rng)
     logits, weights = network.train().looks(shown, scalars)
     places = torch.from_numpy(owners)
     targets = torch.from_numpy(looks.labels[sets])
@@ -128,29 +130,27 @@ def _loss(network: Network, looks: Looks, sets: NDArray[np.int64], recipe: Recip
 
 def _drawn(
     looks: Looks, sets: NDArray[np.int64], rng: np.random.Generator
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Rows of looks, which of `sets` they are of, and whether they pass for real: the first look, and up to three more.
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of looks, and which of `sets` they are of: the first look, and up to `MOST` more.
 
-    What is rendered near by passes for real or for imagined, as an agent may meet it as either.
+    They are real ones and those of one world model, the perfect one or reprojection, as in an episode.
     """
     first = np.searchsorted(looks.owners, sets)
     behind = np.searchsorted(looks.owners, sets, side="right")
+    counts, absent = rng.integers(0, MOST + 1, len(sets)), rng.choice([PERFECT, WARPED], len(sets))
     rows, owners = [], []
-    for i, (start, end, more) in enumerate(zip(first, behind, rng.integers(0, 4, len(sets)), strict=True)):
-        others = rng.permutation(np.arange(start + 1, end))[:more]
+    for i, (start, end, count, model) in enumerate(zip(first, behind, counts, absent, strict=True)):
+        others = np.arange(start + 1, end)
+        others = rng.permutation(others[looks.kinds[others] != model])[:count]
         rows.append(np.concatenate([[start], others]))
         owners.append(np.full(len(rows[-1]), i))
-    chosen = np.concatenate(rows)
-    kinds = looks.kinds[chosen]
-    real = (kinds == START) | ((kinds == TRUE) & (rng.random(len(kinds)) < 0.5))
-    return chosen, np.concatenate(owners), real.astype(np.float32)
+    return np.concatenate(rows), np.concatenate(owners)
 
 
 def _varied(
     looks: Looks,
     rows: NDArray[np.int64],
     owners: NDArray[np.int64],
-    real: NDArray[np.float32],
     rng: np.random.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Pictures and scalars in other light, with boxes a little off, and half of them mirrored."""
@@ -158,7 +158,7 @@ def _varied(
     extent = found.boxes[..., 2:] - found.boxes[..., :2]
     off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
     scalars = found.scalars * rng.uniform(0.96, 1.04, found.scalars.shape)
-    scalars[:, REAL] = real
+    scalars[:, REAL] = found.scalars[:, REAL]
     shown = pictures(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
     light = rng.uniform(0.8, 1.2, (owners.max() + 1, 1)) * rng.uniform(0.92, 1.08, (owners.max() + 1, 3))
     gain = torch.from_numpy(np.tile(light[owners], 2).astype(np.float32))[:, :, None, None]
@@ -180,26 +180,24 @@ def rows_of(looks: Looks, kind: int, most: int) -> NDArray[np.int64]:
 
 
 def set_logits(network: Network, looks: Looks, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Float64 [sets, categories] from the looks at `rows`; those that are not the set's first pass for imagined."""
+    """Float64 [sets, categories] from the looks at `rows`."""
     found = looks.glimpses[rows]
-    scalars = found.scalars.copy()
-    scalars[:, REAL] = looks.kinds[rows] == START
     parts = []
     with torch.inference_mode():
         for i in range(0, len(rows), 256):
             part = slice(i, i + 256)
             shown = pictures(torch.from_numpy(found.images[part]), torch.from_numpy(found.boxes[part]))
-            parts.append(network.eval().looks(shown, torch.from_numpy(scalars[part])))
+            parts.append(network.eval().looks(shown, torch.from_numpy(found.scalars[part])))
         logits, weights = (torch.cat(column) for column in zip(*parts, strict=True))
         return network.fused(logits, weights, torch.from_numpy(looks.owners[rows]), len(looks)).double().numpy()
 
 
 VIEWS = {"start": (START, 0)} | {
     f"start + {count} {name}": (kind, count)
-    for name, kind in (("imagined", IMAGINED), ("true", TRUE))
+    for name, kind in (("real", NEAR), ("perfect", PERFECT), ("warped", WARPED))
     for count in (1, 2, 3)
 }
-"""What accuracy is measured with; true ones are what a perfect world model would imagine."""
+"""What accuracy is measured with: the kind of the looks added to the first, and how many."""
 
 
 def calibrated(
