@@ -177,6 +177,7 @@ POLICIES = Registry(
         "matcher": "wiw.policies.matcher:Matcher",
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
+        "recogniser": "wiw.policies.recogniser:Recognition",
     },
     "wiw.policies.base:Policy",
 )

@@ -192,6 +192,21 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
     assert np.abs(look.images[0, 0].astype(int) - real.images[0, 0])[inside].mean() < 6
 
 
+@pytest.mark.parametrize("model", [None, "copy"])
+def test_a_policy_that_only_proposes_is_revised_by_it(
+    two_rooms: str, tmp_path: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, model: Any
+) -> None:
+    from wiw.policies.recogniser import Recognition
+
+    monkeypatch.setattr("wiw.policies.recogniser.WEIGHTS", weights)
+    task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=2)
+    agent = wiw.Agent("heuristic", model)
+    assert isinstance(agent.settled(task.defaults).revision, Recognition)
+    assert len(answers(task, agent)[0]) == 2
+    assert not isinstance(wiw.Agent("heuristic", "copy", "matcher").settled(task.defaults).revision, Recognition)
+    assert not isinstance(wiw.Agent("matcher", model).settled(task.defaults).revision, Recognition)
+
+
 def test_it_is_told_by_its_weights(weights: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.safetensors"
     from wiw.perception.recogniser import Recogniser

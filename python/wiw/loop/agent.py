@@ -222,9 +222,16 @@ class Agent:
         parts |= {"placebo": self.placebo, "pool": self._given_pool, "imagine_fraction": self.imagine_fraction}
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
-    def settled(self, defaults: Mapping[str, int]) -> Agent:
-        """The same agent with a task's numbers where it was given none."""
-        return self.but(**settled_numbers(self.given, defaults))
+    def settled(self, defaults: Mapping[str, Any]) -> Agent:
+        """The same agent with a task's numbers where it was given none.
+
+        The task's reviser, if it names one, stands in for the default reviser of a policy that only proposes.
+        """
+        numbers = {name: value for name, value in defaults.items() if name != "revision"}
+        changes: dict[str, Any] = settled_numbers(self.given, numbers)
+        if "revision" in defaults and self._given_revision is None and self.policy.default_revision is not None:
+            changes["revision"] = defaults["revision"]
+        return self.but(**changes)
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest."""

@@ -139,7 +139,7 @@ class NavigationTask(ABC):
         return None if len(scenes) == 1 else len(scenes) * self.per_scene
 
     @property
-    def defaults(self) -> dict[str, int]:
+    def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
 

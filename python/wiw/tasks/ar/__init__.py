@@ -84,9 +84,10 @@ class AR(NavigationTask):
             self._episodes = self.of_file()
 
     @property
-    def defaults(self) -> dict[str, int]:
-        """Options for `wiw.Agent` that the task prescribes."""
-        return {**super().defaults, "execute": 1 if self.rules.execute == "primitive" else 0}
+    def defaults(self) -> dict[str, Any]:
+        """Options for `wiw.Agent` that the task prescribes; a policy that only proposes needs one that answers."""
+        execute = 1 if self.rules.execute == "primitive" else 0
+        return {**super().defaults, "execute": execute, "revision": "recogniser"}
 
     @property
     def pointing(self) -> Pointing:
