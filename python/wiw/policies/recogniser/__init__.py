@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.action import FORWARD
 from wiw.panorama import from_cubemap
 from wiw.perception.glimpses import Glimpses, glimpses, joined
 from wiw.perception.recogniser import Recogniser
@@ -52,6 +53,10 @@ class Recognition(Policy):
         remember: real looks that are kept, from as many places.
         views: imagined looks of a plan that are used, the last ones.
         lost: what a plan's score loses if all its frames lose the target.
+        turning: what it loses for each turn, a primitive spent where it is; without, each decision turns back what the
+            one before it turned.
+        trust: what it loses for each place that the plan has in the order of steering, which is all that there is to
+            go by without a world model.
 
     Raises:
         BackendError: torch is not installed.
@@ -67,12 +72,14 @@ class Recognition(Policy):
         remember: int = 2,
         views: int = 2,
         lost: float = 0.5,
+        turning: float = 0.05,
+        trust: float = 0.1,
     ) -> None:
         self.file = Path(WEIGHTS if weights is None else weights)
         self.recogniser = Recogniser.load(self.file)
         self.tracker = TRACKERS.make(tracker)
         self.needs = tuple(sorted({"depth", *self.tracker.needs}))
-        self.remember, self.views, self.lost = remember, views, lost
+        self.remember, self.views, self.lost, self.turning, self.trust = remember, views, lost, turning, trust
 
     def describe(self) -> dict[str, Any]:
         """With a digest of the weights."""
@@ -83,6 +90,8 @@ class Recognition(Policy):
             "remember": self.remember,
             "views": self.views,
             "lost": self.lost,
+            "turning": self.turning,
+            "trust": self.trust,
         }
 
     def begin(self, goal: Goal, key: Key) -> Memory:
@@ -135,7 +144,9 @@ class Recognition(Policy):
             choices = situation.goal.choices
             sure = self.recogniser([joined([*real, each]) for each in looks], choices).max(axis=1)
             boxless = np.array([1 - track.found.mean() for track in followed])
-            scores.append(sure - self.lost * boxless)
+            turns = np.array([np.count_nonzero(plan.actions != FORWARD) for plan in plans])
+            rank = np.array([-plan.prior for plan in plans])
+            scores.append(sure - self.lost * boxless - self.turning * turns - self.trust * rank)
         return scores
 
     def answer(
