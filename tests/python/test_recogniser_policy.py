@@ -174,6 +174,42 @@ def test_a_plan_that_loses_the_target_scores_less(two_rooms: str, tmp_path: Path
     assert kept > lost
 
 
+def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: Path, weights: Path) -> None:
+    from wiw.policies.base import Situation
+
+    task = AR(episode_file=a_file(tmp_path, two_rooms))
+    env = task.environment(depth=True)
+    observation = env.begin(task.episode(0))
+    answerer = policy(weights, turning=0.05, trust=0.2)
+    situation = Situation(observation, env.goal, Key(0, 0), answerer.begin(env.goal, Key(0, 0)))
+    answerer.observe([situation])
+    ways = [([FORWARD], 7.0), ([FORWARD], 5.0), ([TURN_LEFT, FORWARD], 5.0)]
+    plans = [Proposal(np.array(way, np.int8), prior) for way, prior in ways]
+    futures = [
+        Rollout(np.repeat(observation.panorama[None], len(way), 0), np.ones(len(way), bool), "panorama")
+        for way, _ in ways
+    ]
+    (scores,) = answerer.score([situation], [plans], [futures])
+    assert scores[0] - scores[1] == pytest.approx(0.2)
+    assert scores[1] - scores[2] == pytest.approx(0.05)
+
+
+def test_weights_that_come_with_the_package_know_things_of_unseen_homes() -> None:
+    from wiw.perception.recogniser import Recogniser
+    from wiw.policies.recogniser import WEIGHTS
+    from wiw.training.looks import START, LookRules, look_around
+
+    recogniser = Recogniser.load(WEIGHTS)
+    assert WEIGHTS.stat().st_size < 2 * 2**20
+    assert recogniser.card["accuracy"]["start + 3 real"] > recogniser.card["accuracy"]["start"] > 0.75
+    assert recogniser.card["calibration_error"]["after"] < 0.05
+    looks = look_around(world("apartments:test/900"), 0, recogniser.categories, LookRules(places=6))
+    first = [looks.glimpses[np.array([row])] for row in np.flatnonzero(looks.kinds == START)]
+    right = recogniser(first).argmax(axis=1) == looks.labels
+    assert len(right) >= 20
+    assert right.mean() > 0.6
+
+
 def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: Path) -> None:
     from wiw.perception.tracking import Track
 

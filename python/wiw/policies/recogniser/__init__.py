@@ -145,7 +145,7 @@ class Recognition(Policy):
             sure = self.recogniser([joined([*real, each]) for each in looks], choices).max(axis=1)
             boxless = np.array([1 - track.found.mean() for track in followed])
             turns = np.array([np.count_nonzero(plan.actions != FORWARD) for plan in plans])
-            rank = np.array([-plan.prior for plan in plans])
+            rank = np.array([sum(other.prior > plan.prior for other in plans) for plan in plans])
             scores.append(sure - self.lost * boxless - self.turning * turns - self.trust * rank)
         return scores
 
