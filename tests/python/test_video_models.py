@@ -147,6 +147,15 @@ def test_hunyuan_keeps_the_frames_of_both_kinds_of_checkpoint(made, tmp_path):
     assert rollout(made("hunyuan", weights=str(tmp_path))).shape == (1, 5, *concatenating.size, 3)
 
 
+@pytest.mark.parametrize(("name", "kin"), [("ltx", "LTXPipeline"), ("wan2.2-5b", "WanPipeline")])
+def test_folders_of_kindred_pipelines_serve(name, kin, made, world_model_options, tmp_path):
+    folder = shutil.copytree(world_model_options(name)["weights"], tmp_path / "kin")
+    index = json.loads((folder / "model_index.json").read_text())
+    index = {key: value for key, value in index.items() if not key.startswith("image_")} | {"_class_name": kin}
+    (folder / "model_index.json").write_text(json.dumps(index))
+    np.testing.assert_array_equal(rollout(made(name, weights=folder)), rollout(made(name)))
+
+
 @pytest.mark.parametrize(
     ("name", "asked", "size", "frames"),
     [
@@ -189,6 +198,14 @@ def test_long_plans_go_on_from_the_last_frame(made, two_rooms):
     assert len(answers) == 3, "four actions a clip"
     np.testing.assert_array_equal(starts[1], answers[0][:, 4])
     np.testing.assert_array_equal(starts[2], answers[1][:, 4])
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name != "sana-wm"])  # whose network refuses it on a CPU
+def test_half_precision_is_close(name, made):
+    whole, half = made(name, precision="float32"), made(name, precision=wiw.registry.WORLD_MODELS.find(name).half)
+    difference = np.abs(rollout(whole).astype(float) - rollout(half))
+    assert 0 < difference.mean() < 4
+    assert whole.fingerprint() != half.fingerprint()
 
 
 def test_half_precision_leaves_some_networks_whole(made):

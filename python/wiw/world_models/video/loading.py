@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -28,7 +28,7 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
     """
     import diffusers
 
-    with memory_guard(model):
+    with memory_guard(model), _no_bars():
         try:
             pipeline = getattr(diffusers, model.pipeline).from_pretrained(
                 folder, dtype=_dtypes(model), variant=model.variant, local_files_only=True, **components
@@ -42,6 +42,22 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
         pipeline.set_progress_bar_config(disable=True)
         _place(pipeline, model)
     return pipeline
+
+
+@contextmanager
+def _no_bars() -> Iterator[None]:
+    """Holds back the libraries' progress bars: a run has its own, and theirs leave locks behind in worker processes."""
+    from diffusers.utils import logging as of_diffusers
+    from transformers.utils import logging as of_transformers
+
+    shown = [library for library in (of_diffusers, of_transformers) if library.is_progress_bar_enabled()]
+    for library in shown:
+        library.disable_progress_bar()
+    try:
+        yield
+    finally:
+        for library in shown:
+            library.enable_progress_bar()
 
 
 def _dtypes(model: VideoModel) -> dict[str, Any]:
