@@ -14,6 +14,7 @@ __all__ = [
     "InfrastructureError",
     "NavigationError",
     "RegistryError",
+    "RemoteError",
     "RolloutError",
     "StoreError",
     "WeightsError",
@@ -68,6 +69,14 @@ class RolloutError(InfrastructureError):
     def __init__(self, message: str = "", kind: str = "raised") -> None:
         super().__init__(message)
         self.kind = kind
+
+
+class RemoteError(RolloutError):
+    """A served world model gave no answer, or a message between it and its client is not as agreed.
+
+    `kind` is "connection" (nobody is there), "deadline", "token", "version", "model" (the server has come back with
+    another one), "message" (malformed, or too large), "row" (not what the model accepts), or "raised".
+    """
 
 
 class StoreError(Error):

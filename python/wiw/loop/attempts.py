@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError, RolloutError
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel, checked_rollout
+from wiw.world_models.base import WorldModel, checked_rollout, patience
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
@@ -87,7 +87,7 @@ class Attempts:
         self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
-        kind = getattr(error, "kind", "contract") if isinstance(error, ContractError | _LateError) else "raised"
+        kind = error.kind if isinstance(error, ContractError | RolloutError | _LateError) else "raised"
         name = type(self.model).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
@@ -98,7 +98,8 @@ class Attempts:
             self._helper = None
         if self._helper is None:
             self._helper = _Helper()
-        return self._helper.do(work, self.deadline)
+        with patience(self.deadline):
+            return self._helper.do(work, self.deadline)
 
 
 class _LateError(Exception):

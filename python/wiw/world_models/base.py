@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import importlib.util
+import math
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -138,7 +142,7 @@ class WorldModel(ABC):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts):
+        if "rollout" in cls.__dict__ and not isinstance(getattr(cls, "accepts", None), Accepts | property):
             raise ContractError(f"{cls.__name__}: set the class attribute `accepts = wiw.accepts(...)`")
 
     @abstractmethod
@@ -180,6 +184,27 @@ class WorldModel(ABC):
         from wiw.world_models.fingerprint import fingerprint
 
         return fingerprint(self)
+
+
+_GIVE_UP: ContextVar[float] = ContextVar("wiw_give_up", default=math.inf)
+
+
+@contextmanager
+def patience(seconds: float) -> Iterator[None]:
+    """Tells models that are asked inside for how long their answer is waited for."""
+    token = _GIVE_UP.set(time.monotonic() + seconds)
+    try:
+        yield
+    finally:
+        _GIVE_UP.reset(token)
+
+
+def seconds_left() -> float:
+    """For how long the caller of `rollout` still waits for its answer: for models that wait for others themselves.
+
+    Infinite where nobody has set a deadline.
+    """
+    return _GIVE_UP.get() - time.monotonic()
 
 
 def _is_plain(value: Any) -> bool:
