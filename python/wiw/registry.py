@@ -2,6 +2,7 @@
 """One small registry: a kind of thing is found by name in its own folder of `wiw`, by entry point, or by path.
 
 wiw.world_model("warp")                  python/wiw/world_models/warp/   (its class is named in `BUILT_IN`)
+wiw.world_model("remote:ws://HOST:1234") what follows the name is its first argument, for those that end with a colon
 wiw.world_model("mine")                  entry point group "wiw.world_models"
 wiw.world_model("model.py:MyModel")      a class in a file
 wiw.world_model("mypkg.models:MyModel")  a class in an importable module
@@ -37,7 +38,7 @@ class Registry:
     group: str
     """Entry-point group; empty where packages add none."""
     built_in: dict[str, str]
-    """Name to `module:attribute`."""
+    """Name to `module:attribute`. A name that ends with a colon takes what is written after it as first argument."""
     base: str = ""
     """`module:class` that things of this kind derive from, if they have to."""
 
@@ -57,7 +58,10 @@ class Registry:
         plugins = self._plugins()
         if name in plugins:
             return self._load(name, plugins[name].load)
-        if ":" in name:
+        prefix, colon, argument = name.partition(":")
+        if prefix + colon in self.built_in and argument:
+            return partial(self.find(prefix + colon), argument)
+        if colon:
             return self._load(name, partial(_attribute, name))
         near = difflib.get_close_matches(name, self.names(), n=3)
         hint = f" Did you mean {' or '.join(near)}?" if near else ""
@@ -74,7 +78,7 @@ class Registry:
             RegistryError: see `find`; also when the options do not fit the constructor.
         """
         factory = self.find(what) if isinstance(what, str) else what
-        if not callable(factory) or (not inspect.isclass(factory) and not inspect.isfunction(factory)):
+        if not (inspect.isclass(factory) or inspect.isfunction(factory) or isinstance(factory, partial)):
             if options:
                 raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
             return self._checked(what, factory)
@@ -166,9 +170,12 @@ WORLD_MODELS = Registry(
         "sana-wm": "wiw.world_models.sana_wm:SanaWM",
         "runway-gen4": "wiw.world_models.runway_gen4:RunwayGen4",
         "nwm": "wiw.world_models.nwm:NWM",
+        "remote:": "wiw.world_models.remote:Remote",
     },
     "wiw.world_models.base:WorldModel",
 )
+FUNCTION = "wiw.world_models.function:Function"
+"""What makes a world model of a function."""
 POLICIES = Registry(
     "policy",
     "wiw.policies",
@@ -225,9 +232,14 @@ def list_metrics() -> list[str]:
 def world_model(name: Any, **options: Any) -> Any:
     """A world model by name, `path.py:Class`, class or instance; None for "none".
 
+    `wiw.world_model(function, accepts=wiw.accepts(...))` makes one of a function that is called as
+    `WorldModel.rollout` is.
+
     Raises:
         RegistryError: unknown name, or options that do not fit; the message says what is known.
     """
+    if "accepts" in options and not isinstance(name, str) and not inspect.isclass(name):
+        return _attribute(FUNCTION)(name, **options)
     return WORLD_MODELS.make(name, **options)
 
 

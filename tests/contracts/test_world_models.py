@@ -20,7 +20,7 @@ from wiw.policies.base import FrameSpec
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Proposal
 
-NAMES = [name for name in wiw.registry.list_world_models() if name != "none"]
+NAMES = [name for name in wiw.registry.list_world_models() if name != "none" and not name.endswith(":")]
 PLANS = [[FORWARD] * 3, [TURN_LEFT, FORWARD], [FORWARD, TURN_LEFT, FORWARD, FORWARD]]
 
 
@@ -111,6 +111,20 @@ def test_or_names_a_class_in_a_file(tmp_path: Path, two_rooms: str) -> None:
     assert len(imagined(f"{file}:Fog", two_rooms)[0]) == 3
     with pytest.raises(RegistryError, match="cannot be loaded"):
         wiw.world_model(f"{file}:Fgo")
+
+
+def test_or_hands_over_a_function_from_a_notebook(two_rooms: str) -> None:
+    def fog(observations, controls, seeds):
+        return np.repeat(observations.image[:, None] // 2, len(controls[0].actions) + 1, 1)
+
+    declared = wiw.accepts(control="image")
+    model = wiw.world_model(fog, accepts=declared)
+    assert len(imagined(model, two_rooms)[0]) == 3 and model.describe()["name"].endswith("fog")
+    assert wiw.world_model(wiw.world_model("copy").rollout, accepts=declared).accepts is declared
+    with pytest.raises(wiw.errors.ArgumentError, match="nobody can tell what it reads"):
+        wiw.Agent("matcher", model, cache="somewhere")
+    with pytest.raises(wiw.errors.ArgumentError, match="expected a function and accepts"):
+        wiw.world_model(fog, accepts="image")
 
 
 def test_unknown_names_and_options_are_answered_with_what_is_known() -> None:
