@@ -20,11 +20,11 @@ FACES = {"types", "errors", "registry", "panorama", "scenes", "render", "nav", "
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "metrics", "perception"},
+    {"datasets", "metrics", "perception", "wire"},
     {"envs", "policies", "world_models"},
     {"tasks", "loop", "training"},
     {"evaluation"},
-    {"viz"},
+    {"viz", "serving"},
     {"cli"},
 ]
 

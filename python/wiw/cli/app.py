@@ -21,6 +21,7 @@ from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
+from wiw.cli.serve import serve
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
@@ -50,6 +51,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (export, "export", "A run as CSV or Parquet tables, or as a Rerun recording."),
     (verify, "verify", "Run some episodes of a run again, and compare."),
     (view, "view", "Pages to walk through a run, to every decision."),
+    (serve, "serve", "Serve a world model to other processes or machines."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),

@@ -110,8 +110,11 @@ class AgentRecipe:
 
     @property
     def arm(self) -> str:
-        """Short name of the world model: "none", "warp", or the class behind a path."""
-        return "none" if self.model is None else self.model.rpartition(":")[2]
+        """Short name of the world model: "none", "warp", the class behind a path, or a server's host and port."""
+        if self.model is None:
+            return "none"
+        kind, scheme, host = self.model.partition("://")
+        return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
 
 
 @dataclass(frozen=True)

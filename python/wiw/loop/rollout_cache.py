@@ -19,6 +19,7 @@ import zlib
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -165,7 +166,7 @@ class Remembered:
         self.cache_seconds = 0.0
         """Spent on the cache so far."""
         self._ask = ask
-        self._identity = f"{ask.model.fingerprint()} {ask.model.accepts}".encode()
+        self._identity = f"{ask.model.fingerprint()} {replace(ask.model.accepts, best_batch=1)}".encode()
 
     @property
     def tally(self) -> Counter[str]:

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw serve`."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+SHOWN, LOGGED = 1.0, 10.0
+"""Seconds between status lines, on a terminal and elsewhere."""
+
+
+def serve(
+    model: Positional[Annotated[str, arg(metavar="MODEL")]],
+    /,
+    *,
+    host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[int, arg(metavar="N")] = 8765,
+    token: Annotated[str | None, arg(metavar="SECRET")] = None,
+    queue: Annotated[int | None, arg(metavar="ROWS")] = None,
+    window: Annotated[float, arg(metavar="SHARE")] = 0.05,
+    certificate: Annotated[Path | None, arg(metavar="FILE")] = None,
+    key: Annotated[Path | None, arg(metavar="FILE")] = None,
+    grace: Annotated[float, arg(metavar="SECONDS")] = 30.0,
+) -> int:
+    """Serves a world model to runs in other processes or on other machines.
+
+    $ wiw serve warp
+    $ wiw run imagenav --world-model remote:ws://127.0.0.1:8765 --workers 4 --live 8
+
+    $ WIW_TOKEN=secret wiw serve my_model.py:MyModel --host 0.0.0.0
+    $ WIW_TOKEN=secret wiw run imagenav --world-model remote:ws://gpu-machine:8765
+
+    Rows of all episodes of all clients become full batches of the model. A client whose server is killed waits until
+    it is back, as long as its deadline allows, and asks again what was not answered. SIGTERM or Ctrl-C finishes what
+    was taken and ends; a second one ends at once. `wiw check-model MODEL` tells beforehand whether the model keeps its
+    contract; docs/serving.md has the protocol.
+
+    Args:
+        model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        host: Address to listen at; any but this machine's own asks for a token.
+        port: 0 takes a free one.
+        token: What clients must show; WIW_TOKEN if not given, which other users of the machine cannot see.
+        queue: Rows that may wait before clients are told to; eight full batches, and at least 64, if not given.
+        window: Share of a batch's time for which one that is not full waits for clients that are idle.
+        certificate: PEM file, for wss.
+        key: PEM file of the certificate's key, if it is not in the same file.
+        grace: Most seconds for finishing what was taken.
+    """
+    from wiw.registry import world_model
+    from wiw.serving.server import Server, Settings
+
+    settings = Settings(host, port, token or os.environ.get("WIW_TOKEN"), queue, window, certificate, key, grace)
+    server = Server(world_model(model), settings)
+    asyncio.run(_live(server, model))
+    return 0
+
+
+async def _live(server: Any, name: str) -> None:
+    """Serves until a signal comes, and says how it goes."""
+    loop, signals = asyncio.get_running_loop(), 0
+    ready = asyncio.Event()
+    serving = asyncio.ensure_future(server.run(ready.set))
+
+    def stop() -> None:
+        nonlocal signals
+        signals += 1
+        if signals == 1:
+            left = f"finishing {server.taken} rows that were taken" if server.taken else "ending"
+            print(f"\nwiw serve: {left}", file=sys.stderr, flush=True)
+            server.end()
+        else:
+            serving.cancel()
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, stop)
+    showing = asyncio.ensure_future(_show(server, name, ready))
+    try:
+        await serving
+    except asyncio.CancelledError:
+        pass
+    finally:
+        showing.cancel()
+        await asyncio.gather(showing, return_exceptions=True)
+
+
+async def _show(server: Any, name: str, ready: asyncio.Event) -> None:
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    from wiw.serving.status import Status
+
+    await ready.wait()
+    console = Console(highlight=False, soft_wrap=True)
+    accepts = server.model.accepts
+    height, width = accepts.size
+    console.print(f"serving  {name}: {accepts.view} {height}x{width}, control {accepts.control}, up to", end=" ")
+    console.print(f"{accepts.best_batch} rows a batch")
+    console.print(f"run      wiw run imagenav --world-model remote:{server.address}", markup=False)
+    status = Status(server)
+    if console.is_terminal:
+        with Live(console=console, auto_refresh=False) as live:
+            while True:
+                live.update(Text(status.line()), refresh=True)
+                await asyncio.sleep(SHOWN)
+    while True:
+        await asyncio.sleep(LOGGED)
+        if status.changed:
+            print(status.line(), flush=True)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers that were given lately, for clients that ask again because they never got them."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+
+
+class Known:
+    """Encoded answers by the id of their row; those that were not asked for longest go first.
+
+    Args:
+        most_bytes: that they may take together.
+    """
+
+    def __init__(self, most_bytes: int) -> None:
+        self._most, self._size = most_bytes, 0
+        self._answers: OrderedDict[bytes, bytes] = OrderedDict()
+
+    def get(self, row: bytes) -> bytes | None:
+        """The answer, where it is known."""
+        if row in self._answers:
+            self._answers.move_to_end(row)
+        return self._answers.get(row)
+
+    def put(self, row: bytes, answer: bytes) -> None:
+        """Keeps an answer."""
+        self._size += len(answer) - len(self._answers.pop(row, b""))
+        self._answers[row] = answer
+        while self._size > self._most:
+            _, oldest = self._answers.popitem(last=False)
+            self._size -= len(oldest)

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a server takes: rows as its model accepts them, and no larger."""
+
+from __future__ import annotations
+
+from wiw.errors import RemoteError
+from wiw.wire.messages import MOST_BYTES
+from wiw.wire.rows import Row
+from wiw.world_models.base import Accepts
+
+HISTORY = 64
+"""Most frames of a row's history."""
+CONTROL_BYTES = 2**20
+"""Of a row beside its images."""
+
+
+def most_bytes(accepts: Accepts) -> int:
+    """Of one message of a client."""
+    height, width = accepts.size
+    needs = {"depth": 4, "semantic": 4, "history": 3 * HISTORY}
+    pixel = 3 + sum(size for need, size in needs.items() if need in accepts.needs)
+    return min(MOST_BYTES, height * width * pixel + CONTROL_BYTES)
+
+
+def check_row(row: Row, accepts: Accepts) -> None:
+    """Holds a row to what the model accepts, and its answer to what can be sent.
+
+    Raises:
+        RemoteError: what was expected and what came.
+    """
+    size, count = tuple(accepts.size), len(row.control.actions)
+    for name in ("image", "depth", "semantic", "history"):
+        array, needed = getattr(row, name), name == "image" or name in accepts.needs
+        if (array is not None) != needed:
+            raise RemoteError(f"row.{name}: {'missing' if needed else 'the model does not take it'}", "row")
+        if array is not None and (array.shape[1:3] if name == "history" else array.shape[:2]) != size:
+            raise RemoteError(f"row.{name}: expected {size} pixels, got shape {array.shape}", "row")
+    if row.image.shape[2:] != (3,) or (row.history is not None and row.history.shape[3:] != (3,)):
+        raise RemoteError("row: expected images of three channels", "row")
+    if (row.control.ids is not None) != (accepts.control == "action"):
+        raise RemoteError(f"row.ids: a model of control '{accepts.control}' and these ids do not fit", "row")
+    if count < 1 or (accepts.frames and count != accepts.frames - 1):
+        expected = accepts.frames - 1 if accepts.frames else "at least 1"
+        raise RemoteError(f"row.actions: expected {expected} actions, got {count}", "row")
+    if (count + 1) * row.image.size > MOST_BYTES - CONTROL_BYTES:
+        raise RemoteError(f"row.actions: {count} frames of {size} pixels are more than can be sent", "row")

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rows that wait for the model, and which of them make the next batch."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+
+from wiw.wire.rows import Row
+
+ANNOUNCED = 1.0
+"""Seconds for which a batch waits for rows that a client has announced, counted from the latest arrival."""
+LONGEST = 1.0
+"""Most seconds for which a batch waits for rows that nobody has announced."""
+
+
+@dataclass(eq=False)
+class Job:
+    """A row that waits or is computed."""
+
+    id: bytes
+    row: Row
+    arrived: float
+    expires: float
+    askers: set[Hashable] = field(default_factory=set)
+
+
+class Queue:
+    """First come, first served, in batches of rows that fit together. Filled by one thread, emptied by another.
+
+    A batch that is not full waits a little: for rows that a client has announced, and, where clients are connected that
+    have asked for nothing, for a share of the time that a batch takes.
+
+    Args:
+        batch: rows of a full batch.
+        most: rows that may wait.
+        window: that share; 0 never waits for rows that nobody announced.
+        clock: seconds.
+    """
+
+    def __init__(self, batch: int, most: int, window: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self.batch, self.most, self.window, self._clock = batch, most, window, clock
+        self.batch_seconds = 0.0
+        """What the last batch took."""
+        self._jobs: list[Job] = []
+        self._coming: dict[Hashable, int] = {}
+        """Rows that each client has announced."""
+        self._owed: Counter[Hashable] = Counter()
+        """Rows of each client that wait or are computed."""
+        self._latest = -math.inf
+        self._ending = False
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def join(self, client: Hashable) -> None:
+        """A client is there, and may ask."""
+        with self._changed:
+            self._coming[client] = 0
+
+    def leave(self, client: Hashable) -> list[Job]:
+        """A client has gone. Returns the jobs that nobody wants any more."""
+        with self._changed:
+            self._coming.pop(client, None)
+            self._owed.pop(client, None)
+            for job in self._jobs:
+                job.askers.discard(client)
+            orphans = [job for job in self._jobs if not job.askers]
+            self._jobs = [job for job in self._jobs if job.askers]
+            self._changed.notify()
+            return orphans
+
+    def put(self, job: Job, client: Hashable, rest: int = 0) -> bool:
+        """Takes a job of a client that announces `rest` more; False where the queue is full."""
+        with self._changed:
+            self._coming[client] = rest
+            full = len(self._jobs) >= self.most
+            if not full:
+                self._latest = self._clock()
+                self._owed[client] += 1
+                self._jobs.append(job)
+            self._changed.notify()
+            return not full
+
+    def share(self, client: Hashable) -> None:
+        """A client asks what another one has asked already."""
+        with self._changed:
+            self._owed[client] += 1
+
+    def answered(self, client: Hashable) -> None:
+        """A client has one answer more."""
+        with self._changed:
+            if client in self._owed:
+                self._owed[client] -= 1
+
+    def expired(self) -> list[Job]:
+        """Takes out the jobs whose clients wait no more."""
+        with self._changed:
+            now = self._clock()
+            late = [job for job in self._jobs if job.expires <= now]
+            self._jobs = [job for job in self._jobs if job.expires > now]
+            self._changed.notify()
+            return late
+
+    def take(self) -> list[Job] | None:
+        """The next batch, as soon as it is due; None when the queue has ended and is empty."""
+        with self._changed:
+            while True:
+                batch, wait = self.due()
+                if batch and wait <= 0:
+                    taken = set(map(id, batch))
+                    self._jobs = [job for job in self._jobs if id(job) not in taken]
+                    return batch
+                if self._ending and not self._jobs:
+                    return None
+                self._changed.wait(wait if batch else None)
+
+    def end(self) -> None:
+        """Nothing more will come."""
+        with self._changed:
+            self._ending = True
+            self._changed.notify()
+
+    def due(self) -> tuple[list[Job], float]:
+        """The batch as far as it is there, and the seconds until it is taken as it is."""
+        now = self._clock()
+        waiting = [job for job in self._jobs if job.expires > now]
+        if not waiting:
+            return [], math.inf
+        first = waiting[0]
+        batch = [job for job in waiting if job.row.shape == first.row.shape][: self.batch]
+        if len(batch) == self.batch or self._ending:
+            return batch, 0.0
+        if any(self._coming.values()):
+            return batch, self._latest + ANNOUNCED - now
+        if all(self._owed[client] > 0 for client in self._coming):
+            return batch, 0.0
+        return batch, first.arrived + min(LONGEST, self.window * self.batch_seconds) - now

@@ -1,0 +1,345 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The server: connections on one side, a queue of rows on the other, the model in a thread of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import ipaddress
+import json
+import logging
+import ssl
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any
+
+from websockets.asyncio.server import Server as Listener
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from wiw.errors import ArgumentError, InfrastructureError, RemoteError
+from wiw.serving.known import Known
+from wiw.serving.limits import check_row, most_bytes
+from wiw.serving.queue import Job, Queue
+from wiw.serving.worker import Outcome, Worker
+from wiw.wire.messages import Answer, Ask, Hello, Message, Refusal, Wait, Welcome, decode, encode
+from wiw.wire.rows import row_id, unpack_row
+from wiw.world_models.base import WorldModel
+from wiw.world_models.remote.declaration import declaration
+
+PORT = 8765
+CLIENTS = 256
+"""Most connections at a time."""
+KNOWN_BYTES = 512 * 2**20
+"""Of answers that are kept for clients that ask again."""
+AHEAD = 4
+"""Full batches that one client may have unanswered, so that rows travel while others are computed."""
+HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0
+"""Seconds: between pings, without an answer to one until a client counts as gone, and for a client's first message."""
+TICK = 0.1
+POLICY_VIOLATION = 1008
+_log = logging.getLogger("wiw.serving.connections")
+_log.addHandler(logging.NullHandler())
+_log.propagate = False  # every stranger who connects would write a line
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Where and how a model is served.
+
+    Args:
+        host: address to listen at.
+        port: 0 takes a free one.
+        token: what clients must show; needed where others than this machine can reach `host`.
+        queue: rows that may wait; None means eight full batches, and at least 64 rows.
+        window: share of a batch's time for which one that is not full waits for clients that are idle.
+        certificate: PEM file, for wss.
+        key: PEM file of its key, where that is not in `certificate`.
+        grace: seconds for finishing what was taken when the server is told to end.
+
+    Raises:
+        ArgumentError: a number out of range, or a host beyond this machine without a token.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = PORT
+    token: str | None = None
+    queue: int | None = None
+    window: float = 0.05
+    certificate: Path | None = None
+    key: Path | None = None
+    grace: float = 30.0
+
+    def __post_init__(self) -> None:
+        least = 1 if self.queue is None else self.queue
+        if not 0 <= self.port < 2**16 or least < 1 or self.window < 0 or self.grace < 0:
+            raise ArgumentError(
+                "serve: expected a port below 65536, a queue of at least 1, and a window and a grace of at least 0, "
+                f"got port={self.port}, queue={self.queue}, window={self.window}, grace={self.grace}"
+            )
+        if not self.token and not _is_loopback(self.host):
+            raise ArgumentError(
+                f"serve: {self.host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a "
+                "secret that clients show, such as the output of `openssl rand -hex 16`"
+            )
+
+    @property
+    def tls(self) -> ssl.SSLContext | None:
+        """For wss."""
+        if self.certificate is None:
+            return None
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+        context.load_cert_chain(self.certificate, self.key)
+        return context
+
+
+class Server:
+    """Serves one world model.
+
+    Raises:
+        ArgumentError: the model cannot be served.
+    """
+
+    def __init__(self, model: Any, settings: Settings | None = None) -> None:
+        if not isinstance(model, WorldModel):
+            raise ArgumentError(f"serve: expected a world model, got {model!r}; see `wiw list`")
+        if "simulator" in model.accepts.needs:
+            raise ArgumentError(
+                f"serve: {type(model).__name__} needs the simulator, which cannot leave the process it runs in; "
+                "name it where the run is: wiw run --world-model oracle"
+            )
+        self.model, self.settings = model, settings or Settings()
+        self.address = ""
+        """Once it listens."""
+        accepts = model.accepts
+        batch = accepts.best_batch
+        self.queue = Queue(batch, self.settings.queue or max(8 * batch, 64), self.settings.window)
+        self.worker = Worker(model, self.queue, self._report)
+        self.refused = 0
+        """Messages and connections that were not as agreed."""
+        self._welcome = _welcome(model, AHEAD * batch)
+        self._jobs: dict[bytes, Job] = {}
+        self._known = Known(KNOWN_BYTES)
+        self._owed: Counter[ServerConnection] = Counter()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._ending = asyncio.Event()
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._owed)
+
+    @property
+    def taken(self) -> int:
+        """Rows that wait or are computed."""
+        return len(self._jobs)
+
+    async def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Serves until `end` is called; then finishes what it has taken.
+
+        Raises:
+            InfrastructureError: the address cannot be listened at.
+        """
+        self._loop = asyncio.get_running_loop()
+        try:
+            listener = await self._listen()
+        except OSError as error:
+            raise InfrastructureError(
+                f"cannot listen at {self.settings.host} port {self.settings.port}: {error.strerror or error}; name "
+                "another one (--port 0 takes any that is free)"
+            ) from None
+        async with listener:
+            port = next(iter(listener.sockets)).getsockname()[1]
+            host = f"[{self.settings.host}]" if ":" in self.settings.host else self.settings.host
+            self.address = f"{'ws' if self.settings.certificate is None else 'wss'}://{host}:{port}"
+            self.worker.start()
+            ready()
+            ticking = asyncio.ensure_future(self._tick())
+            await self._ending.wait()
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._finished(), self.settings.grace)
+            ticking.cancel()
+            self.queue.end()
+
+    def end(self) -> None:
+        """Takes nothing more, finishes, and lets `run` return. To be called from the loop's thread."""
+        self._ending.set()
+
+    # -- connections ---------------------------------------------------------------------------------------------------
+
+    async def _listen(self) -> Listener:
+        return await serve(
+            self._meet,
+            self.settings.host,
+            self.settings.port,
+            ssl=self.settings.tls,
+            process_request=self._admit,
+            origins=[None],  # a browser names the page that connects; no page has business here
+            compression=None,  # images hardly shrink
+            max_size=most_bytes(self.model.accepts),
+            ping_interval=HEARTBEAT,
+            ping_timeout=SILENCE,
+            open_timeout=HANDSHAKE,
+            close_timeout=1,
+            server_header=None,
+            logger=_log,
+        )
+
+    def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
+        """None lets a client in."""
+        if len(self._owed) >= CLIENTS:
+            return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are connected already\n")
+        token = self.settings.token
+        shown = request.headers.get_all("Authorization")
+        if token and not (len(shown) == 1 and hmac.compare_digest(shown[0].encode(), f"Bearer {token}".encode())):
+            self.refused += 1
+            return connection.respond(HTTPStatus.UNAUTHORIZED, "the token is missing or wrong\n")
+        return None
+
+    async def _meet(self, client: ServerConnection) -> None:
+        """One client, from its first message to its last."""
+        self._owed[client] = 0
+        self.queue.join(client)
+        try:
+            hello = decode(await asyncio.wait_for(client.recv(), HANDSHAKE))
+            if not isinstance(hello, Hello):
+                raise RemoteError(f"expected a hello first, got {type(hello).__name__}", "message")
+            await client.send(encode(self._welcome))
+            async for data in client:
+                await self._hear(client, decode(data))
+        except RemoteError as error:
+            self.refused += 1
+            await self._dismiss(client, error)
+        except (ConnectionClosed, asyncio.TimeoutError):
+            pass
+        finally:
+            del self._owed[client]
+            for job in self.queue.leave(client):
+                del self._jobs[job.id]
+            for job in self._jobs.values():
+                job.askers.discard(client)
+
+    async def _dismiss(self, client: ServerConnection, error: RemoteError) -> None:
+        with contextlib.suppress(ConnectionClosed):
+            await client.send(encode(Refusal(b"", error.kind, str(error))))
+            await client.close(POLICY_VIOLATION, error.kind)
+
+    async def _hear(self, client: ServerConnection, said: Message) -> None:
+        if not isinstance(said, Ask):
+            raise RemoteError(f"expected an ask, got {type(said).__name__}", "message")
+        if said.id != row_id(said.row):
+            raise RemoteError("ask.id is not the digest of ask.row", "message")
+        answer = self._known.get(said.id)
+        if answer is not None:
+            await client.send(answer)
+        elif (reason := self._cannot(client)) or not self._take(client, said):
+            await client.send(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
+
+    def _cannot(self, client: ServerConnection) -> str:
+        """Why no row of this client is taken now; empty where one is."""
+        if self._ending.is_set():
+            return "the server is ending"
+        return "too many rows unanswered" if self._owed[client] >= self._welcome.in_flight else ""
+
+    def _pause(self) -> float:
+        """Seconds in which there may be room: half a batch."""
+        return min(2.0, max(0.05, self.queue.batch_seconds / 2))
+
+    def _take(self, client: ServerConnection, ask: Ask) -> bool:
+        """Queues a row, unless it is queued or computed already; False where the queue is full."""
+        job = self._jobs.get(ask.id)
+        now = time.monotonic()
+        if job is None:
+            try:
+                row = unpack_row(ask.row)
+                check_row(row, self.model.accepts)
+            except RemoteError as error:
+                self.refused += 1
+                self._say(client, encode(Refusal(ask.id, error.kind, str(error))))
+                return True
+            job = Job(ask.id, row, now, now + ask.seconds)
+            if not self.queue.put(job, client, ask.rest):
+                return False
+            self._jobs[ask.id] = job
+        elif client in job.askers:
+            raise RemoteError("a row was asked for twice on one connection", "message")
+        else:
+            self.queue.share(client)
+            job.expires = max(job.expires, now + ask.seconds)
+        job.askers.add(client)
+        self._owed[client] += 1
+        return True
+
+    # -- answers -------------------------------------------------------------------------------------------------------
+
+    def _report(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
+        """Called in the model's thread; the encoding is left to another, for the model is to go on."""
+        assert self._loop is not None
+        with contextlib.suppress(RuntimeError):  # the server has ended
+            self._loop.call_soon_threadsafe(lambda: self._start(self._answer(jobs, outcomes)))
+
+    async def _answer(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
+        for job, outcome in zip(jobs, outcomes, strict=True):
+            if isinstance(outcome, Refusal):
+                self._settle(job, encode(Refusal(job.id, outcome.kind, outcome.text)))
+            else:
+                answer = await asyncio.to_thread(encode, Answer(job.id, outcome))
+                self._known.put(job.id, answer)
+                self._settle(job, answer)
+
+    def _settle(self, job: Job, answer: bytes) -> None:
+        """Tells all who asked."""
+        self._jobs.pop(job.id, None)
+        for client in [client for client in self._owed if client in job.askers]:  # others have gone
+            self._owed[client] -= 1
+            self.queue.answered(client)
+            self._say(client, answer)
+
+    def _say(self, client: Any, message: bytes) -> None:
+        self._start(_send(client, message))
+
+    def _start(self, work: Any) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _tick(self) -> None:
+        """Tells those whose rows were not begun in time."""
+        while True:
+            await asyncio.sleep(TICK)
+            for job in self.queue.expired():
+                self._settle(
+                    job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
+                )
+
+    async def _finished(self) -> None:
+        while self._jobs or self._tasks:
+            await asyncio.sleep(TICK)
+
+
+async def _send(client: ServerConnection, message: bytes) -> None:
+    with contextlib.suppress(ConnectionClosed):
+        await client.send(message)
+
+
+def _welcome(model: WorldModel, in_flight: int) -> Welcome:
+    try:
+        fingerprint, unknown = model.fingerprint(), ""
+    except ArgumentError as error:
+        fingerprint, unknown = "", str(error)
+    described = json.dumps(model.describe(), default=str)
+    return Welcome(declaration(model.accepts), described, fingerprint, unknown, in_flight)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The thread in which the model lives: batches in, frames out."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ContractError
+from wiw.serving.queue import Job, Queue
+from wiw.wire.messages import Refusal
+from wiw.wire.rows import Row, stack
+from wiw.world_models.base import WorldModel, checked_rollout, patience
+
+Outcome = NDArray[np.uint8] | Refusal
+"""Frames of a row, or why there are none."""
+Report = Callable[[Sequence[Job], Sequence[Outcome]], None]
+
+
+class Worker(threading.Thread):
+    """Takes batches from a queue until it ends. One thread for all calls: libraries keep state by thread."""
+
+    def __init__(self, model: WorldModel, queue: Queue, report: Report) -> None:
+        super().__init__(daemon=True, name="wiw served model")
+        self._model, self._queue, self._report = model, queue, report
+        self.busy_since: float | None = None
+        self.batches, self.rows, self.busy_seconds = 0, 0, 0.0
+
+    def run(self) -> None:
+        """Works until the queue has ended."""
+        while (batch := self._queue.take()) is not None:
+            begin = self.busy_since = time.monotonic()
+            with patience(max(job.expires for job in batch) - begin):
+                outcomes = self._answers([job.row for job in batch])
+            seconds, self.busy_since = time.monotonic() - begin, None
+            self.batches, self.rows, self.busy_seconds = (
+                self.batches + 1,
+                self.rows + len(batch),
+                self.busy_seconds + seconds,
+            )
+            self._queue.batch_seconds = seconds
+            self._report(batch, outcomes)
+
+    def _answers(self, rows: Sequence[Row]) -> list[Outcome]:
+        """What the model gives for each row.
+
+        Where it raises, each half of the batch is asked again: a row that it cannot do fails alone, and too many rows
+        for the memory become fewer.
+        """
+        try:
+            frames = checked_rollout(self._model, *stack(rows))
+        except ContractError as error:
+            return [Refusal(b"", error.kind, str(error)) for _ in rows]
+        except BaseException as error:  # SystemExit too: the thread has to go on
+            if len(rows) == 1:
+                return [Refusal(b"", "raised", f"{type(error).__name__}: {' '.join(str(error).split())}")]
+            half = len(rows) // 2
+            return [*self._answers(rows[:half]), *self._answers(rows[half:])]
+        return [
+            answer[1 + row.control.shared : 1 + row.control.length] for row, answer in zip(rows, frames, strict=True)
+        ]

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One row of a rollout over the wire: what the model sees, the plan in every form, the seed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Any
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import RemoteError
+from wiw.types import Conditioning, Control
+from wiw.wire.arrays import pack_array, unpack_array
+from wiw.wire.messages import Reader, read_fields, text, unpack_map, whole
+
+SEEN = ("image", "depth", "semantic", "history")
+PLAN = ("actions", "trajectory", "viewpoints", "ids")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One future that is asked for."""
+
+    image: NDArray[np.uint8]
+    depth: NDArray[np.float32] | None
+    semantic: NDArray[np.uint32] | None
+    history: NDArray[np.uint8] | None
+    control: Control
+    seed: int
+
+    @property
+    def shape(self) -> tuple[Any, ...]:
+        """What the rows of a batch have in common: the number of actions, and the ids' shape and kind."""
+        ids = self.control.ids
+        return len(self.control.actions), *(() if ids is None else (ids.shape, ids.dtype.str))
+
+
+def pack_row(observations: Conditioning, row: int, control: Control, seed: int) -> bytes:
+    """One row of what `WorldModel.rollout` is given."""
+    seen = {name: getattr(observations, name) for name in SEEN}
+    arrays = {name: None if values is None else values[row] for name, values in seen.items()}
+    arrays |= {name: getattr(control, name) for name in PLAN}
+    packed = {name: None if array is None else pack_array(np.asarray(array)) for name, array in arrays.items()}
+    plain = {"text": control.text, "length": control.length, "shared": control.shared, "seed": int(seed)}
+    return bytes(msgpack.packb({**packed, **plain}))
+
+
+def row_id(row: bytes) -> bytes:
+    """The digest of a packed row: 16 bytes that equal questions share."""
+    return blake2b(row, digest_size=16).digest()
+
+
+def unpack_row(data: bytes) -> Row:
+    """The row behind some bytes.
+
+    Raises:
+        RemoteError: no such row; names what is wrong with it.
+    """
+    values = read_fields("row", unpack_map("row", data), _READERS)
+    plan: dict[str, Any] = {name: None if values[name] is None else values[name].copy() for name in PLAN}
+    control = Control(**plan, text=values["text"], length=values["length"], shared=values["shared"])
+    count = len(control.actions)
+    for name, shape in (("trajectory", (count, 3)), ("viewpoints", (count, 4, 4))):
+        if getattr(control, name).shape != shape or not np.isfinite(getattr(control, name)).all():
+            raise RemoteError(f"row.{name}: expected finite numbers of shape {shape}", "message")
+    if control.ids is not None and len(control.ids) not in (count, count + 1):
+        raise RemoteError(f"row.ids: expected one for each of {count} actions", "message")
+    if not control.shared <= control.length <= count:
+        raise RemoteError(f"row: expected shared <= length <= {count} actions", "message")
+    return Row(control=control, seed=values["seed"], **{name: values[name] for name in SEEN})
+
+
+def stack(rows: Sequence[Row]) -> tuple[Conditioning, list[Control], NDArray[np.uint64]]:
+    """Rows of one shape as `WorldModel.rollout` takes them."""
+    first = rows[0]
+    observations = Conditioning(
+        np.stack([row.image for row in rows]),
+        depth=None if first.depth is None else np.stack([row.depth for row in rows if row.depth is not None]),
+        semantic=None
+        if first.semantic is None
+        else np.stack([row.semantic for row in rows if row.semantic is not None]),
+        history=None if first.history is None else [row.history for row in rows if row.history is not None],
+    )
+    return observations, [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
+
+
+def _array(dtype: str, dimensions: int) -> Reader:
+    def read(name: str, value: Any) -> NDArray[Any]:
+        array = unpack_array(name, value)
+        if array.dtype.str != dtype or array.ndim != dimensions:
+            expected = f"{np.dtype(dtype).name} in {dimensions} dimensions"
+            raise RemoteError(f"{name}: expected {expected}, got {array.dtype} {array.shape}", "message")
+        return array
+
+    return read
+
+
+def _ids(name: str, value: Any) -> NDArray[Any]:
+    array = unpack_array(name, value)
+    if array.ndim not in (1, 2):
+        raise RemoteError(f"{name}: expected ids or vectors, got shape {array.shape}", "message")
+    return array
+
+
+def _maybe(reader: Reader) -> Reader:
+    return lambda name, value: None if value is None else reader(name, value)
+
+
+_READERS: Mapping[str, Reader] = {
+    "image": _array("|u1", 3),
+    "depth": _maybe(_array("<f4", 2)),
+    "semantic": _maybe(_array("<u4", 2)),
+    "history": _maybe(_array("|u1", 4)),
+    "actions": _array("|i1", 1),
+    "trajectory": _array("<f8", 2),
+    "viewpoints": _array("<f8", 3),
+    "ids": _maybe(_ids),
+    "text": text,
+    "length": whole,
+    "shared": whole,
+    "seed": whole,
+}

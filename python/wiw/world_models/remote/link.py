@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A connection that mends itself: a thread of its own keeps it, asks again what was not answered, and tells when.
+
+Rows are asked under ids made of their content, so a row that is sent again, after the connection broke or by a caller
+that tries once more, is answered from what the server knows or is computing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import random
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from concurrent.futures import TimeoutError as LateError
+from dataclasses import dataclass, field
+from ipaddress import ip_address
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+
+import wiw
+from wiw.errors import ContractError, RemoteError
+from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
+from wiw.wire.rows import row_id
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
+"""Seconds before a connection is tried again; each failure doubles them."""
+HANDSHAKE = 10.0
+HEARTBEAT, SILENCE = 10.0, 30.0
+"""Seconds between pings, and without an answer to one until the connection counts as lost."""
+BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "contract"})
+"""Kinds of `ContractError`."""
+
+Frames = NDArray[np.uint8]
+
+
+@dataclass
+class _Question:
+    """A row that waits for its answer."""
+
+    id: bytes
+    row: bytes
+    give_up: float
+    rest: int
+    answer: Future[Frames] = field(default_factory=Future)
+    askers: int = 1
+
+
+class Link:
+    """Asks the server at an address. Any number of threads may use it."""
+
+    def __init__(self, address: str, token: str | None) -> None:
+        self.address = address
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._proxy: Any = None if _is_here(address) else True
+        self._open: dict[bytes, _Question] = {}
+        self._welcome: Future[Welcome] = Future()
+        self._trouble = "not connected yet"
+        self._loop = asyncio.new_event_loop()
+        self._wanted = asyncio.Event()
+        self._outbox: asyncio.Queue[_Question] | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True, name="wiw remote")
+        self._thread.start()
+
+    # -- called by those who ask ---------------------------------------------------------------------------------------
+
+    def welcome(self, seconds: float) -> Welcome:
+        """What is served.
+
+        Raises:
+            RemoteError: nobody has answered in time, or the server refuses.
+        """
+        self._soon(self._wanted.set)
+        try:
+            return self._welcome.result(seconds)
+        except LateError:
+            raise RemoteError(f"nobody serves a world model at {self.address}: {self._trouble}", "connection") from None
+
+    def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
+        """The frames of each row, in order.
+
+        Raises:
+            RemoteError: not all are there at the time `give_up` (`time.monotonic()`), or the server refuses one.
+            ContractError: the served model broke its contract.
+        """
+        questions = [_Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
+        asked: Future[list[_Question]] = Future()
+        self._soon(lambda: asked.set_result([self._submit(question) for question in questions]))
+        try:
+            questions = asked.result(max(0.0, give_up - time.monotonic()))
+            return [question.answer.result(max(0.0, give_up - time.monotonic())) for question in questions]
+        except LateError:
+            raise self._late() from None
+        finally:
+            self._soon(lambda: self._leave(questions))
+
+    def close(self) -> None:
+        """Ends the connection and the thread."""
+        if self._thread.is_alive():
+            self._soon(self._loop.stop)
+            self._thread.join(5)
+
+    def _late(self) -> RemoteError:
+        if self._outbox is None:
+            return RemoteError(f"{self.address} could not be reached in time: {self._trouble}", "connection")
+        return RemoteError(f"no answer from {self.address} in time; the server is there, but busy or hung", "deadline")
+
+    def _soon(self, work: Any) -> None:
+        with contextlib.suppress(RuntimeError):  # closed: callers find out by their deadlines
+            self._loop.call_soon_threadsafe(work)
+
+    # -- in the thread -------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        main = self._loop.create_task(self._keep())
+        self._loop.run_forever()
+        main.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            self._loop.run_until_complete(main)
+        self._loop.close()
+
+    async def _keep(self) -> None:
+        """Connects whenever something is asked, and again while it is not answered."""
+        pause = FIRST_PAUSE
+        while True:
+            await self._wanted.wait()
+            try:
+                async with self._connection() as connection:
+                    await self._greet(connection)
+                    pause = FIRST_PAUSE
+                    await self._talk(connection)
+            except RemoteError as error:
+                self._give_up(error)
+            except InvalidStatus as error:
+                if error.response.status_code in (401, 403):
+                    self._give_up(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
+                self._trouble = str(error)
+            except (OSError, TimeoutError, WebSocketException) as error:
+                self._trouble = f"{type(error).__name__}: {error}"
+            if not self._open and self._welcome.done():
+                self._wanted.clear()
+                continue
+            await asyncio.sleep(pause * random.uniform(0.8, 1.2))
+            pause = min(2 * pause, LONGEST_PAUSE)
+
+    def _connection(self) -> connect:
+        return connect(
+            self.address,
+            additional_headers=self._headers,
+            proxy=self._proxy,
+            compression=None,
+            max_size=MOST_BYTES,
+            open_timeout=HANDSHAKE,
+            ping_interval=HEARTBEAT,
+            ping_timeout=SILENCE,
+            close_timeout=1,
+        )
+
+    async def _greet(self, connection: ClientConnection) -> None:
+        await connection.send(encode(Hello(f"wiw {wiw.__version__}")))
+        said = decode(await asyncio.wait_for(connection.recv(), HANDSHAKE))
+        if isinstance(said, Refusal):
+            raise RemoteError(f"{self.address}: {said.text}", said.kind)
+        if not isinstance(said, Welcome):
+            raise RemoteError(f"{self.address}: expected a welcome, got {type(said).__name__}", "message")
+        if not self._welcome.done():
+            self._welcome.set_result(said)
+        elif said != (first := self._welcome.result()):
+            what = "weights or options" if (said.accepts, said.model) == (first.accepts, first.model) else "model"
+            raise RemoteError(
+                f"{self.address} has come back with another {what} than this run began with; serve the same one again",
+                "model",
+            )
+
+    async def _talk(self, connection: ClientConnection) -> None:
+        """Asks and hears until the connection ends."""
+        outbox: asyncio.Queue[_Question] = asyncio.Queue()
+        room = asyncio.Semaphore(self._welcome.result().in_flight)
+        for question in self._open.values():
+            outbox.put_nowait(question)
+        self._outbox = outbox
+        tasks = [
+            asyncio.ensure_future(self._send(connection, outbox, room)),
+            asyncio.ensure_future(self._hear(connection, outbox, room)),
+        ]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+        finally:
+            self._outbox = None
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _send(
+        self, connection: ClientConnection, outbox: asyncio.Queue[_Question], room: asyncio.Semaphore
+    ) -> None:
+        while True:
+            question = await outbox.get()
+            await room.acquire()
+            left = question.give_up - time.monotonic()
+            if left <= 0 or self._open.get(question.id) is not question:
+                room.release()
+                continue
+            await connection.send(encode(Ask(question.id, question.row, left, question.rest)))
+
+    async def _hear(
+        self, connection: ClientConnection, outbox: asyncio.Queue[_Question], room: asyncio.Semaphore
+    ) -> None:
+        while True:
+            try:
+                said = decode(await connection.recv())
+            except ConnectionClosed as error:
+                raise ConnectionError(f"the connection was lost ({error})") from None
+            if isinstance(said, Refusal) and not said.id:
+                raise RemoteError(f"{self.address}: {said.text}", said.kind)
+            if not isinstance(said, Answer | Wait | Refusal):
+                raise RemoteError(f"{self.address}: did not expect a {type(said).__name__}", "message")
+            room.release()
+            question = self._open.get(said.id)
+            if question is None or question.answer.done():
+                continue
+            if isinstance(said, Wait):
+                question.rest = 0  # those that followed it have gone on
+                self._loop.call_later(said.seconds, outbox.put_nowait, question)
+            elif isinstance(said, Answer):
+                question.answer.set_result(said.frames)
+            else:
+                question.answer.set_exception(_error(said))
+
+    def _submit(self, question: _Question) -> _Question:
+        """The question itself, or the same one that is open already."""
+        same = self._open.get(question.id)
+        if same is not None and not same.answer.done():
+            same.askers += 1
+            same.give_up = max(same.give_up, question.give_up)
+            return same
+        self._open[question.id] = question
+        if self._outbox is not None:
+            self._outbox.put_nowait(question)
+        self._wanted.set()
+        return question
+
+    def _leave(self, questions: Sequence[_Question]) -> None:
+        """Forgets questions that nobody waits for any more."""
+        for question in questions:
+            question.askers -= 1
+            if question.askers <= 0 and self._open.get(question.id) is question:
+                del self._open[question.id]
+
+    def _give_up(self, error: RemoteError) -> None:
+        """Tells all who wait that waiting is of no use."""
+        self._trouble = str(error)
+        if not self._welcome.done():
+            self._welcome.set_exception(error)
+        for question in self._open.values():
+            if not question.answer.done():
+                question.answer.set_exception(error)
+
+
+def _error(refusal: Refusal) -> Exception:
+    if refusal.kind in BREACHES:
+        return ContractError(refusal.text, refusal.kind)
+    return RemoteError(refusal.text, refusal.kind)
+
+
+def _is_here(address: str) -> bool:
+    """Whether the address is of this machine, for which no proxy is asked."""
+    host = urlsplit(address).hostname or ""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
