@@ -71,11 +71,12 @@ def _world_models() -> Any:
 
 
 def _cells(model: Any) -> list[str]:
-    """Of one row, from a class of world models or a factory (`none`, which imagines nothing)."""
+    """Of one row, from a class of world models; dashes for `none` and for a server, which tells when it is asked."""
+    from wiw.world_models.base import Accepts
     from wiw.world_models.status import lacks
 
     declared = getattr(model, "accepts", None)
-    if declared is None:
+    if not isinstance(declared, Accepts):
         return ["-", "-", "-", "-", "-", "[green]ready[/]"]
     height, width = declared.size
     shown = f"{declared.view} {height}x{width}"

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options, model_options
+
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
 
@@ -20,6 +22,7 @@ def serve(
     model: Positional[Annotated[str, arg(metavar="MODEL")]],
     /,
     *,
+    world_model_option: Options = (),
     host: Annotated[str, arg(metavar="ADDRESS")] = "127.0.0.1",
     port: Annotated[int, arg(metavar="N")] = 8765,
     token: Annotated[str | None, arg(metavar="SECRET")] = None,
@@ -39,11 +42,11 @@ def serve(
 
     Rows of all episodes of all clients become full batches of the model. A client whose server is killed waits until
     it is back, as long as its deadline allows, and asks again what was not answered. SIGTERM or Ctrl-C finishes what
-    was taken and ends; a second one ends at once. `wiw check-model MODEL` tells beforehand whether the model keeps its
-    contract; docs/serving.md has the protocol.
+    was taken and ends; a second one ends at once. docs/serving.md has the protocol.
 
     Args:
         model: Name, path.py:Class or package.module:Class. See `wiw list`.
+        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
         host: Address to listen at; any but this machine's own asks for a token.
         port: 0 takes a free one.
         token: What clients must show; WIW_TOKEN if not given, which other users of the machine cannot see.
@@ -57,7 +60,7 @@ def serve(
     from wiw.serving.server import Server, Settings
 
     settings = Settings(host, port, token or os.environ.get("WIW_TOKEN"), queue, window, certificate, key, grace)
-    server = Server(world_model(model), settings)
+    server = Server(world_model(model, **model_options(model, world_model_option)), settings)
     asyncio.run(_live(server, model))
     return 0
 
