@@ -18,6 +18,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Accepts",
     "Agent",
+    "Headline",
     "Policy",
     "WorldModel",
     "accepts",
@@ -49,6 +50,7 @@ __all__ = [
 _HOME = {
     "Accepts": "wiw.world_models.base",
     "Agent": "wiw.loop.agent",
+    "Headline": "wiw.metrics.headlines",
     "Policy": "wiw.policies.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
@@ -88,6 +90,7 @@ if TYPE_CHECKING:
     from wiw.evaluation.scale import scale
     from wiw.evaluation.verify import verify
     from wiw.loop.agent import Agent
+    from wiw.metrics.headlines import Headline
     from wiw.policies.base import Policy
     from wiw.registry import make, make_vec, policy, world_model
     from wiw.viz.show import show

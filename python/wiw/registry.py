@@ -200,12 +200,13 @@ TRACKERS = Registry(
 )
 METRICS = Registry(
     "metric",
-    "",
+    "wiw.metrics",
     {
-        "success": "wiw.metrics.navigation:success_rate",
-        "spl": "wiw.metrics.navigation:spl",
-        "mean_trajectory": "wiw.metrics.navigation:mean_trajectory",
+        "success": "wiw.metrics.headlines:SUCCESS",
+        "spl": "wiw.metrics.headlines:SPL",
+        "mean_trajectory": "wiw.metrics.headlines:MEAN_TRAJECTORY",
     },
+    "wiw.metrics.headlines:Headline",
 )
 
 
@@ -225,7 +226,7 @@ def list_tasks() -> list[str]:
 
 
 def list_metrics() -> list[str]:
-    """Names of the task metrics."""
+    """Names of the metrics that tables show."""
     return METRICS.names()
 
 

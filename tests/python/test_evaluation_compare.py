@@ -12,7 +12,8 @@ from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
 from wiw.evaluation.evaluate import run_arms
 from wiw.evaluation.runlog import load_run
-from wiw.evaluation.statistics import HEADLINES, estimate_difference, mcnemar
+from wiw.evaluation.statistics import estimate_difference, mcnemar
+from wiw.metrics.headlines import SUCCESS
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def test_common_arms_are_paired_by_episode(runs):
     ]
     (theirs, scenes), (ours, _) = success(runs[1], "warp"), success(runs[0], "warp")
     shown = found.difference("warp · new", "warp · old")
-    assert shown.estimate == estimate_difference(theirs, ours, scenes, HEADLINES[0])
+    assert shown.estimate == estimate_difference(theirs, ours, scenes, SUCCESS)
     assert shown.p_value == mcnemar(theirs, ours) and shown.p_adjusted == pytest.approx(min(1, 3 * shown.p_value))
     assert shown.estimate.value > 20
     assert found.difference("copy · new", "copy · old").estimate.value == 0

@@ -7,7 +7,8 @@ import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.evaluation.power import simulated_power
-from wiw.evaluation.statistics import HEADLINES, estimate_difference, holm, mcnemar
+from wiw.evaluation.statistics import estimate_difference, holm, mcnemar
+from wiw.metrics.headlines import SUCCESS
 
 
 def test_mcnemars_power_is_the_exact_sum():
@@ -34,7 +35,7 @@ def test_as_many_episodes_do_show_the_difference():
         local = rng.dirichlet(concentration, plan.scenes)
         ways = np.concatenate([rng.choice(3, plan.per_scene, p=shares) for shares in local])
         arm, base = (ways == 0).astype(float), (ways == 1).astype(float)
-        found = estimate_difference(arm, base, scenes, HEADLINES[0])
+        found = estimate_difference(arm, base, scenes, SUCCESS)
         shown.append((found.low > 0, mcnemar(arm, base) <= 0.05))
     by_interval, by_test = np.mean(shown, 0)
     assert by_interval == pytest.approx(plan.by_interval, abs=0.1) and by_test == pytest.approx(plan.by_test, abs=0.1)

@@ -11,9 +11,10 @@ from scipy import stats
 
 from wiw.evaluation.evaluate import run_arms
 from wiw.evaluation.report import summary_html
-from wiw.evaluation.statistics import HEADLINES, estimate_difference
+from wiw.evaluation.statistics import estimate_difference
 from wiw.evaluation.summary import notes, role_of, summarise
 from wiw.evaluation.utility import ratio
+from wiw.metrics.headlines import SUCCESS
 
 RATES = {"none": 0.2, "copy": 0.2, "warp": 0.5, "placebo-shuffled:mine": 0.2, "mine": 0.6, "oracle": 0.8}
 
@@ -117,7 +118,7 @@ def test_identifiability_is_the_sign_of_the_difference_shown():
         found = summarise(list(RATES), rows, 24)
         success = {arm: [r["metrics"]["success"] for r in rows if r["arm"] == arm] for arm in RATES}
         scenes = [r["scene"] for r in rows if r["arm"] == "copy"]
-        shown = estimate_difference(success["oracle"], success["copy"], scenes, HEADLINES[0])
+        shown = estimate_difference(success["oracle"], success["copy"], scenes, SUCCESS)
         assert found.utility("mine").identifiable == (shown.low > 0)
 
 

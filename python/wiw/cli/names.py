@@ -94,7 +94,8 @@ def _cells(model: Any) -> list[str]:
 def _first_line(registry: Any, name: str) -> str:
     """What a thing is, in its own words; or why it cannot be loaded."""
     try:
-        text = inspect.getdoc(registry.find(name)) or ""
+        thing = registry.find(name)
+        text = str(getattr(thing, "about", "") or inspect.getdoc(thing) or "")
     except Exception as error:  # a broken plugin must not hide the others
         return f"[red]{escape(str(error))}[/]"
     return escape(text.strip().partition("\n")[0])

@@ -5,42 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from wiw.evaluation.intervals import Interval, Kind, agresti_min, clustered_bootstrap, clustered_t, student, wilson
-
-
-@dataclass(frozen=True)
-class Headline:
-    """One column of the table, in the paper's terms."""
-
-    metric: str
-    """Name in `EpisodeResult.metrics`."""
-    label: str
-    kind: Literal["rate", "length"]
-    """"rate": episode values in [0, 1], shown as percent. "length": any number."""
-    higher_is_better: bool
-
-    @property
-    def scale(self) -> float:
-        """From episode values to what is shown."""
-        return 100.0 if self.kind == "rate" else 1.0
-
-    @property
-    def unit(self) -> str:
-        """Sign behind the number."""
-        return "%" if self.kind == "rate" else ""
-
-
-HEADLINES = (
-    Headline("success", "SR", "rate", True),
-    Headline("spl", "SPL", "rate", True),
-    Headline("actions", "Mean Traj", "length", False),
-)
+from wiw.metrics.headlines import Headline
 
 
 @dataclass(frozen=True)

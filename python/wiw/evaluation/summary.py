@@ -4,12 +4,18 @@
 from __future__ import annotations
 
 import math
+import sys
+import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, reduce
 from typing import Any
 
-from wiw.evaluation.statistics import HEADLINES, Difference, Estimate, Headline, adjusted, compare, estimate_mean
+from wiw.errors import RegistryError
+from wiw.evaluation.statistics import Difference, Estimate, adjusted, compare, estimate_mean
 from wiw.evaluation.utility import CEILING, FLOOR, Utility, utility
+from wiw.metrics.headlines import Headline
+from wiw.registry import METRICS
 
 ROLES = {
     "none": "the policy alone",
@@ -178,12 +184,14 @@ def summarise(
 def finished(
     arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, dict[int, Mapping[str, Any]]], dict[str, int]]:
-    """By arm: episodes that count, by index; and how many failed for infrastructure."""
+    """By arm: episodes that count, by index, with all metrics that can be told; and how many infrastructure failed."""
+    known = headlines()
     done: dict[str, dict[int, Mapping[str, Any]]] = {arm: {} for arm in arms}
     failed = dict.fromkeys(arms, 0)
     for outcome in outcomes:
         if outcome["status"] == "done":
-            done[outcome["arm"]][outcome["episode"]] = outcome
+            metrics = reduce(lambda told, headline: headline.added(told), known, outcome["metrics"])
+            done[outcome["arm"]][outcome["episode"]] = {**outcome, "metrics": metrics}
         else:
             failed[outcome["arm"]] += 1
     return done, failed
@@ -218,10 +226,27 @@ def under_test(arm: str, role: str) -> bool:
     return role == WORLD_MODEL and arm != "warp" and "+" not in arm
 
 
+def headlines() -> tuple[Headline, ...]:
+    """All metrics that are known: built-in ones, then those of installed packages that can be loaded."""
+    return _headlines_on(tuple(sys.path))
+
+
+@cache
+def _headlines_on(path: tuple[str, ...]) -> tuple[Headline, ...]:
+    """Packages are looked for once for each state of `sys.path`: that takes longer than all the numbers of a run."""
+    found = []
+    for name in METRICS.names():
+        try:
+            found.append(METRICS.make(name))
+        except RegistryError as error:  # a broken package must not hide what a run has shown
+            warnings.warn(str(error), RuntimeWarning, stacklevel=2)
+    return tuple(found)
+
+
 def headlines_of(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Headline]:
     """The columns that every finished episode has a value for."""
     ended = [outcome["metrics"] for arm in done.values() for outcome in arm.values()]
-    return [headline for headline in HEADLINES if ended and all(headline.metric in metrics for metrics in ended)]
+    return [headline for headline in headlines() if ended and all(headline.metric in metrics for metrics in ended)]
 
 
 def _line(
@@ -315,7 +340,7 @@ def show_p(p_value: float | None) -> str:
 def shown_headlines(summary: Summary) -> list[Headline]:
     """The columns that the summary has numbers for."""
     present = {metric for line in summary.arms for metric in line.estimates}
-    return [headline for headline in HEADLINES if headline.metric in present]
+    return [headline for headline in headlines() if headline.metric in present]
 
 
 def column_title(headline: Headline) -> str:
