@@ -87,6 +87,7 @@ def test_a_plan_goes_round_what_is_in_the_way() -> None:
     free[2] = 0.3
     assert steering.plan(np.pi / 4, free, 4).tolist() == [TURN_LEFT, FORWARD, FORWARD, FORWARD]
     assert steering.plan(np.pi, np.zeros(16), 3).tolist().count(FORWARD) == 0
+    assert steering.plan(0.0, np.full(16, np.inf), 4).tolist() == [FORWARD] * 4  # nothing stands anywhere around
 
 
 def test_what_is_large_or_hidden_is_passed_aside_and_what_is_small_is_neared() -> None:

@@ -117,9 +117,9 @@ def plan(heading: float, free: NDArray[np.float64], horizon: int) -> NDArray[np.
     count = len(free)
     turns = min(range(-count // 2, count // 2 + 1), key=lambda turn: (_cost(turn, wanted, free), abs(turn), -turn))
     steps = max(0, horizon - abs(turns))
-    room = max(0, int((free[turns % count] - CLEAR / 2) / ActionSpace().forward_m))
+    room = max(0.0, (free[turns % count] - CLEAR / 2) / ActionSpace().forward_m)  # infinite where nothing is in the way
     way = TURN_LEFT if turns > 0 or (turns == 0 and wanted >= 0) else TURN_RIGHT
-    made = [way] * min(abs(turns), horizon) + [FORWARD] * min(steps, room)
+    made = [way] * min(abs(turns), horizon) + [FORWARD] * int(min(steps, room))
     return np.array(made or [way], np.int8)
 
 
