@@ -13,10 +13,12 @@ __all__ = [
     "FileError",
     "InfrastructureError",
     "NavigationError",
+    "PromptError",
     "RegistryError",
     "RemoteError",
     "RolloutError",
     "StoreError",
+    "VlmError",
     "WeightsError",
 ]
 
@@ -77,6 +79,22 @@ class RemoteError(RolloutError):
     `kind` is "connection" (nobody is there), "deadline", "token", "version", "model" (the server has come back with
     another one), "message" (malformed, or too large), "row" (not what the model accepts), or "raised".
     """
+
+
+class PromptError(Error):
+    """A prompt template cannot be used. The message names the file, and the slot if it is one."""
+
+
+class VlmError(InfrastructureError):
+    """A vision-language model could not be asked, however often it was tried.
+
+    `kind` is "unreachable", "timeout", "status" (the server failed or was busy), "refused" (it never will), "protocol"
+    (a reply that is no completion) or "missing" (an answer that was not recorded).
+    """
+
+    def __init__(self, message: str = "", kind: str = "unreachable") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class StoreError(Error):

@@ -20,7 +20,7 @@ FACES = {"types", "errors", "registry", "panorama", "scenes", "render", "nav", "
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "metrics", "perception", "wire"},
+    {"datasets", "metrics", "perception", "vlm", "wire"},
     {"envs", "policies", "world_models"},
     {"tasks", "loop", "training"},
     {"evaluation"},

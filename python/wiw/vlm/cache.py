@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers on disk, so that the same question is put to a model, and paid for, once.
+
+One SQLite file in WAL mode, which any number of processes may share. Answers are named by all that they depend on
+(`Client.name_of`). When it outgrows its budget, what was not used for longest goes first.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sqlite3
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError
+from wiw.vlm.base import Completion
+
+_log = logging.getLogger("wiw.vlm")
+BUDGET_GB = 1.0
+"""Most gigabytes of answers unless the user says otherwise; an answer takes about a kilobyte."""
+_SCHEMA = "CREATE TABLE IF NOT EXISTS reply (name TEXT PRIMARY KEY, data TEXT NOT NULL, used REAL NOT NULL)"
+
+
+def default_folder() -> Path:
+    """Where answers are kept: `$WIW_CACHE/replies`, or `~/.cache/wiw/replies`. Deleting it is always safe."""
+    root = os.environ.get("WIW_CACHE")
+    return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "replies"
+
+
+def reply_cache(where: str | Path) -> ReplyCache | None:
+    """The cache of a folder; "auto" for the default one, "off" for none."""
+    return None if str(where) == "off" else ReplyCache(default_folder() if str(where) == "auto" else where)
+
+
+class ReplyCache:
+    """A folder of answers. Where it cannot be read or written a warning says so, and models are asked.
+
+    Args:
+        folder: where; made when the first answer is kept.
+        budget_gb: most gigabytes that answers may take.
+    """
+
+    def __init__(self, folder: str | Path, budget_gb: float = BUDGET_GB) -> None:
+        if not budget_gb > 0:
+            raise ArgumentError(f"vlm cache: expected a budget above 0 GB, got {budget_gb}")
+        self.folder, self.budget_gb = Path(folder).expanduser(), budget_gb
+        self._connection: sqlite3.Connection | None = None
+        self._process = 0
+        self._broken = False
+
+    def __reduce__(self) -> Any:
+        return ReplyCache, (self.folder, self.budget_gb)
+
+    def get(self, name: str) -> Completion | None:
+        """The answer of that name; None where there is none."""
+        if self._broken or not (self.folder / "replies.sqlite").exists():
+            return None
+        try:
+            with self._open() as connection:
+                row = connection.execute("SELECT data FROM reply WHERE name = ?", (name,)).fetchone()
+                if row is None:
+                    return None
+                connection.execute("UPDATE reply SET used = ? WHERE name = ?", (time.time(), name))
+            return Completion.from_json(json.loads(row[0]))
+        except (sqlite3.Error, OSError) as error:
+            self._give_up(error)
+        except (ValueError, KeyError, TypeError) as error:
+            _log.warning("kept answer %s is damaged (%s); it is asked for anew", name, error)
+        return None
+
+    def put(self, answers: Mapping[str, Completion]) -> None:
+        """Keeps answers by name."""
+        if self._broken or not answers:
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            rows = [(name, json.dumps(answer.to_json()), time.time()) for name, answer in answers.items()]
+            with self._open() as connection:
+                connection.executemany("INSERT OR REPLACE INTO reply VALUES (?, ?, ?)", rows)
+                self._trim(connection)
+        except (sqlite3.Error, OSError) as error:
+            self._give_up(error)
+
+    def _open(self) -> sqlite3.Connection:
+        if self._connection is None or self._process != os.getpid():
+            connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30)
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+            connection.execute(_SCHEMA)
+            self._connection, self._process = connection, os.getpid()
+        return self._connection
+
+    def _trim(self, connection: sqlite3.Connection) -> None:
+        """Makes the answers a tenth smaller than their budget where they have outgrown it."""
+        budget = self.budget_gb * 2**30
+        total = connection.execute("SELECT total(length(data)) FROM reply").fetchone()[0]
+        if total <= budget:
+            return
+        connection.execute(
+            "DELETE FROM reply WHERE name IN (SELECT name FROM (SELECT name, length(data) AS own,"
+            " sum(length(data)) OVER (ORDER BY used, name) AS freed FROM reply) WHERE freed - own < ?)",
+            (total - 0.9 * budget,),
+        )
+
+    def _give_up(self, error: Exception) -> None:
+        self._broken = True
+        _log.warning("answers are not kept any more: %s; make room or name another folder", error)

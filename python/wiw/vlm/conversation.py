@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From one request to its reply: what to ask next, until the answer can be used or the tries are over."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.vlm import choices, structured
+from wiw.vlm.base import Call, Completion, Problem, Reply, Request, Said
+
+AGAIN = 0.7
+"""Least temperature at which a question is put again: at 0 the same answer would come."""
+VOTE_TOKENS = 8
+Talk = Generator[list[Call], list[Completion], Reply]
+
+
+class Conversation:
+    """One request on its way; the client completes `calls` and tells by `hear`, until there are none."""
+
+    def __init__(self, request: Request, top_logprobs: int, votes: int) -> None:
+        self._talk = _chosen(request, top_logprobs, votes) if request.choices else _written(request)
+        self._said: list[tuple[str, Completion]] = []
+        self.calls: list[Call] = next(self._talk)
+        self.reply = Reply()
+
+    def hear(self, answers: Sequence[tuple[str, Completion]]) -> None:
+        """Takes in (name, completion) of each of the calls."""
+        self._said += answers
+        try:
+            self.calls = self._talk.send([completion for _, completion in answers])
+        except StopIteration as end:
+            reply: Reply = end.value
+            latest = len(self._said) - len(answers)
+            said = tuple(
+                Said(name, completion, reply.problem is None and (bool(reply.by) or place >= latest))
+                for place, (name, completion) in enumerate(self._said)
+            )
+            self.calls, self.reply = [], replace(reply, said=said)
+
+
+def _written(request: Request) -> Talk:
+    """Free text, or JSON."""
+    found: Reply | None = None
+    for attempt in range(request.tries):
+        (completion,) = yield [_call(request, attempt)]
+        found = _judged(request, completion)
+        if found.problem is None:
+            return found
+    assert found is not None
+    return found
+
+
+def _judged(request: Request, completion: Completion) -> Reply:
+    if request.schema is None:
+        return Reply(completion.text, problem=structured.unfit(completion))
+    outcome = structured.parsed(completion, request.schema)
+    if isinstance(outcome, Problem):
+        return Reply(completion.text, problem=outcome)
+    value, repaired = outcome
+    return Reply(completion.text, value, repaired=repaired)
+
+
+def _call(request: Request, attempt: int) -> Call:
+    temperature = request.temperature if attempt == 0 else max(request.temperature, AGAIN)
+    schema = None if request.schema is None else request.schema.model_json_schema()
+    return Call(request.messages, temperature, _seed(request.seed, attempt), request.max_tokens, schema=schema)
+
+
+def _seed(seed: int, attempt: int) -> int:
+    """32 bits, so that every server takes them."""
+    return int.from_bytes(blake2b(f"{seed} {attempt}".encode(), digest_size=4).digest(), "little") >> 1
+
+
+def _chosen(request: Request, most: int, votes: int) -> Talk:
+    """Multiple choice: the last round's text, the least mass, and votes if any round took them."""
+    found = yield from _elected(request, range(len(request.choices)), most, votes)
+    if isinstance(found, Reply):
+        return found
+    probabilities, rounds = found
+    by = "votes" if any(reply.by == "votes" for reply in rounds) else "logprobs"
+    return Reply(rounds[-1].text, probabilities=probabilities, mass=min(reply.mass for reply in rounds), by=by)
+
+
+def _elected(
+    request: Request, options: Sequence[int], most: int, votes: int
+) -> Generator[list[Call], list[Completion], tuple[NDArray[np.float64], list[Any]] | Reply]:
+    """Probabilities of some of the choices, and all that was asked for them; or an unusable reply.
+
+    More of them than a server lists tokens are asked about in groups, and the best of each group in a final.
+    """
+    groups = choices.chunks(len(options), most)
+    first = yield from _ballots(request, [[options[i] for i in group] for group in groups], most, votes)
+    if isinstance(first, Reply):
+        return first
+    if len(groups) == 1:
+        return first[0].probabilities, first
+    best = [np.argsort(-reply.probabilities, kind="stable")[: max(1, most // len(groups))] for reply in first]
+    finalists = sorted(group[i] for group, order in zip(groups, best, strict=True) for i in order)
+    final = yield from _elected(request, [options[i] for i in finalists], most, votes)
+    if isinstance(final, Reply):
+        return final
+    together = choices.united(groups, [reply.probabilities for reply in first], finalists, final[0])
+    return together, [*first, *final[1]]
+
+
+def _ballots(
+    request: Request, groups: Sequence[Sequence[int]], most: int, votes: int
+) -> Generator[list[Call], list[Completion], list[Any] | Reply]:
+    """What a model chooses in each group of options, or the unusable reply of the first group that has one."""
+    options = [[request.choices[i] for i in group] for group in groups]
+    messages = [choices.asked(request.messages, names) for names in options]
+    labels = [choices.labels_of(len(names)) for names in options]
+    seed = _seed(request.seed, 0)
+    calls = [Call(said, 0.0, seed, 1, own, most) for said, own in zip(messages, labels, strict=True)]
+    completions = yield calls
+    found: list[Any] = [
+        _counted(choices.from_logprobs(completion.logprobs or (), own), completion, "logprobs")
+        for completion, own in zip(completions, labels, strict=True)
+    ]
+    open_ = [place for place, reply in enumerate(found) if reply is None]
+    samples = [
+        replace(calls[place], temperature=1.0, seed=_seed(request.seed, 1 + vote), max_tokens=VOTE_TOKENS, logprobs=0)
+        for place in open_
+        for vote in range(votes)
+    ]
+    said = iter((yield samples) if samples else [])
+    for place in open_:
+        texts = [next(said) for _ in range(votes)]
+        counted = choices.from_votes([_text(each) for each in texts], labels[place])
+        found[place] = _counted(counted, texts[0], "votes")
+        if found[place] is None:
+            refused = structured.unfit(texts[0])
+            detail = f"none of {votes} answers begins with one of the {len(labels[place])} letters"
+            return Reply(texts[0].text, problem=refused or structured.problem("no_option", detail, texts[0]))
+    return found
+
+
+def _text(completion: Completion) -> str:
+    """What counts as a vote."""
+    return "" if structured.unfit(completion) else completion.text
+
+
+def _counted(outcome: tuple[NDArray[np.float64], float] | None, completion: Completion, by: str) -> Reply | None:
+    if outcome is None:
+        return None
+    probabilities, mass = outcome
+    return Reply(completion.text, probabilities=probabilities, mass=mass, by=by)

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Any server that speaks OpenAI's chat completions: vLLM, SGLang, hosted models, `wiw serve-vlm`."""
+
+from __future__ import annotations
+
+import email.utils
+import json
+import random
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
+
+from wiw.errors import ArgumentError, DependencyError, VlmError
+from wiw.vlm.base import Call, Client, Completion, Message
+from wiw.vlm.images import ImageFormat, to_data_uri
+
+Dialect = Literal["openai", "vllm", "legacy"]
+DIALECTS = ("openai", "vllm", "legacy")
+MOST_BYTES = 4 << 20
+"""Of a reply's body; what goes beyond is not read."""
+LONGEST_WAIT = 60.0
+"""Seconds that are waited before a request is sent again, however long the server asks for."""
+_PASSING = (408, 409, 425, 429)
+"""Client errors that may pass; so may all of the server's, 500 and above."""
+
+
+class OpenAIClient(Client):
+    """Asks a server over HTTP; the key of one that wants any is `$OPENAI_API_KEY`.
+
+    Args:
+        base_url: such as "http://localhost:8000/v1".
+        model: its name there; None means the only one that the server offers.
+        dialect: how choices and schemas are sent beside the prompt. "openai": `response_format`; "vllm":
+            `structured_outputs` too, for choices; "legacy": `guided_choice` and `guided_json` (vLLM before 0.12).
+        concurrency: most requests at a time.
+        timeout: seconds that one request may take.
+        attempts: times that it is sent in all while the server is busy or fails; how long it asks to wait is heeded.
+        image_format: "png", or "jpeg" for slow connections.
+        options: see `Client`.
+    """
+
+    def __init__(
+        self,
+        base_url: str,
+        model: str | None = None,
+        *,
+        dialect: Dialect = "openai",
+        concurrency: int = 8,
+        timeout: float = 120.0,
+        attempts: int = 4,
+        image_format: ImageFormat = "png",
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        if dialect not in DIALECTS or image_format not in ("png", "jpeg"):
+            raise ArgumentError(
+                f"vlm: expected dialect {', '.join(DIALECTS)}, image_format png or jpeg, got {dialect}, {image_format}"
+            )
+        if concurrency < 1 or attempts < 1 or not timeout > 0:
+            raise ArgumentError(
+                f"vlm: expected concurrency, attempts and timeout above 0, got {concurrency}, {attempts}, {timeout}"
+            )
+        self.base_url, self.dialect, self.image_format = base_url, dialect, image_format
+        self.concurrency, self.timeout, self.attempts = concurrency, timeout, attempts
+        self._model = model
+        self._given: dict[str, Any] = {
+            "model": model,
+            "dialect": dialect,
+            "concurrency": concurrency,
+        }
+        self._given |= {"timeout": timeout, "attempts": attempts, "image_format": image_format, **options}
+
+    def __reduce__(self) -> Any:
+        return _remade, (self.base_url, self._given)
+
+    @property
+    def model(self) -> str:
+        """The model's name at the server; asked for once where it was not given.
+
+        Raises:
+            VlmError: the server cannot be reached, or offers none or several.
+        """
+        if self._model is None:
+            names = [str(each.id) for each in self._asked_for(lambda: list(self._sdk.models.list()))]
+            if len(names) != 1:
+                raise VlmError(
+                    f"{self.base_url} offers {', '.join(names) or 'no models'}; name one as model=", "refused"
+                )
+            self._model = names[0]
+        return self._model
+
+    def complete(self, calls: Sequence[Call]) -> list[Completion]:
+        """All calls, at most `concurrency` at a time."""
+        images: dict[int, str] = {}
+        for call in calls:
+            for message in call.messages:
+                for part in message.content:
+                    if not isinstance(part, str) and id(part) not in images:
+                        images[id(part)] = to_data_uri(part, self.image_format)
+        bodies = [self._body(call, images) for call in calls]
+        with ThreadPoolExecutor(min(self.concurrency, len(bodies))) as pool:
+            return list(pool.map(self._sent, bodies))
+
+    @cached_property
+    def _sdk(self) -> Any:
+        try:
+            import openai
+        except ImportError:
+            raise DependencyError("asking OpenAI-compatible servers needs openai: pip install 'wiw[vlm]'") from None
+        import os
+
+        key = os.environ.get("OPENAI_API_KEY") or "none"
+        return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0)
+
+    def _body(self, call: Call, images: dict[int, str]) -> dict[str, Any]:
+        body: dict[str, Any] = {
+            "model": self.model,
+            "messages": [_message(message, images) for message in call.messages],
+            "temperature": call.temperature,
+            "seed": call.seed,
+            "max_tokens": call.max_tokens,
+        }
+        if call.logprobs:
+            body |= {"logprobs": True, "top_logprobs": call.logprobs}
+        extra: dict[str, Any] = {}
+        if call.labels and self.dialect != "openai":
+            choice = list(call.labels)
+            extra = (
+                {"guided_choice": choice} if self.dialect == "legacy" else {"structured_outputs": {"choice": choice}}
+            )
+        if call.schema is not None and self.dialect == "legacy":
+            extra = {"guided_json": call.schema}
+        elif call.schema is not None:
+            schema = {"name": "answer", "schema": call.schema, "strict": True}
+            body["response_format"] = {"type": "json_schema", "json_schema": schema}
+        return {**body, "extra_body": extra} if extra else body
+
+    def _sent(self, body: dict[str, Any]) -> Completion:
+        retries = _Retries()
+        completion = self._asked_for(lambda: self._received(body), retries)
+        return replace(completion, retries=retries.count)
+
+    def _received(self, body: dict[str, Any]) -> Completion:
+        """One request; the body is read piece by piece, so that neither its length nor its pace has the last word."""
+        until = time.monotonic() + self.timeout
+        data = bytearray()
+        with self._sdk.chat.completions.with_streaming_response.create(**body) as response:
+            for piece in _pieces(response):
+                data += piece
+                if len(data) > MOST_BYTES:
+                    return Completion(data[:1000].decode("utf-8", "replace"), "huge")
+                if time.monotonic() > until:
+                    raise TimeoutError(f"the reply was not complete within {self.timeout:g} s")
+        return _completion(bytes(data))
+
+    def _asked_for(self, work: Any, retries: _Retries | None = None) -> Any:
+        """Work that asks the server, done again where the server may come round.
+
+        Raises:
+            VlmError: it did not in `attempts`, or said that it never will.
+        """
+        import openai
+
+        retries = retries or _Retries()
+        while True:
+            try:
+                return work()
+            except openai.APIStatusError as error:
+                passing = error.status_code in _PASSING or error.status_code >= 500
+                said, kind, wait = (
+                    f"{error.status_code} {_short(error)}",
+                    "status" if passing else "refused",
+                    _asked_wait(error),
+                )
+            except (openai.APITimeoutError, TimeoutError) as error:
+                passing, said, kind, wait = (
+                    True,
+                    _short(error) or f"no answer within {self.timeout:g} s",
+                    "timeout",
+                    None,
+                )
+            except _NoCompletionError as error:
+                passing, said, kind, wait = True, _short(error), "protocol", None
+            except (openai.APIError, _BrokenOffError) as error:
+                passing, said, kind, wait = True, f"{type(error).__name__}: {_short(error)}", "unreachable", None
+            if not passing or retries.count + 1 >= self.attempts:
+                times = f"{retries.count + 1} tries" if retries.count else "1 try"
+                raise VlmError(f"{self.base_url}: {said} ({times})", kind)
+            time.sleep(min(LONGEST_WAIT, retries.pause() if wait is None else wait))
+            retries.count += 1
+
+
+@dataclass
+class _Retries:
+    """How often a request was sent in vain."""
+
+    count: int = 0
+
+    def pause(self) -> float:
+        """Seconds, doubling from a half, spread so that many clients do not come back at once."""
+        return float(0.5 * 2**self.count * (0.75 + 0.5 * random.random()))
+
+
+class _NoCompletionError(Exception):
+    """A reply that is no chat completion."""
+
+
+class _BrokenOffError(Exception):
+    """A connection that ended before the reply did."""
+
+
+def _pieces(response: Any) -> Iterator[bytes]:
+    """The body as it comes; what the SDK's transport raises meanwhile is of classes that it does not name."""
+    try:
+        yield from response.iter_bytes()
+    except Exception as error:
+        raise _BrokenOffError(f"{type(error).__name__}: {error}") from error
+
+
+def _remade(base_url: str, options: dict[str, Any]) -> OpenAIClient:
+    return OpenAIClient(base_url, **options)
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
+
+
+def _asked_wait(error: Any) -> float | None:
+    """Seconds that the server asks to wait: `Retry-After`, in seconds or as a date."""
+    value = error.response.headers.get("retry-after")
+    if value is None:
+        return None
+    try:
+        return max(0.0, float(value))
+    except ValueError:
+        when = email.utils.parsedate_tz(value)
+        return None if when is None else max(0.0, email.utils.mktime_tz(when) - time.time())
+
+
+def _message(message: Message, images: dict[int, str]) -> dict[str, Any]:
+    parts = [
+        {"type": "text", "text": part.encode("utf-8", "replace").decode()}
+        if isinstance(part, str)
+        else {"type": "image_url", "image_url": {"url": images[id(part)]}}
+        for part in message.content
+    ]
+    return {"role": message.role, "content": parts}
+
+
+def _completion(data: bytes) -> Completion:
+    """Raises _NoCompletionError where the body is something else than a chat completion."""
+    try:
+        body = json.loads(data)
+        choice = body["choices"][0]
+        message, usage = choice["message"], body.get("usage") or {}
+        refusal, text = message.get("refusal"), message.get("content")
+        text = text if isinstance(text, str) else ""
+        finish = "refusal" if refusal else str(choice.get("finish_reason") or "stop")
+        return Completion(
+            _clean(str(refusal) if refusal else text),
+            finish,
+            _first_token(choice.get("logprobs")),
+            int(usage.get("prompt_tokens") or 0),
+            int(usage.get("completion_tokens") or 0),
+        )
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+        begin = data[:80].decode("utf-8", "replace")
+        raise _NoCompletionError(f"expected a chat completion, got '{begin}' ({type(error).__name__})") from None
+
+
+def _clean(text: str) -> str:
+    """Text that can be written down: without lone surrogates."""
+    return text.encode("utf-8", "replace").decode()
+
+
+def _first_token(logprobs: Any) -> tuple[tuple[str, float], ...] | None:
+    """Likeliest first tokens; None where the server lists none."""
+    tokens = (logprobs or {}).get("content") or []
+    listed = tokens[0].get("top_logprobs") or [] if tokens else []
+    pairs = tuple((_clean(str(each["token"])), float(each["logprob"])) for each in listed)
+    return pairs or None

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tokens cost, as far as the user says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from wiw.errors import FileError
+
+
+@dataclass(frozen=True)
+class Prices:
+    """US dollars per million tokens by model: (read, written)."""
+
+    table: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def of(self, model: str, read: int, written: int) -> float | None:
+        """US dollars; None where the price is not known."""
+        price = self.table.get(model)
+        return None if price is None else (price[0] * read + price[1] * written) / 1e6
+
+    @classmethod
+    def load(cls, path: str | Path) -> Prices:
+        """From a YAML file of lines `model: [read, written]`.
+
+        Raises:
+            FileError: it cannot be read, or holds something else.
+        """
+        import yaml
+
+        try:
+            content = yaml.safe_load(Path(path).expanduser().read_text(encoding="utf-8"))
+            return cls({str(model): (float(read), float(written)) for model, (read, written) in content.items()})
+        except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError, TypeError, ValueError) as error:
+            raise FileError(
+                f"{path}: expected prices as `model: [read, written]`, dollars per million tokens: {error}"
+            ) from error

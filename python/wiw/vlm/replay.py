@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers that a run has recorded, given again to the same questions."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import FileError, VlmError
+from wiw.vlm.base import Call, Client, Completion
+
+
+class ReplayClient(Client):
+    """Stands in for the model of a run: what was asked then has its answer, and nothing else has.
+
+    Args:
+        run: the run's folder, or its run.sqlite.
+        model: the model that was asked; None means the only one that the run has recorded.
+        options: see `Client`; those of other clients are taken, and change nothing.
+
+    Raises:
+        FileError: no run there, or one that has recorded no answers, or those of several models and none is named.
+    """
+
+    def __init__(self, run: str | Path, model: str | None = None, **options: Any) -> None:
+        known = inspect.signature(Client).parameters
+        super().__init__(**{name: value for name, value in options.items() if name in known})
+        path = Path(run).expanduser()
+        self.path = path if path.suffix == ".sqlite" else path / "run.sqlite"
+        self._answers, models = _recorded(self.path, model)
+        if not models or (model is None and len(models) > 1):
+            raise FileError(f"{self.path}: expected answers of one model, got {', '.join(sorted(models)) or 'none'}")
+        self._model = model or models.pop()
+
+    @property
+    def model(self) -> str:
+        """The model whose answers these are."""
+        return self._model
+
+    def complete(self, calls: Sequence[Call]) -> list[Completion]:
+        """The recorded answers.
+
+        Raises:
+            VlmError: a question that the run has not put.
+        """
+        names = [self.name_of(call) for call in calls]
+        for name, call in zip(names, calls, strict=True):
+            if name not in self._answers:
+                begin = next((part for part in call.messages[-1].content if isinstance(part, str)), "")[:80]
+                raise VlmError(f"{self.path} holds no answer to this question ({name}): '{begin}...'", "missing")
+        return [self._answers[name] for name in names]
+
+
+def _recorded(path: Path, model: str | None) -> tuple[dict[str, Completion], set[str]]:
+    if not path.is_file():
+        raise FileError(f"no run at {path}: expected a folder with run.sqlite in it")
+    answers: dict[str, Completion] = {}
+    models: set[str] = set()
+    try:
+        connection = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+        rows = connection.execute("SELECT exchanges FROM decision WHERE exchanges != '[]'").fetchall()
+        connection.close()
+        for exchange in (exchange for (text,) in rows for exchange in json.loads(text)):
+            if model in (None, exchange["model"]):
+                models.add(exchange["model"])
+                answers |= {said["call"]: Completion.from_json(said) for said in exchange["said"]}
+    except (sqlite3.Error, ValueError, KeyError, TypeError) as error:
+        raise FileError(f"{path}: the recorded answers cannot be read: {error}") from error
+    return answers, models

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A model in this process, through the auto classes of `transformers`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import DependencyError, WeightsError
+from wiw.vlm.base import Call, Client, Completion, Message
+from wiw.vlm.choices import AROUND
+from wiw.vlm.instances import instance
+from wiw.vlm.tiny import NEEDED
+
+LISTED = 256
+"""Likeliest first tokens that are looked at."""
+
+
+class TransformersClient(Client):
+    """Asks a local image-text-to-text model; requests one after the other.
+
+    Multiple choice reads the scores of the first token. Objects that fit a schema are made by letting the model choose
+    between the schema's ways to go on, so that they are always well-formed.
+
+    Args:
+        path: a folder or hub name that `AutoModelForImageTextToText.from_pretrained` takes.
+        device: of torch; None means a GPU if there is one.
+        dtype: of the weights, such as "bfloat16"; None means as they were saved.
+        options: see `Client`.
+
+    Raises:
+        DependencyError: torch or transformers is not installed.
+        WeightsError: the model cannot be loaded.
+    """
+
+    def __init__(
+        self, path: str | Path, *, device: str | None = None, dtype: str | None = None, **options: Any
+    ) -> None:
+        super().__init__(**options)
+        self.path, self._given = str(path), {"device": device, "dtype": dtype, **options}
+        try:
+            import torch
+            import transformers as hf
+        except ImportError as error:
+            raise DependencyError(f"{NEEDED}: {error}") from None
+        self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+        try:
+            self._processor = hf.AutoProcessor.from_pretrained(self.path)
+            network: Any = hf.AutoModelForImageTextToText.from_pretrained(self.path, dtype=dtype or "auto")
+        except (OSError, ValueError) as error:
+            raise WeightsError(
+                f"{self.path}: no vision-language model can be loaded from there: {error}. Expected a folder with "
+                "config.json, weights and processor, or a hub name that this machine can reach"
+            ) from error
+        self._network = network.to(self.device).eval()
+
+    def __reduce__(self) -> Any:
+        return _remade, (self.path, self._given)
+
+    @property
+    def model(self) -> str:
+        """The folder's name, or the hub's."""
+        return Path(self.path).name if Path(self.path).exists() else self.path
+
+    def complete(self, calls: Sequence[Call]) -> list[Completion]:
+        """One after the other."""
+        return [self._one(call) for call in calls]
+
+    def _one(self, call: Call) -> Completion:
+        inputs = self._inputs(call.messages)
+        read = int(inputs["input_ids"].shape[1])
+        if call.logprobs:
+            listed = self._first_tokens(inputs)
+            told = [
+                pair for rank, pair in enumerate(listed) if rank < call.logprobs or pair[0].strip(AROUND) in call.labels
+            ]
+            return Completion(listed[0][0], "length", tuple(told), read, 1)
+        if call.schema is not None:
+            text = self._instance(call)
+            return Completion(text, "stop", None, read, self._length(text))
+        tokens = self._written(inputs, call)
+        text = self._tokenizer.decode(tokens, skip_special_tokens=True)
+        finish = "stop" if len(tokens) and tokens[-1] == self._tokenizer.eos_token_id else "length"
+        return Completion(text, finish, None, read, len(tokens))
+
+    @property
+    def _tokenizer(self) -> Any:
+        return self._processor.tokenizer
+
+    def _length(self, text: str) -> int:
+        return len(self._tokenizer(text, add_special_tokens=False)["input_ids"])
+
+    def _inputs(self, messages: Sequence[Message], begun: str = "") -> Any:
+        """Tensors of a conversation, with the answer begun."""
+        from PIL import Image
+
+        turns, images = [], []
+        for message in messages:
+            parts: list[dict[str, str]] = []
+            for part in message.content:
+                if isinstance(part, str):
+                    parts.append({"type": "text", "text": part})
+                else:
+                    parts.append({"type": "image"})
+                    images.append(Image.fromarray(part))
+            turns.append({"role": message.role, "content": parts})
+        text = self._processor.apply_chat_template(turns, add_generation_prompt=True, tokenize=False) + begun
+        return self._processor(text=[text], images=images or None, return_tensors="pt").to(self.device)
+
+    def _first_tokens(self, inputs: Any) -> list[tuple[str, float]]:
+        import torch
+
+        with torch.inference_mode():
+            scores = torch.log_softmax(self._network(**inputs).logits[0, -1].float(), dim=-1)
+        values, ids = scores.topk(min(LISTED, len(scores)))
+        return [
+            (self._tokenizer.decode([token]), value) for token, value in zip(ids.tolist(), values.tolist(), strict=True)
+        ]
+
+    def _written(self, inputs: Any, call: Call) -> list[int]:
+        import torch
+
+        sampling = (
+            {"do_sample": True, "temperature": call.temperature} if call.temperature > 0 else {"do_sample": False}
+        )
+        with torch.inference_mode(), torch.random.fork_rng():
+            torch.manual_seed(call.seed)
+            whole = self._network.generate(**inputs, max_new_tokens=call.max_tokens, **sampling)
+        return list(whole[0, inputs["input_ids"].shape[1] :].tolist())
+
+    def _instance(self, call: Call) -> str:
+        """An object that fits the schema; each choice is drawn by the scores of the tokens that options begin with."""
+        import torch
+
+        assert call.schema is not None
+        random = torch.Generator().manual_seed(call.seed)
+
+        def choose(before: str, options: Sequence[str]) -> int:
+            if len(options) == 1:
+                return 0
+            firsts = [self._tokenizer(option, add_special_tokens=False)["input_ids"][-1] for option in options]
+            with torch.inference_mode():
+                scores = self._network(**self._inputs(call.messages, before)).logits[0, -1, firsts].float().cpu()
+            if call.temperature == 0:
+                return int(scores.argmax())
+            return int(torch.multinomial(torch.softmax(scores / call.temperature, -1), 1, generator=random))
+
+        return instance(call.schema, choose)
+
+
+def _remade(path: str, options: dict[str, Any]) -> TransformersClient:
+    return TransformersClient(path, **options)

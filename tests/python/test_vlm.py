@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clients of vision-language models: choices, JSON, caches, records and a real model with random weights."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pydantic = pytest.importorskip("pydantic")
+pytest.importorskip("json_repair")
+
+from wiw.errors import ArgumentError, FileError, VlmError, WeightsError  # noqa: E402
+from wiw.vlm import Request, choices, connect, user  # noqa: E402
+from wiw.vlm.base import Completion  # noqa: E402
+from wiw.vlm.cache import ReplyCache, reply_cache  # noqa: E402
+from wiw.vlm.images import from_data_uri, to_data_uri  # noqa: E402
+from wiw.vlm.instances import instance  # noqa: E402
+from wiw.vlm.mock import MockClient  # noqa: E402
+from wiw.vlm.prices import Prices  # noqa: E402
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+
+
+class Plan(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid")
+    reason: str
+    actions: list[Literal["forward", "turn_left"]] = pydantic.Field(min_length=1, max_length=4)
+
+
+def ask(client: Any, *content: Any, **options: Any) -> Any:
+    return client.ask([Request((user(*content),), **options)])[0]
+
+
+def slow_choice(listed: dict[str, float], labels: str) -> list[float]:
+    """The recipe, one step after the other, in probabilities."""
+    own = dict.fromkeys(labels, 0.0)
+    for token, value in listed.items():
+        if token.strip(" (.)") in own:
+            own[token.strip(" (.)")] += math.exp(value)
+    least = min(math.exp(min(listed.values())), max(1 - sum(math.exp(value) for value in listed.values()), 1e-300))
+    weights = [own[label] or least for label in labels]
+    return [weight / sum(weights) for weight in weights]
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(["A", " A", "(A", "B", " B", "B)", "C", " D", "the", "I", "\n"]), st.floats(-20, 0), min_size=1
+    )
+)
+def test_choices_equal_their_slow_twin(listed: dict[str, float]) -> None:
+    found = choices.from_logprobs(list(listed.items()), "ABCD")
+    named = [token for token in listed if token.strip(" (.)") in set("ABCD")]
+    if not named:
+        assert found is None
+        return
+    assert found is not None
+    np.testing.assert_allclose(found[0], slow_choice(listed, "ABCD"), rtol=1e-9, atol=1e-12)
+    assert found[1] == pytest.approx(min(1.0, sum(math.exp(listed[token]) for token in named)))
+
+
+def test_tokens_that_a_server_forbids_count_nothing() -> None:
+    found = choices.from_logprobs([("A", -0.1), ("B", -9999.0), ("x", -math.inf), ("y", math.nan)], "ABC")
+    assert found is not None
+    np.testing.assert_allclose(found[0], [1, 0, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "vote"),
+    [
+        ("B", 1), ("b", 1), (" (B) chair", 1), ("B. chair", 1), ("**B**", 1), ("The answer is C.", 2), ("Answer: A", 0),
+        ("A chair", None), ("I'm sorry", None), ("Bad", None), ("", None), ("D", None), ("It is B", None),
+        ("?" * 5000, None),
+    ],
+)  # fmt: skip
+def test_votes_are_letters_that_stand_alone(text: str, vote: int | None) -> None:
+    found = choices.from_votes([text], tuple("ABC"))
+    assert found is None if vote is None else found is not None and found[0].argmax() == vote and found[1] == 1
+
+
+def test_a_server_without_logprobs_is_asked_for_votes_and_the_reply_says_so() -> None:
+    texts = iter(["?", "A", "(B)", "b", "no idea", "B."])
+    client = MockClient(lambda call: Completion(next(texts)))
+    reply = ask(client, "Which?", choices=("x", "y"))
+    assert (reply.by, reply.mass) == ("votes", 0.8) and reply.problem is None
+    assert reply.probabilities.tolist() == [0.25, 0.75]
+    assert len({call.seed for call in client.asked}) == 6 and {call.temperature for call in client.asked[1:]} == {1.0}
+
+
+def test_mass_below_one_half_is_doubtful() -> None:
+    reply = ask(MockClient(lambda call: {"A": 0.2, " B": 0.1, "The": 0.7}), "Which?", choices=("x", "y"))
+    assert reply.doubtful and reply.mass == pytest.approx(0.3)
+    np.testing.assert_allclose(reply.probabilities, [2 / 3, 1 / 3])
+
+
+@pytest.mark.parametrize(("count", "most"), [(5, 20), (27, 20), (27, 3), (60, 7), (3, 2)])
+def test_rounds_find_the_distribution_of_a_model_that_is_consistent(count: int, most: int) -> None:
+    """A model whose odds between two options never change has the same distribution in one round as in several."""
+    truth = np.random.default_rng(count).dirichlet(np.ones(count))
+
+    def script(call: Any) -> dict[str, float]:
+        lines = call.messages[-1].content[-1].splitlines()
+        shown = {line[0]: truth[int(line.split(" o")[1])] for line in lines if " o" in line and line[1] == "."}
+        assert len(shown) <= most
+        return {label: p / sum(shown.values()) for label, p in shown.items()}
+
+    reply = ask(MockClient(script, top_logprobs=most), "Which?", choices=tuple(f"o{i}" for i in range(count)))
+    np.testing.assert_allclose(reply.probabilities, truth, rtol=1e-6)
+
+
+def test_requests_that_make_no_sense_are_refused() -> None:
+    for wrong in ({"choices": ("a",)}, {"choices": ("a", "a")}, {"choices": ("a", "b"), "schema": Plan}, {"tries": 0}):
+        with pytest.raises(ArgumentError):
+            Request((user("?"),), **wrong)
+    for spec in ("ftp://x", "transformers:", "replay", "mock:3"):
+        with pytest.raises(ArgumentError, match="expected http"):
+            connect(spec)
+    with pytest.raises(ArgumentError, match="no option colour; there are script"):
+        connect("mock", colour="red")
+    with pytest.raises(ArgumentError, match="top_logprobs from 2 to 26"):
+        connect("mock", top_logprobs=40)
+
+
+@pytest.mark.parametrize(
+    ("text", "actions", "repaired"),
+    [
+        ('{"reason": "a", "actions": ["forward"]}', ["forward"], False),
+        ('Sure!\n```json\n{"reason": "a } b", "actions": ["forward"]}\n```', ["forward"], False),
+        ("{'reason': 'a', 'actions': ['forward', 'turn_left',]}", ["forward", "turn_left"], True),
+        ('{reason: "a", actions: ["forward"]} and so on', ["forward"], True),
+    ],
+)
+def test_json_is_found_and_slips_are_mended(text: str, actions: list[str], repaired: bool) -> None:
+    reply = ask(MockClient(lambda call: text), "Plan!", schema=Plan)
+    assert reply.value.actions == actions and reply.repaired is repaired and reply.problem is None
+
+
+def test_an_unusable_answer_is_asked_for_again_then_it_is_the_outcome() -> None:
+    texts = iter(["nonsense", '{"reason": "a", "actions": ["forward"]}'])
+    client = MockClient(lambda call: next(texts))
+    reply = ask(client, "Plan!", schema=Plan, tries=2)
+    assert reply.value.actions == ["forward"] and [said.used for said in reply.said] == [False, True]
+    first, second = client.asked
+    assert first.temperature == 0 and second.temperature > 0 and first.seed != second.seed
+    reply = ask(MockClient(lambda call: "nonsense"), "Plan!", schema=Plan, tries=2)
+    assert reply.value is None and reply.problem.kind == "malformed" and reply.problem.raw == "nonsense"
+    assert len(reply.said) == 2
+
+
+def test_a_question_is_named_by_all_that_its_answer_depends_on() -> None:
+    client = MockClient()
+    base: dict[str, Any] = {"choices": ("a", "b")}
+    names = set()
+    other = IMAGE.copy()
+    other[3, 4, 1] ^= 1
+    for content, options in (
+        ((IMAGE, "?"), base),
+        ((other, "?"), base),
+        ((IMAGE, "!"), base),
+        (("?", IMAGE), base),
+        ((IMAGE, "?"), {**base, "seed": 1}),
+        ((IMAGE, "?"), {"choices": ("a", "c")}),
+        ((IMAGE, "?"), {"schema": Plan}),
+        ((IMAGE, "?"), {"temperature": 0.5}),
+        ((IMAGE.reshape(60, 40, 3), "?"), base),
+    ):
+        names.add(ask(client, *content, **options).said[0].call)
+    names.add(ask(MockClient(model="other"), IMAGE, "?", **base).said[0].call)
+    assert len(names) == 10
+    assert ask(MockClient(), IMAGE.copy(), "?", **base).said[0].call in names
+
+
+def test_the_cache_answers_what_was_of_use(tmp_path: Path) -> None:
+    texts = iter(["nonsense", '{"reason": "a", "actions": ["forward"]}', "nonsense", "more"])
+    first = MockClient(lambda call: next(texts), cache=ReplyCache(tmp_path), prices=Prices({"mock": (1.0, 2.0)}))
+    reply = ask(first, IMAGE, schema=Plan)
+    assert first.spent["vlm_calls"] == 2 and first.spent["vlm_cached"] == 0
+    read, written = first.spent["vlm_input_tokens"], first.spent["vlm_output_tokens"]
+    assert first.spent["vlm_usd"] == pytest.approx((read + 2 * written) / 1e6)
+    again = MockClient(lambda call: "nonsense", cache=ReplyCache(tmp_path))
+    second = ask(again, IMAGE, schema=Plan)  # the unusable answer comes again, and then the one that was kept
+    assert second.value == reply.value and again.spent["vlm_calls"] == 1 and again.spent["vlm_cached"] == 1
+    assert "vlm_usd" not in again.spent
+    assert pickle.loads(pickle.dumps(ReplyCache(tmp_path))).folder == tmp_path
+    assert reply_cache("off") is None
+
+
+def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cache = ReplyCache(tmp_path, 20_000 / 2**30)
+    for k in range(60):
+        cache.put({f"k{k}": Completion("x" * 1000)})
+    kept = [k for k in range(60) if cache.get(f"k{k}")]
+    assert kept == list(range(60 - len(kept), 60)) and 12 <= len(kept) <= 18
+    with sqlite3.connect(tmp_path / "replies.sqlite") as connection:
+        connection.execute("UPDATE reply SET data = '{' WHERE name = 'k59'")
+    assert cache.get("k59") is None and "damaged" in caplog.text
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/replies.sqlite").write_bytes(b"no database" * 100)
+    broken = ReplyCache(tmp_path / "broken")
+    assert broken.get("a") is None and "not kept any more" in caplog.text
+    broken.put({"a": Completion("x")})
+    with pytest.raises(ArgumentError, match="above 0"):
+        ReplyCache(tmp_path, 0)
+
+
+def test_prices_come_from_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "prices.yaml"
+    path.write_text("big: [2.5, 10]\n")
+    prices = Prices.load(path)
+    assert prices.of("big", 1_000_000, 100_000) == pytest.approx(3.5) and prices.of("small", 1, 1) is None
+    for wrong in ("big: 3", "- big", "big: [1, x]", "{", ""):
+        path.write_text(wrong)
+        with pytest.raises(FileError, match="dollars per million tokens"):
+            Prices.load(path)
+
+
+def test_images_travel_as_data_uris() -> None:
+    assert (from_data_uri(to_data_uri(IMAGE)) == IMAGE).all()
+    smooth = np.linspace(0, 255, 40 * 60 * 3).reshape(40, 60, 3).astype(np.uint8)
+    jpeg = from_data_uri(to_data_uri(smooth, "jpeg"))
+    assert np.abs(jpeg.astype(int) - smooth).max() < 12
+    for wrong in (
+        "x",
+        "data:image/png;base64,",
+        "data:image/png;base64,!!",
+        "data:text/plain;base64,QQ==",
+        "data:image/png;base64,QQ==",
+    ):
+        with pytest.raises(ArgumentError, match=r"data:image|cannot be read"):
+            from_data_uri(wrong)
+    with pytest.raises(ArgumentError, match="uint8"):
+        to_data_uri(IMAGE.astype(np.float32))
+
+
+class Leaf(pydantic.BaseModel):
+    size: int = pydantic.Field(ge=2, le=5)
+    kind: Literal["a", "b"] | None
+    share: float = pydantic.Field(ge=0, le=1)
+
+
+class Tree(pydantic.BaseModel):
+    name: str = pydantic.Field(max_length=5)
+    leaves: list[Leaf] = pydantic.Field(max_length=3)
+    alive: bool
+
+
+@given(st.randoms(use_true_random=False))
+def test_instances_fit_their_schema(random: Any) -> None:
+    text = instance(Tree.model_json_schema(), lambda before, options: random.randrange(len(options)))
+    Tree.model_validate(json.loads(text))
+
+
+def test_a_recorded_answer_is_given_again_and_nothing_else(tmp_path: Path) -> None:
+    reply = ask(MockClient(), IMAGE, choices=("a", "b"))
+    exchange = {
+        "model": "mock",
+        "said": [{"call": said.call, **json.loads(json.dumps(said.completion.to_json()))} for said in reply.said],
+    }
+    with sqlite3.connect(tmp_path / "run.sqlite") as connection:
+        connection.execute("CREATE TABLE decision (exchanges TEXT)")
+        connection.execute("INSERT INTO decision VALUES (?), ('[]')", (json.dumps([exchange]),))
+    replay = connect(f"replay:{tmp_path}")
+    assert replay.model == "mock"
+    np.testing.assert_array_equal(ask(replay, IMAGE, choices=("a", "b")).probabilities, reply.probabilities)
+    with pytest.raises(VlmError, match="holds no answer") as error:
+        ask(replay, IMAGE, choices=("a", "c"))
+    assert error.value.kind == "missing"
+    with pytest.raises(FileError, match="one model, got none"):
+        connect(f"replay:{tmp_path}", model="another")
+    with pytest.raises(FileError, match="no run at"):
+        connect(f"replay:{tmp_path / 'nowhere'}")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    pytest.importorskip("transformers")
+    from wiw.vlm.tiny import make_tiny
+
+    yield make_tiny(tmp_path_factory.mktemp("vlm") / "tiny")
+
+
+def test_a_local_model_answers_by_the_scores_of_the_first_token(tiny: Path) -> None:
+    import torch
+
+    client = connect(f"transformers:{tiny}", device="cpu")
+    reply = ask(client, "Which?", IMAGE, choices=("a", "b", "c"))
+    mock = MockClient()
+    ask(mock, "Which?", IMAGE, choices=("a", "b", "c"))
+    inputs = client._inputs(mock.asked[0].messages)
+    with torch.inference_mode():
+        scores = torch.softmax(client._network(**inputs).logits[0, -1].double(), -1)
+    words = client._tokenizer.get_vocab()
+    slow = [float(scores[words[letter]] + scores[words["\u2581" + letter]]) for letter in "ABC"]
+    np.testing.assert_allclose(reply.probabilities, np.array(slow) / sum(slow), rtol=1e-4)
+    assert reply.mass == pytest.approx(sum(slow), rel=1e-4)
+    other = ask(client, "Which?", 255 - IMAGE, choices=("a", "b", "c"))
+    assert not np.array_equal(reply.probabilities, other.probabilities), "the image is not looked at"
+
+
+def test_a_local_model_writes_text_and_objects(tiny: Path) -> None:
+    client = pickle.loads(pickle.dumps(connect(f"transformers:{tiny}", device="cpu")))
+    first, again, other = client.ask(
+        [Request((user("Say", IMAGE),), temperature=1.0, seed=seed, max_tokens=12) for seed in (0, 0, 1)]
+    )
+    assert first.text == again.text != other.text
+    plan = ask(client, "Plan!", IMAGE, schema=Plan, temperature=1.0)
+    assert 1 <= len(plan.value.actions) <= 4 and not plan.repaired
+    assert client.spent["vlm_input_tokens"] > 4 * 49 and client.spent["vlm_output_tokens"] > 20
+
+
+def test_weights_that_are_not_there(tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    with pytest.raises(WeightsError, match=r"config\.json"):
+        connect(f"transformers:{tmp_path}")
