@@ -22,6 +22,7 @@ from wiw.cli.run import resume, run
 from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
+from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
@@ -54,6 +55,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (serve, "serve", "Serve a world model to other processes or machines."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),
+    (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
     (train, "train", "Train the recogniser of Active Recognition."),
 )

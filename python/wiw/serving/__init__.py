@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""World models for other processes and machines: rows of many clients become full batches of one model."""
+"""Models behind sockets: world models for other processes and machines, and a vision-language model for tests."""

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A small OpenAI-compatible server of chat completions on the loopback interface, with any `Client` behind it.
+
+It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests ask for
+them, and misbehaves on demand.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Mapping
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from wiw.errors import ArgumentError, Error
+from wiw.serving.misbehaviour import Misbehaviour, spoiled
+from wiw.vlm.base import Call, Client, Completion, Message, Part
+from wiw.vlm.images import from_data_uri
+
+MOST_BYTES = 256 << 20
+"""Of a request's body."""
+
+
+class VlmServer:
+    """Serves on 127.0.0.1 from `start` to `stop`; works as a context manager.
+
+    Args:
+        client: answers the completions.
+        port: 0 takes a free one; see `url`.
+        misbehaviour: what goes wrong, and how often.
+    """
+
+    def __init__(self, client: Client, port: int = 0, misbehaviour: Misbehaviour | None = None) -> None:
+        self.client, self.misbehaviour = client, misbehaviour or Misbehaviour()
+        self.requests: list[dict[str, Any]] = []
+        """Bodies of the latest 1000 requests, without their images' data."""
+        self.count = 0
+        self._asking, self._counting = threading.Lock(), threading.Lock()
+        try:
+            self._http = _Http(("127.0.0.1", port), _Handler)
+        except OSError as error:
+            raise ArgumentError(f"serve-vlm: cannot listen on port {port}: {error}; choose another --port") from None
+        self._http.server = self
+
+    @property
+    def url(self) -> str:
+        """What clients are told, as in "http://127.0.0.1:8000/v1"."""
+        return f"http://127.0.0.1:{self._http.server_address[1]}/v1"
+
+    def start(self) -> VlmServer:
+        """Serves in a thread."""
+        threading.Thread(target=self._http.serve_forever, args=(0.05,), daemon=True, name="wiw serve-vlm").start()
+        return self
+
+    def serve(self) -> None:
+        """Serves until it is interrupted."""
+        self._http.serve_forever()
+
+    def stop(self) -> None:
+        """Ends serving."""
+        self._http.shutdown()
+        self._http.server_close()
+
+    def __enter__(self) -> VlmServer:
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def answer(self, body: dict[str, Any], number: int, fault: str | None) -> dict[str, Any]:
+        """The completion of one request.
+
+        Raises:
+            Error: the request cannot be understood.
+        """
+        call = call_of(body)
+        with self._asking:
+            (completion,) = self.client.complete([call])
+        return _chat_completion(spoiled(completion, fault, number), self.client.model, number)
+
+    def numbered(self, body: dict[str, Any]) -> int:
+        """Counts a request and notes it."""
+        with self._counting:
+            self.requests = [*self.requests[-999:], _without_images(body)]
+            self.count += 1
+            return self.count - 1
+
+
+class _Http(ThreadingHTTPServer):
+    daemon_threads = True
+    server: VlmServer
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version = "wiw"
+
+    def log_message(self, *_: Any) -> None:
+        """Silence: the server is asked thousands of times."""
+
+    def do_GET(self) -> None:
+        server: VlmServer = self.server.server  # type: ignore[attr-defined]
+        if self.path.rstrip("/") == "/v1/models":
+            models = [{"id": server.client.model, "object": "model", "created": 0, "owned_by": "wiw"}]
+            self._send(200, {"object": "list", "data": models})
+        elif self.path == "/health":
+            self._send(200, {})
+        else:
+            self._send(404, _error(f"no such path: {self.path}"))
+
+    def do_POST(self) -> None:
+        server: VlmServer = self.server.server  # type: ignore[attr-defined]
+        length = int(self.headers.get("content-length") or 0)
+        if self.path.rstrip("/") != "/v1/chat/completions" or length > MOST_BYTES:
+            self.close_connection = True
+            self._send(404 if length <= MOST_BYTES else 413, _error(f"{self.path}: {length} bytes"))
+            return
+        try:
+            body = json.loads(self.rfile.read(length))
+            number = server.numbered(body)
+            fault = server.misbehaviour.fault(number)
+            if fault == "429":
+                wait = f"{server.misbehaviour.retry_after:g}"
+                self._send(429, _error("too many requests"), {"Retry-After": wait})
+                return
+            if fault == "500":
+                self._send(500, _error("something broke"))
+                return
+            if fault == "slow":
+                time.sleep(server.misbehaviour.slow_seconds)
+            self._send(200, server.answer(body, number, fault))
+        except (Error, ValueError, KeyError, TypeError, AttributeError) as error:
+            self._send(400, _error(f"{type(error).__name__}: {error}"))
+
+    def _send(self, status: int, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> None:
+        data = json.dumps(body).encode()
+        try:
+            self.send_response(status)
+            self.send_header("Content-Type", "application/json")
+            self.send_header("Content-Length", str(len(data)))
+            for name, value in (headers or {}).items():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(data)
+        except (BrokenPipeError, ConnectionResetError):  # the client has had enough
+            self.close_connection = True
+
+
+def call_of(body: Mapping[str, Any]) -> Call:
+    """What a request asks for.
+
+    Raises:
+        ArgumentError: an image that is no data URI, or several completions at once.
+        KeyError: no messages.
+    """
+    if int(body.get("n") or 1) != 1 or body.get("stream"):
+        raise ArgumentError("expected n = 1 and no streaming")
+    outputs = body.get("structured_outputs") or {}
+    labels = outputs.get("choice") or body.get("guided_choice") or ()
+    wanted = body.get("response_format") or {}
+    schema = (wanted.get("json_schema") or {}).get("schema") or outputs.get("json") or body.get("guided_json")
+    return Call(
+        messages=tuple(Message(each["role"], _parts(each["content"])) for each in body["messages"]),
+        temperature=float(body.get("temperature") or 0.0),
+        seed=int(body.get("seed") or 0),
+        max_tokens=int(body.get("max_tokens") or body.get("max_completion_tokens") or 256),
+        labels=tuple(str(label) for label in labels),
+        logprobs=int(body.get("top_logprobs") or 0) if body.get("logprobs") else 0,
+        schema=schema,
+    )
+
+
+def _parts(content: Any) -> tuple[Part, ...]:
+    if isinstance(content, str):
+        return (content,)
+    return tuple(
+        str(part["text"]) if part["type"] == "text" else from_data_uri(part["image_url"]["url"]) for part in content
+    )
+
+
+def _without_images(body: dict[str, Any]) -> dict[str, Any]:
+    return {
+        **body,
+        "messages": [
+            {
+                **each,
+                "content": each["content"]
+                if isinstance(each["content"], str)
+                else [part if part["type"] == "text" else {"type": "image_url"} for part in each["content"]],
+            }
+            for each in body["messages"]
+        ],
+    }
+
+
+def _chat_completion(completion: Completion, model: str, number: int) -> dict[str, Any]:
+    refused = completion.finish == "refusal"
+    message = {
+        "role": "assistant",
+        "content": None if refused else completion.text,
+        "refusal": completion.text if refused else None,
+    }
+    choice: dict[str, Any] = {
+        "index": 0,
+        "message": message,
+        "finish_reason": "content_filter" if refused else completion.finish,
+        "logprobs": None,
+    }
+    if completion.logprobs is not None:
+        listed = [{"token": token, "logprob": value, "bytes": None} for token, value in completion.logprobs]
+        choice["logprobs"] = {"content": [{**listed[0], "top_logprobs": listed}]} if listed else {"content": []}
+    tokens = completion.prompt_tokens, completion.completion_tokens
+    return {
+        "id": f"chatcmpl-{number}",
+        "object": "chat.completion",
+        "created": int(time.time()),
+        "model": model,
+        "choices": [choice],
+        "usage": {"prompt_tokens": tokens[0], "completion_tokens": tokens[1], "total_tokens": sum(tokens)},
+    }
+
+
+def _error(message: str) -> dict[str, Any]:
+    return {"error": {"message": message, "type": "invalid_request_error", "code": None}}

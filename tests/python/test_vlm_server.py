@@ -1,0 +1,245 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The OpenAI client against the loopback server: every dialect, and everything that a server can do wrong."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+pydantic = pytest.importorskip("pydantic")
+pytest.importorskip("openai")
+
+from wiw.errors import ArgumentError, VlmError  # noqa: E402
+from wiw.serving.misbehaviour import FAULTS, Misbehaviour  # noqa: E402
+from wiw.serving.vlm_server import VlmServer  # noqa: E402
+from wiw.vlm import Request, connect, user  # noqa: E402
+from wiw.vlm.mock import MockClient  # noqa: E402
+
+IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+
+
+class Plan(pydantic.BaseModel):
+    reason: str
+    actions: list[Literal["forward", "turn_left"]] = pydantic.Field(min_length=1, max_length=4)
+
+
+REQUESTS = [
+    Request((user("Which?", IMAGE),), choices=("a", "b", "c")),
+    Request((user("Plan!", IMAGE, IMAGE),), schema=Plan, temperature=1.0, seed=3),
+    Request((user("Say"),), max_tokens=10),
+    Request((user("Which?"),), choices=tuple(f"o{i}" for i in range(27))),
+]
+
+
+def failing(rates: dict[str, float], **options: Any) -> Misbehaviour:
+    return Misbehaviour(rates, slow_seconds=0.5, retry_after=0.05, **options)
+
+
+def parts_of(call: Any) -> tuple[Any, ...]:
+    return tuple(part if isinstance(part, str) else part.tobytes() for part in call.messages[0].content)
+
+
+@pytest.mark.parametrize("dialect", ["openai", "vllm", "legacy"])
+def test_what_goes_over_the_wire_is_what_was_asked(dialect: str) -> None:
+    with VlmServer(MockClient()) as server:
+        client = connect(server.url, dialect=dialect)
+        assert client.model == "mock"
+        replies = client.ask(REQUESTS)
+        asked = server.client.asked
+        direct = MockClient()
+        direct.ask(REQUESTS)
+        twins = {parts_of(call): call for call in direct.asked}
+        for call in (call for call in asked if parts_of(call) in twins):
+            twin = twins[parts_of(call)]
+            assert call.schema == twin.schema and call.temperature in (twin.temperature, 1.0)
+            assert call.labels == (() if dialect == "openai" else twin.labels)
+            if call.logprobs:
+                assert (call.seed, call.max_tokens, call.logprobs) == (twin.seed, twin.max_tokens, twin.logprobs)
+        assert {parts_of(call) for call in direct.asked[:3]} <= {parts_of(call) for call in asked}
+        assert all(reply.problem is None for reply in replies)
+        assert [reply.by for reply in replies] == ["logprobs", "", "", "logprobs"]
+        assert client.spent["vlm_calls"] == len(asked) and client.spent["vlm_retries"] == 0
+        assert client.spent["vlm_input_tokens"] > 0
+        extra = {"openai": "response_format", "vllm": "structured_outputs", "legacy": "guided_choice"}[dialect]
+        assert any(extra in body for body in server.requests)
+
+
+def test_a_busy_or_failing_server_is_asked_again_as_it_wishes() -> None:
+    with VlmServer(MockClient(), misbehaviour=failing({"429": 0.3, "500": 0.1}, seed=5)) as server:
+        client = connect(server.url, dialect="vllm", attempts=8, concurrency=2)
+        replies = client.ask(REQUESTS * 3)
+        assert all(reply.problem is None for reply in replies)
+        assert client.spent["vlm_retries"] == server.count - client.spent["vlm_calls"] > 0
+
+
+def test_retry_after_is_heeded() -> None:
+    faults = Misbehaviour({"429": 1.0}, retry_after=0.4)
+    with VlmServer(MockClient(), misbehaviour=faults) as server:
+        begin = time.monotonic()
+        with pytest.raises(VlmError, match=r"429.*\(3 tries\)") as error:
+            connect(server.url, model="mock", attempts=3).ask(REQUESTS[2:3])
+        assert error.value.kind == "status" and time.monotonic() - begin >= 0.8 and server.count == 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind"),
+    [("truncated", "truncated"), ("refusal", "refusal"), ("huge", "huge")],
+)
+def test_answers_that_no_one_can_use_are_outcomes(fault: str, kind: str) -> None:
+    with VlmServer(MockClient(), misbehaviour=failing({fault: 1.0})) as server:
+        client = connect(server.url, model="mock", dialect="vllm")
+        (reply,) = client.ask([Request((user("Plan!"),), schema=Plan, tries=2)])
+        assert reply.problem is not None and reply.problem.kind == kind and reply.value is None
+        assert len(reply.problem.raw) <= 500 and server.count == 2
+        if fault != "truncated":  # half a letter is none, and then votes are asked for
+            (choice,) = client.ask([REQUESTS[0]])
+            assert choice.problem is not None and choice.problem.kind == kind and choice.probabilities is None
+
+
+def test_malformed_answers_are_outcomes_too() -> None:
+    with VlmServer(MockClient(), misbehaviour=failing({"malformed": 1.0})) as server:
+        client = connect(server.url, model="mock", dialect="vllm")
+        replies = client.ask([Request((user(f"Plan {k}!"),), schema=Plan, tries=1) for k in range(24)])
+        kinds = {reply.problem.kind for reply in replies if reply.problem}
+        assert kinds <= {"malformed", "schema", "truncated", "empty"} and "schema" in kinds
+        for reply in replies:
+            assert (reply.value is None) != (reply.problem is None)
+
+
+def test_a_slow_server_is_not_waited_for() -> None:
+    with VlmServer(MockClient(), misbehaviour=failing({"slow": 1.0})) as server:
+        client = connect(server.url, model="mock", timeout=0.1, attempts=2)
+        with pytest.raises(VlmError) as error:
+            client.ask(REQUESTS[2:3])
+        assert error.value.kind == "timeout"
+
+
+def test_a_server_that_is_not_there_and_one_that_refuses() -> None:
+    with VlmServer(MockClient()) as server:
+        url = server.url
+        client = connect(url.replace("/v1", "/v2"), model="mock")
+        with pytest.raises(VlmError, match="404") as error:
+            client.ask(REQUESTS[:1])
+        assert error.value.kind == "refused" and server.count == 0
+    with pytest.raises(VlmError, match="tries") as gone:
+        connect(url, attempts=2).ask(REQUESTS[:1])
+    assert gone.value.kind == "unreachable"
+
+
+@contextmanager
+def speaking(bodies: list[bytes]) -> Iterator[str]:
+    """A server that answers with the given bodies, whatever is asked; the last one goes on."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None: ...
+
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["content-length"]))
+            body = bodies.pop(0) if len(bodies) > 1 else bodies[0]
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(body) + (body == b"cut off")))
+            self.end_headers()
+            self.wfile.write(body)
+
+    http = HTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=http.serve_forever, args=(0.05,), daemon=True).start()
+    yield f"http://127.0.0.1:{http.server_address[1]}/v1"
+    http.shutdown()
+    http.server_close()
+
+
+GOOD = json.dumps({"choices": [{"message": {"content": "fine \ud800"}}]}).encode()
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"<html>", b"[]", b"null", b'{"choices": []}', b'{"choices": [{"message": null}]}', b"\xff\xfe", b"[" * 99999,
+     b'{"choices": [{"message": {"content": "x"}, "logprobs": {"content": [{"top_logprobs": [{"token": 1}]}]}}]}'],
+)  # fmt: skip
+def test_bodies_that_are_no_completions_are_asked_for_again(body: bytes) -> None:
+    with speaking([body, GOOD]) as url:
+        client = connect(url, model="m", attempts=2)
+        (reply,) = client.ask(REQUESTS[2:3])
+        assert reply.text == "fine ?" and client.spent["vlm_retries"] == 1
+    with speaking([body]) as url, pytest.raises(VlmError) as error:
+        connect(url, model="m", attempts=1).ask(REQUESTS[2:3])
+    assert error.value.kind == "protocol"
+
+
+def test_a_reply_that_is_cut_off_is_asked_for_again() -> None:
+    with speaking([b"cut off", GOOD]) as url:
+        (reply,) = connect(url, model="m", attempts=2, timeout=5).ask(REQUESTS[2:3])
+        assert reply.text == "fine ?"
+
+
+def test_content_in_odd_shapes_is_no_answer() -> None:
+    for message in ({}, {"content": None}, {"content": ["x"]}, {"content": 3}):
+        with speaking([json.dumps({"choices": [{"message": message}]}).encode()]) as url:
+            (reply,) = connect(url, model="m").ask([Request((user("Say"),), tries=1)])
+            assert reply.problem is not None and reply.problem.kind == "empty"
+
+
+def test_wrong_requests_are_told_so() -> None:
+    with VlmServer(MockClient()) as server:
+        import openai
+
+        sdk = openai.OpenAI(base_url=server.url, api_key="-", max_retries=0)
+        image = {"type": "image_url", "image_url": {"url": "http://elsewhere/x.png"}}
+        for body in (
+            {"messages": [{"role": "user", "content": [image]}]},
+            {"messages": [{"role": "user", "content": "x"}], "n": 2},
+        ):
+            with pytest.raises(openai.BadRequestError, match=r"data:image|n = 1"):
+                sdk.chat.completions.create(model="mock", **body)
+        said = sdk.chat.completions.create(
+            model="mock", messages=[{"role": "user", "content": "x"}], logprobs=True, top_logprobs=3, max_tokens=1,
+            extra_body={"structured_outputs": {"choice": ["A", "B"]}},
+        )  # fmt: skip
+        assert said.usage is not None and said.usage.total_tokens > 0
+        assert {each.token for each in said.choices[0].logprobs.content[0].top_logprobs} == {"A", "B"}  # type: ignore[union-attr]
+
+
+def test_faults_come_as_often_as_they_should_and_to_the_same_requests() -> None:
+    faults = Misbehaviour.parse("429:0.2,slow,malformed:0.05", seed=1)
+    drawn = [faults.fault(k) for k in range(4000)]
+    assert drawn == [Misbehaviour.parse("429:0.2,slow,malformed:0.05", seed=1).fault(k) for k in range(4000)]
+    for name, rate in (("429", 0.2), ("slow", 0.1), ("malformed", 0.05), (None, 0.65)):
+        assert drawn.count(name) / 4000 == pytest.approx(rate, abs=0.025)
+    assert set(FAULTS) > set(faults.rates)
+    for wrong in ("tired", "429:x", "429:0.9,500:0.2", "slow:-1"):
+        with pytest.raises(ArgumentError, match="misbehave"):
+            Misbehaviour.parse(wrong)
+
+
+def test_a_client_can_be_sent_to_another_process() -> None:
+    client = pickle.loads(pickle.dumps(connect("http://127.0.0.1:1/v1", model="m", dialect="legacy", timeout=3.0)))
+    assert (client.dialect, client.timeout, client.model) == ("legacy", 3.0, "m")
+    with pytest.raises(ArgumentError, match="dialect"):
+        connect("http://x", dialect="klingon")
+    with pytest.raises(ArgumentError, match="above 0"):
+        connect("http://x", attempts=0)
+
+
+def test_the_command_names_scripts_by_their_content(tmp_path: Path) -> None:
+    """Answers are kept under the model's name, so an edited script must have another one."""
+    from wiw.cli.serve_vlm import _client
+
+    file = tmp_path / "script.py"
+    file.write_text("def answer(call):\n    return 'one'\n")
+    first = _client(f"{file}:answer", 0, "")
+    file.write_text("def answer(call):\n    return 'two'\n")
+    second = _client(f"{file}:answer", 0, "")
+    request = Request((user("Say"),))
+    assert [client.ask([request])[0].text for client in (first, second)] == ["one", "two"]
+    assert first.model.startswith("answer-") and first.model != second.model
+    assert _client("mock", 0, "").model == "mock"
