@@ -222,6 +222,24 @@ class Fidelity:
 
 
 @dataclass(frozen=True)
+class Exchange:
+    """A question that was put to a language model while deciding, and what came of it."""
+
+    purpose: str
+    """What the policy wanted, such as "propose/0" or "answer"."""
+    model: str
+    said: tuple[Mapping[str, Any], ...]
+    """Every completion: `call` (its question's name), `text`, `finish`, `logprobs`, `prompt_tokens`,
+    `completion_tokens`. With these a run can be told again without the model."""
+    result: Mapping[str, Any] = field(default_factory=dict)
+    """How it was read: `by` ("logprobs" or "votes"), `mass` of the choices, whether it was `repaired`."""
+    problem: str = ""
+    """Why the answer could not be used, "<kind>: <detail>"; empty where it could."""
+    instead: str = ""
+    """What the policy did then."""
+
+
+@dataclass(frozen=True)
 class Decision:
     """The outcome of one pass through propose, imagine, revise, with all evidence kept."""
 
@@ -250,7 +268,11 @@ class Decision:
     """How true imagination was, where the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
     """What answering took, an equal share of the batch's: calls of the world model with their rows and frames, retries
-    among the calls, cached_rows that needed none, vlm_tokens; credits where a paid service imagines."""
+    among the calls, cached_rows that needed none, vlm_tokens; credits where a paid service imagines. A language model
+    adds vlm_calls, vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens, and vlm_usd where its price is known.
+    """
+    exchanges: tuple[Exchange, ...] = ()
+    """What a language model was asked, and what it said."""
 
 
 @dataclass(frozen=True)
@@ -317,4 +339,5 @@ class EpisodeResult:
     error: str = ""
     """Traceback."""
     kind: str = ""
-    """What failed: "environment", "agent", "worker" (its process died), or "world_model/" and a `RolloutError.kind`."""
+    """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`, or
+    "vlm/" and a `VlmError.kind`."""

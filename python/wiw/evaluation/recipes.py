@@ -15,6 +15,8 @@ NUMBERS = ("candidates", "horizon", "execute", "depth", "width")
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
+ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
+"""Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS: Mapping[str, Any] = {}
 
 
@@ -60,6 +62,8 @@ class AgentRecipe:
     imagine_fraction: float | None = None
     model_options: Mapping[str, Any] = field(default_factory=dict)
     """What the world model is made with, by name."""
+    policy_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):
@@ -73,12 +77,15 @@ class AgentRecipe:
         `limits` are what a run gives every agent beyond its identity: deadline, cache, fidelity and the like.
         """
         from wiw.loop.agent import Agent
-        from wiw.registry import WORLD_MODELS
+        from wiw.registry import POLICIES, WORLD_MODELS
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
         options = given.pop("model_options")
         if options:
             given["model"] = WORLD_MODELS.make(self.model, **options)
+        made = {name: POLICIES.make(name, **own) for name, own in given.pop("policy_options").items()}
+        for part in ("policy", "revision"):
+            given |= {part: made[given[part]]} if given.get(part) in made else {}
         return Agent(**given, **limits).settled(defaults)
 
     def with_model(self, model: str) -> AgentRecipe:
@@ -106,7 +113,21 @@ class AgentRecipe:
         for registry, name in ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision)):
             if name is not None:
                 registry.find(name)
-        return {name: value for name, value in asdict(self).items() if value not in (None, {})}
+        said = {name: value for name, value in asdict(self).items() if value not in (None, {})}
+        if self.policy_options:
+            said["policy_options"] = {
+                policy: {name: value for name, value in options.items() if name not in ELSEWHERE}
+                for policy, options in self.policy_options.items()
+            }
+        return said
+
+    def replaying(self, run: Path) -> AgentRecipe:
+        """The same agent with the answers that a run has recorded in the place of its language model."""
+        replay = {"vlm": f"replay:{run}", "cache": "off"}
+        options = {
+            policy: {**given, **(replay if "vlm" in given else {})} for policy, given in self.policy_options.items()
+        }
+        return replace(self, policy_options=options)
 
     @property
     def arm(self) -> str:

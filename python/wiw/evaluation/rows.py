@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import cv2
@@ -104,6 +104,7 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "real_frames": None if real is None else to_json(real),
         "answer": None if decision.answer is None else to_json(_answer(decision.answer)),
         "fidelity": None if decision.fidelity is None else to_json(_fidelity(decision.fidelity, decision.chosen)),
+        "exchanges": to_json([asdict(exchange) for exchange in decision.exchanges]),
         "note": decision.note,
         "path": to_json(record.path),
         "seconds": to_json(dict(decision.seconds)),

@@ -24,7 +24,7 @@ CREATE TABLE outcome (              -- how an episode ended in an arm; absent wh
     metrics TEXT NOT NULL,          -- JSON: name to number
     seconds REAL NOT NULL,
     error TEXT NOT NULL,            -- traceback; empty where nothing failed
-    kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind of RolloutError>; else empty
+    kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind> | vlm/<kind>; else empty
     PRIMARY KEY (arm, episode)
 ) WITHOUT ROWID;
 
@@ -41,6 +41,7 @@ CREATE TABLE decision (
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
     answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
     fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim[, lpips]}; NULL: not measured
+    exchanges TEXT NOT NULL,        -- JSON: [{purpose, model, said, result, problem, instead}]: a language model's part
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
     seconds TEXT NOT NULL,          -- JSON: wall time by stage

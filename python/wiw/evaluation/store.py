@@ -31,6 +31,7 @@ DECISION_JSON = (
     "scores",
     "answer",
     "fidelity",
+    "exchanges",
     "proposals",
     "real_frames",
     "path",

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs some episodes of a run again and compares everything that was decided and measured with what the run recorded.
 
-Timings are left out, and so is a rollout cache, which would answer with what is to be checked, and LPIPS, whose last
-digits depend on threads and device.
+What a language model said then, it is taken to say again. Timings are left out, and so is a rollout cache, which would
+answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
 """
 
 from __future__ import annotations
@@ -107,6 +107,7 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     store.require_task(built.describe())
     require_scenes(built, store, [all_episodes[index] for _, index in keys])
     limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
+    agents = {arm: recipe.replaying(store.path) for arm, recipe in agents.items()}
     pictures = frozenset(info["pictures"])
     plan = Plan(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
     runner, found = Runner(plan), dict[tuple[str, int], Facts]()

@@ -249,10 +249,15 @@ class Agent:
             **({} if self.imagine_fraction == 1 else {"imagine_fraction": self.imagine_fraction}),
         }
 
+    @property
+    def _policies(self) -> list[Policy]:
+        return [self.policy] if self.revision is self.policy else [self.policy, self.revision]
+
     def meter(self) -> Counter[str]:
         """What the agent's model and policies have been asked for so far."""
-        policies = [self.policy] if self.revision is self.policy else [self.policy, self.revision]
-        counts = Counter({"vlm_tokens": sum(policy.tokens for policy in policies)})
+        counts: Counter[str] = Counter()
+        for policy in self._policies:
+            counts.update(policy.spent)
         if self._ask is not None:
             counts.update(self._ask.tally)
         if (charged := getattr(self.model, "credits", None)) is not None:
@@ -269,7 +274,7 @@ class Agent:
     ) -> list[_Future]:
         """What each episode has to choose from: imagined and scored, or with the proposer's own preference."""
         futures = [_Future(plans, None, np.array([plan.prior for plan in plans]), {}) for plans in proposals]
-        asking = [place for place, query in enumerate(queries) if consults(query.key, self.imagine_fraction)]
+        asking = [place for place, situation in enumerate(proposing) if situation.imagines]
         if self._ask is not None and asking:
             imagined = self._imagined(
                 self._ask,
@@ -358,9 +363,10 @@ class Agent:
         proposing, revising = [], []
         for query in queries:
             life = self._life(query)
-            executed = tuple(life.executed)
-            proposing.append(Situation(query.observation, query.goal, query.key, life.proposer, executed))
-            revising.append(Situation(query.observation, query.goal, query.key, life.reviser, executed))
+            imagines = self._ask is not None and consults(query.key, self.imagine_fraction)
+            known = query.observation, query.goal, query.key
+            proposing.append(Situation(*known, life.proposer, tuple(life.executed), imagines))
+            revising.append(Situation(*known, life.reviser, tuple(life.executed), imagines))
         return proposing, revising
 
     def _life(self, query: Query) -> _Life:
@@ -384,6 +390,7 @@ class Agent:
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
         self._life(query).executed += actions[:execute].tolist()
+        exchanges = tuple(each for policy in self._policies for each in policy.exchanges(query.key))
         return Decision(
             actions=actions,
             execute=execute,
@@ -396,7 +403,9 @@ class Agent:
             goal=query.goal,
             key=query.key,
             calls=future.calls,
+            note="; ".join(f"{each.purpose}: {each.problem}, {each.instead}" for each in exchanges if each.problem),
             fidelity=future.fidelity,
+            exchanges=exchanges,
             **costs,
         )
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, ContractError, RolloutError
+from wiw.errors import ArgumentError, ContractError, RolloutError, VlmError
 from wiw.loop.agent import Agent, Query
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
 
@@ -142,7 +142,7 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
     except (ArgumentError, ContractError):
         raise
     except Exception as error:
-        kind = f"world_model/{error.kind}" if isinstance(error, RolloutError) else "agent"
+        kind = _kind(error)
         sink.lost({**(agent.meter() - before), "seconds": time.perf_counter() - begin})
         for trial in trials:
             trial.done = True
@@ -164,6 +164,12 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
         if result is not None:
             sink.episode(result)
     return []
+
+
+def _kind(error: Exception) -> str:
+    if isinstance(error, RolloutError):
+        return f"world_model/{error.kind}"
+    return f"vlm/{error.kind}" if isinstance(error, VlmError) else "agent"
 
 
 def _finished(trial: Trial) -> EpisodeResult:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Answer, Goal, Key, Observation, Proposal, Rollout
+from wiw.types import Answer, Exchange, Goal, Key, Observation, Proposal, Rollout
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,9 @@ class Situation:
     """What `Policy.begin` returned for this episode; the policy may change it."""
     executed: tuple[int, ...] = ()
     """Primitives carried out since the episode began."""
+    imagines: bool = True
+    """Whether a world model is asked about the plans proposed now. Where none is, no more than one plan is of use to a
+    policy that takes its first."""
 
 
 class Policy(ABC):
@@ -52,7 +55,7 @@ class Policy(ABC):
     default_revision: str | None = None
     """Name of the reviser that stands in where this policy only proposes."""
     tokens: int = 0
-    """Tokens that the policy's language model has read and written so far, for the cost ledger; 0 without one."""
+    """Tokens that the policy's language model has read and written so far; 0 without one."""
 
     def begin(self, goal: Goal, key: Key) -> Any:
         """Memory for a new episode; None for a policy that keeps none."""
@@ -106,6 +109,15 @@ class Policy(ABC):
         Asked of the revising policy once a decision, with what is seen and what was imagined. Default: no answer.
         """
         return [None] * len(situations)
+
+    def exchanges(self, key: Key) -> tuple[Exchange, ...]:
+        """What a language model was asked for this decision and said, handed over once; nothing without one."""
+        return ()
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What the policy has used up so far, for the cost ledger (`Decision.spent`)."""
+        return {"vlm_tokens": self.tokens}
 
     @property
     def can_revise(self) -> bool:
