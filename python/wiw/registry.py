@@ -185,6 +185,7 @@ POLICIES = Registry(
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
         "recogniser": "wiw.policies.recogniser:Recognition",
+        "vlm": "wiw.policies.vlm:VLM",
     },
     "wiw.policies.base:Policy",
 )

@@ -30,6 +30,7 @@ def list_names(what: Positional[Literal["all", "world-models"]] = "all", /) -> i
 def _everything() -> Any:
     from rich.table import Table
 
+    from wiw.policies.vlm import presets as vlms
     from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS
     from wiw.tasks import presets
 
@@ -46,6 +47,10 @@ def _everything() -> Any:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
         for name in presets.names(task):
             table.add_row(f"  {name}", escape(presets.about(task, name)))
+    table.add_row()
+    table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
+    for name in vlms.names():
+        table.add_row(f"  {name}", escape(vlms.about(name)))
     return table
 
 

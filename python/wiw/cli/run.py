@@ -52,6 +52,10 @@ def run(
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
     fidelity: bool = False,
     lpips: Annotated[str | None, arg(metavar="auto|DIR")] = None,
+    vlm: Annotated[str | None, arg(metavar="URL")] = None,
+    vlm_model: MaybeName = None,
+    vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None,
+    prompts: Folder = None,
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -61,6 +65,7 @@ def run(
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
+    $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
 
@@ -100,6 +105,11 @@ def run(
         fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
         lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where
             they are not there it says which files are needed.
+        vlm: For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock;
+            http://localhost:8000/v1 if not given.
+        vlm_model: Its name at the server, or a preset of `wiw list`; not needed where the server has one model.
+        vlm_prices: YAML file of `model: [read, written]`, dollars per million tokens, for the costs.
+        prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
     """
     from wiw.evaluation.evaluate import evaluate
@@ -111,11 +121,13 @@ def run(
     }  # fmt: skip
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
     model = None if world_model == "none" else absolute(world_model)
+    names = _arms(arms, world_model)
+    given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
         model_options=model_options(model, world_model_option),
+        policy_options=_vlm_options(given, [policy, revision or "", *(name.partition("+")[0] for name in names or [])]),
     )  # fmt: skip
-    names = _arms(arms, world_model)
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 
     def work() -> Any:
@@ -168,6 +180,19 @@ def finish(log: Any, report: bool) -> int:
         print(f"report  {log.report()}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0
+
+
+def _vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
+    """Options of policy vlm; its own address, so that the record says where it asked."""
+    from wiw.errors import ArgumentError
+
+    named = {name: value for name, value in given.items() if value is not None}
+    if "vlm" not in policies:
+        if named:
+            raise ArgumentError("--vlm, --vlm-model, --vlm-prices and --prompts are for policy vlm: give --policy vlm")
+        return {}
+    paths = {name: str(value.expanduser().resolve()) for name, value in named.items() if isinstance(value, Path)}
+    return {"vlm": {"vlm": "http://localhost:8000/v1", **named, **paths}}
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:

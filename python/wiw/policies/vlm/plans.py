@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans as a language model writes them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+PRIMITIVES: dict[str, int] = {"forward": int(FORWARD), "turn_left": int(TURN_LEFT), "turn_right": int(TURN_RIGHT)}
+MEANINGS = {
+    "forward": "go straight for 0.20 m",
+    "turn_left": "turn left by 22.5 degrees",
+    "turn_right": "turn right by 22.5 degrees",
+}
+_MEANING_OF = {PRIMITIVES[name]: meaning for name, meaning in MEANINGS.items()}
+
+
+@lru_cache(maxsize=32)
+def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
+    """{reason, actions}: 1 to `longest` primitives; {plans: [...]} of up to `count` of them where count > 1."""
+    from pydantic import ConfigDict, Field, create_model
+
+    names = Literal["forward", "turn_left", "turn_right"]
+    strict: Any = ConfigDict(extra="forbid")
+    actions: Any = (list[names], Field(min_length=1, max_length=longest))
+    plan = create_model("Plan", __config__=strict, reason=(str, ...), actions=actions)
+    if count == 1:
+        return plan
+    plans: Any = (list[plan], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
+    return create_model("Plans", __config__=strict, plans=plans)
+
+
+def plans_in(value: Any) -> list[tuple[NDArray[np.int8], str]]:
+    """Primitives and reasons of a validated answer."""
+    return [
+        (np.array([PRIMITIVES[name] for name in plan.actions], np.int8), plan.reason)
+        for plan in getattr(value, "plans", None) or [value]
+    ]
+
+
+def in_words(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
+    """What each primitive does; "stop" for what ends a plan."""
+    return [_MEANING_OF.get(int(action), "stop") for action in actions]
+
+
+def named(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
+    """The primitives' names, as plans are written."""
+    names = {primitive: name for name, primitive in PRIMITIVES.items()}
+    return [names.get(int(action), "stop") for action in actions]

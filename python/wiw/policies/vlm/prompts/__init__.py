@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prompt templates: one folder a task, one Jinja file a question, with the paper's slots. A user's own may stand in.
+
+Slots: `obs_key` (what is seen now, in words), `look_ahead_action_num` (actions of a plan), `plan_num` (plans asked for
+at once) and `actions` (name to meaning).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError, PromptError
+
+FOLDER = Path(__file__).parent
+SLOTS: dict[str, Any] = {
+    "obs_key": "front view",
+    "look_ahead_action_num": 5,
+    "plan_num": 1,
+    "actions": {"forward": "go straight for 0.20 m"},
+}
+"""Every slot, with a value to try a template on."""
+
+
+def tasks() -> list[str]:
+    """Tasks that prompts are shipped for."""
+    return sorted(path.name for path in FOLDER.iterdir() if any(path.glob("*.j2")))
+
+
+class Prompts:
+    """Templates of all tasks: a user's where there are any, else those that come with the package.
+
+    Args:
+        folder: with templates as `<task>/<name>.j2`, under the names that are shipped; None means the shipped ones.
+
+    Raises:
+        PromptError: no such folder, nothing to be used in it, a template under another name, with an unknown slot, or
+            one that cannot be read.
+    """
+
+    def __init__(self, folder: str | Path | None = None) -> None:
+        self.folder = None if folder is None else Path(folder).expanduser()
+        self._templates = {path.relative_to(FOLDER).as_posix(): _parsed(path) for path in _files(FOLDER)}
+        if self.folder is not None:
+            self._templates |= self._own(self.folder)
+
+    def __reduce__(self) -> Any:
+        return Prompts, (self.folder,)
+
+    def text(self, task: str, name: str, **slots: Any) -> str:
+        """A prompt with its slots filled.
+
+        Raises:
+            ArgumentError: a task without prompts.
+        """
+        template = self._templates.get(f"{task}/{name}.j2")
+        if template is None:
+            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {tasks()}")
+        return str(template[1].render(**slots)).strip()
+
+    @cached_property
+    def digest(self) -> str:
+        """Of all templates, as hexadecimal digits."""
+        parts = [f"{name}\0{source}\0" for name, (source, _) in sorted(self._templates.items())]
+        return blake2b("".join(parts).encode(), digest_size=8).hexdigest()
+
+    def _own(self, folder: Path) -> dict[str, Any]:
+        found = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
+        if not found:
+            raise PromptError(f"{folder}: expected templates such as {folder / 'ar/planner.j2'}, found none")
+        for name, path in found.items():
+            if name not in self._templates:
+                raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
+        return {name: _parsed(path) for name, path in found.items()}
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*/*.j2"))
+
+
+def _parsed(path: Path) -> tuple[str, Any]:
+    """Source and template; tried on, so that what is wrong with it is known before the first question."""
+    from jinja2 import StrictUndefined, TemplateError, meta
+    from jinja2.sandbox import SandboxedEnvironment
+
+    environment = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    try:
+        source = path.read_text(encoding="utf-8")
+        unknown = sorted(meta.find_undeclared_variables(environment.parse(source)) - set(SLOTS))
+        if unknown:
+            raise PromptError(f"{path}: unknown slot '{unknown[0]}'; the slots are {', '.join(SLOTS)}")
+        template = environment.from_string(source)
+        template.render(**SLOTS)
+    except (OSError, UnicodeDecodeError, TemplateError, TypeError, ValueError, ArithmeticError, LookupError) as error:
+        raise PromptError(f"{path}: {type(error).__name__}: {error}") from error
+    return source, template

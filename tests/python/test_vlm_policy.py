@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Policy vlm in the closed loop: what it shows and asks, what it makes of answers, and of those that are none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_active_recognition import a_file
+
+pytest.importorskip("pydantic")
+pytest.importorskip("openai")
+pytest.importorskip("json_repair")
+
+import wiw
+from wiw.cli import main
+from wiw.errors import ArgumentError, PromptError
+from wiw.evaluation.evaluate import evaluate
+from wiw.evaluation.recipes import AgentRecipe
+from wiw.loop.agent import Query
+from wiw.policies.vlm import VLM, looks, presets
+from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
+from wiw.serving.misbehaviour import Misbehaviour
+from wiw.serving.vlm_server import VlmServer
+from wiw.types import Rollout
+from wiw.vlm.base import Call
+from wiw.vlm.mock import MockClient
+
+FORWARD, LEFT, RIGHT = 1, 2, 3
+WALK = json.dumps({"reason": "free floor ahead", "actions": ["forward", "forward", "turn_left"]})
+
+
+def images(call: Call) -> list[Any]:
+    return [part for message in call.messages for part in message.content if not isinstance(part, str)]
+
+
+def words(call: Call) -> str:
+    return "\n".join(part for message in call.messages for part in message.content if isinstance(part, str))
+
+
+def letter_of(call: Call, option: str) -> str:
+    return next(line[0] for line in words(call).splitlines() if line[1:] == f". {option}")
+
+
+def script(call: Call) -> Any:
+    """Takes the table for what it is, and always wants to go on."""
+    if call.schema is not None:
+        return WALK
+    wanted = "table" if ". table" in words(call) else "go straight for 0.20 m"
+    return {letter_of(call, wanted): 0.9, "?": 0.1}
+
+
+def imagenav(scene: str) -> Any:
+    return wiw.make("ImageNav-v0", scenes=scene, seed=0)
+
+
+def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
+    _, info = env.reset(options={"episode": 0})
+    agent = wiw.Agent(policy, model, **options).settled(env.unwrapped.task.defaults)
+    return agent.decide(env.observation, env.goal, info["key"])
+
+
+def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms: str) -> None:
+    client = MockClient(script)
+    decision = decided(imagenav(two_rooms), VLM(client), "copy")
+    *proposing, revising = client.asked
+    assert len(proposing) == 3 and len({call.seed for call in proposing}) == 3
+    assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
+    assert [image.shape for image in images(proposing[0])] == [(480, 480, 3), (576, 1024, 3), (480, 480, 3)]
+    assert "next 5 action(s)" in words(proposing[0]) and "{{" not in words(proposing[0])
+    goal, strip = images(revising)
+    np.testing.assert_array_equal(goal, decision.goal.image)
+    assert strip.shape[0] > looks.VIEW and strip.shape[1] >= 3 * looks.VIEW
+    assert "Plan 1: ['forward', 'forward', 'turn_left']" in words(revising)
+    assert [plan.actions.tolist() for plan in decision.proposals] == [[FORWARD, FORWARD, LEFT]], "equal plans are one"
+    assert decision.chosen == 0 and decision.scores.tolist() == [1.0] and decision.note == ""
+    assert [each.purpose for each in decision.exchanges] == ["propose/0", "propose/1", "propose/2", "revise"]
+    assert decision.spent["vlm_calls"] == 4 and decision.spent["vlm_tokens"] > 1000
+
+
+def test_without_a_world_model_one_plan_is_asked_for(two_rooms: str) -> None:
+    client = MockClient(script)
+    decision = decided(imagenav(two_rooms), VLM(client))
+    assert len(client.asked) == 1 and decision.actions.tolist() == [FORWARD, FORWARD, LEFT] and decision.chosen == 0
+
+
+def test_answers_do_not_depend_on_who_else_is_asked_for(two_rooms: str) -> None:
+    env = imagenav(two_rooms)
+    queries = []
+    for episode in range(2):
+        _, info = env.reset(options={"episode": episode})
+        queries.append(Query(env.unwrapped.observation, env.unwrapped.goal, info["key"]))
+    together = wiw.Agent(VLM(MockClient()), "copy").decide_batch(queries)
+    alone = [wiw.Agent(VLM(MockClient()), "copy").decide_batch([query])[0] for query in queries]
+    for one, other in zip(together, alone, strict=True):
+        assert one.exchanges == other.exchanges
+        np.testing.assert_array_equal(one.actions, other.actions)
+
+
+def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
+    plans = iter([["forward"], ["turn_left", "forward"], ["turn_right"], ["turn_left", "turn_left"]])
+    client = MockClient(lambda call: json.dumps({"reason": "r", "actions": next(plans)}))
+    decision = decided(imagenav(two_rooms), VLM(client), "copy")
+    assert decision.actions.tolist() == [LEFT, LEFT] and decision.chosen is None
+    assert decision.scores.tolist() == [0.0, 0.5, 0.0]
+    plans = iter([["forward"], ["turn_left", "forward"], ["turn_right"]])
+    chooser = MockClient(
+        lambda call: (
+            {"B": 0.6, "A": 0.3, "C": 0.1} if call.labels else json.dumps({"reason": "r", "actions": next(plans)})
+        )
+    )
+    decision = decided(imagenav(two_rooms), VLM(chooser, revision="select"), "copy")
+    assert decision.actions.tolist() == [LEFT, FORWARD] and decision.chosen == 1
+    np.testing.assert_allclose(decision.scores, [0.3, 0.6, 0.1])
+    assert "B. plan 2: turn_left, forward" in words(chooser.asked[-1])
+
+
+def test_plans_may_be_listed_in_one_answer(two_rooms: str) -> None:
+    answer = json.dumps({"plans": [{"reason": "r", "actions": [name]} for name in ("forward", "turn_left", "forward")]})
+    client = MockClient(lambda call: answer if "plans" in call.schema["properties"] else WALK)
+    decision = decided(imagenav(two_rooms), VLM(client, proposals="listed"), "copy")
+    assert len(client.asked) == 2 and "Give 3 plans" in words(client.asked[0])
+    assert [plan.actions.tolist() for plan in decision.proposals] == [[FORWARD], [LEFT]]
+
+
+@pytest.fixture
+def recognition(tmp_path: Path, two_rooms: str) -> Iterator[Any]:
+    yield wiw.make("AR-v0", episode_file=a_file(tmp_path, two_rooms, yaw=np.pi / 2))
+
+
+def redness(image: Any) -> int:
+    """Pixels in the colour of boxes."""
+    return int((np.abs(image.astype(int) - (220, 40, 40)).max(-1) < 8).sum())
+
+
+def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
+    client = MockClient(script)
+    decision = decided(recognition, VLM(client), "warp")
+    proposing, (moving, answering) = client.asked[:-2], client.asked[-2:]
+    assert [each.purpose for each in decision.exchanges] == ["propose/0", "propose/1", "move", "answer"]
+    assert len(proposing) == 2 and "next 4 action(s)" in words(proposing[0])
+    assert "next 1 action(s)" in words(moving) and "Plan 1:" in words(moving)
+    assert [image.shape[:2] for image in images(moving)[:2]] == [(480, 480), (576, 1024)] and len(images(moving)) == 3
+    shapes = [image.shape[:2] for image in images(answering)]
+    assert shapes[0] == (looks.VIEW, looks.VIEW) and len(shapes) == 2 and shapes[1][1] > looks.VIEW
+    for image in (*images(moving), *images(answering), *images(proposing[0])):
+        assert redness(image) > 20, "the target is not boxed"
+    assert "turn left" not in words(answering) and moving.labels == ("A", "B", "C")
+    assert decision.answer.label == "table" and decision.answer.confidence == pytest.approx(1.0)
+    assert decision.chosen == 0 and decision.actions[0] == FORWARD and decision.execute == 1
+
+
+def test_recognition_without_a_world_model_is_two_questions(recognition: Any) -> None:
+    client = MockClient(
+        lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)
+    )
+    decision = decided(recognition, VLM(client))
+    assert [each.purpose for each in decision.exchanges] == ["move", "answer"]
+    assert decision.actions.tolist() == [RIGHT] and decision.chosen == 0
+    assert [len(images(call)) for call in client.asked] == [2, 1]
+
+
+def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: Any) -> None:
+    client = MockClient(
+        lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)
+    )
+    decision = decided(recognition, VLM(client), "copy")
+    assert decision.actions.tolist() == [RIGHT] and decision.chosen is None and decision.scores[0] < 0.5
+
+
+def test_a_target_out_of_sight_is_not_asked_about(tmp_path: Path, two_rooms: str) -> None:
+    file = a_file(tmp_path, two_rooms, start=(2.0, 0.0, 0.0), target="picture")
+    env = wiw.make("AR-v0", episode_file=file)
+    env.reset(options={"episode": 0})
+    assert not env.unwrapped.observation.target.mask.any(), "the test needs a hidden target"
+    client = MockClient(lambda call: {letter_of(call, "go straight for 0.20 m"): 1.0})
+    decision = decided(env, VLM(client))
+    assert len(client.asked) == 1 and "nothing was asked, no choice was preferred" in decision.note
+    assert decision.answer.confidence == pytest.approx(0.25, abs=1e-6)
+
+
+def test_unusable_answers_are_recorded_and_no_choice_is_preferred(recognition: Any, two_rooms: str) -> None:
+    decision = decided(recognition, VLM(MockClient(lambda call: "I'm sorry, no."), tries=2), "copy")
+    problems = {each.purpose: each for each in decision.exchanges}
+    assert problems["propose/0"].problem.startswith("refusal") and problems["answer"].problem.startswith("no_option")
+    assert problems["answer"].instead == "no choice was preferred" and len(problems["propose/0"].said) == 2
+    for said in ("propose/0: refusal", "a primitive was drawn", "move: no_option", "the first plan was taken"):
+        assert said in decision.note
+    np.testing.assert_allclose(decision.answer.probabilities, 0.25, atol=1e-6)
+    assert len(decision.proposals) == 1 and "drawn" in decision.proposals[0].note
+    labels = set()
+    for seed in range(6):
+        _, info = recognition.reset(options={"episode": 0})
+        key = wiw.types.Key(seed, info["key"].episode)
+        agent = wiw.Agent(VLM(MockClient(lambda call: "?")), None, execute=1, horizon=4)
+        labels.add(agent.decide(recognition.unwrapped.observation, recognition.unwrapped.goal, key).answer.label)
+    assert len(labels) > 1, "one choice is always first"
+    some = iter(["junk", WALK, WALK, "junk"])
+    decision = decided(imagenav(two_rooms), VLM(MockClient(lambda call: next(some)), tries=1), "copy")
+    assert len(decision.proposals) == 1 and decision.chosen == 0
+    assert "propose/0: malformed" in decision.note and "the plan was left out" in decision.note
+    assert "revise: malformed" in decision.note and "the first plan was taken" in decision.note
+
+
+def test_strips_name_actions_and_show_where_the_target_is() -> None:
+    from wiw.perception.tracking import Track
+    from wiw.types import Proposal
+
+    frames = np.full((2, 576, 1024, 3), 90, np.uint8)
+    masks = np.zeros((2, 576, 1024), bool)
+    masks[0, 250:300, 500:540] = True
+    rollout = Rollout(frames, np.zeros(2, bool), "panorama")
+    strip = looks.plan_strip(Proposal([FORWARD, LEFT]), rollout, Track(masks, ((500, 250, 540, 300), None)))
+    half = strip.shape[1] // 2
+    assert redness(strip[:, :half]) > 50 and redness(strip[:, half:]) == 0
+    bar = strip.shape[0] - looks.VIEW
+    assert bar > 10 and not np.array_equal(strip[:bar, : looks.VIEW], strip[:bar, -looks.VIEW :])
+    views = looks.target_strip(rollout, Track(masks, ((500, 250, 540, 300), None)))
+    assert views is not None and views.shape[1] == looks.VIEW and redness(views) > 50
+    assert looks.target_strip(Rollout(frames, np.ones(2, bool), "panorama"), Track(masks, (None, None))) is None
+    front = Rollout(frames[:, :384, :384], np.zeros(2, bool), "front")
+    boxed = looks.target_strip(front, Track(masks[:, :384, :384], ((9, 9, 50, 50), None)))
+    assert boxed is not None and redness(boxed) > 50
+
+
+def test_shipped_prompts_have_the_papers_slots() -> None:
+    for task, name, slots in (
+        ("ar", "planner", ("obs_key", "look_ahead_action_num")),
+        ("imagenav", "planner", ("obs_key", "look_ahead_action_num")),
+        ("imagenav", "planner_imagined", ("look_ahead_action_num",)),
+    ):
+        source = (FOLDER / task / f"{name}.j2").read_text()
+        assert all(f"{{{{ {slot} }}}}" in source for slot in slots)
+    text = Prompts().text("ar", "planner", **{**SLOTS, "look_ahead_action_num": 7, "obs_key": "a painting"})
+    assert "next 7 action(s)" in text and "a painting" in text
+
+
+def test_a_users_own_prompts_are_checked(tmp_path: Path, two_rooms: str) -> None:
+    (tmp_path / "imagenav").mkdir()
+    file = tmp_path / "imagenav/planner.j2"
+    file.write_text("Walk {{ look_ahead_action_num }} steps!")
+    own, shipped = Prompts(tmp_path), Prompts()
+    assert own.text("imagenav", "planner", **SLOTS) == "Walk 5 steps!" and own.digest != shipped.digest
+    assert own.text("ar", "answerer", **SLOTS) == shipped.text("ar", "answerer", **SLOTS)
+    client = MockClient(script)
+    decided(imagenav(two_rooms), VLM(client, prompts=tmp_path))
+    assert words(client.asked[0]).startswith("Walk 5 steps!")
+    for source, said in (
+        ("{{ goal_colour }}", "unknown slot 'goal_colour'; the slots are obs_key"),
+        ("{{ actions.fly.high }}", "UndefinedError"),
+        ("{% if %}", "TemplateSyntaxError"),
+        ("{{ look_ahead_action_num / 0 }}", "ZeroDivisionError"),
+        ("{{ obs_key.__class__.__mro__ }}", "SecurityError"),
+    ):
+        file.write_text(source)
+        with pytest.raises(PromptError, match=r"imagenav/planner\.j2") as error:
+            VLM("mock", prompts=tmp_path)
+        assert said in str(error.value)
+    file.rename(tmp_path / "imagenav/plan.j2")
+    with pytest.raises(PromptError, match="no prompt has this name"):
+        Prompts(tmp_path)
+    with pytest.raises(PromptError, match="found none"):
+        Prompts(tmp_path / "nowhere")
+
+
+def test_options_out_of_range_and_tasks_without_prompts() -> None:
+    for wrong in ({"proposals": "many"}, {"revision": "guess"}, {"temperature": -1.0}, {"tries": 0}, {"colour": 1}):
+        with pytest.raises(ArgumentError):
+            VLM("mock", **wrong)
+    with pytest.raises(ArgumentError, match="ar, imagenav"):
+        VLM("mock").begin(wiw.types.Goal("dance"), wiw.types.Key(0, 0))
+
+
+def test_presets_name_a_model_and_how_it_is_served() -> None:
+    docs = (Path(__file__).parents[2] / "docs/vlm.md").read_text()
+    for name in presets.names():
+        options = presets.client_options(name)
+        assert options["model"] in presets.serve_command(name) and options["dialect"] == "vllm"
+        assert " ".join(presets.serve_command(name).split()) in " ".join(docs.replace("\\\n", " ").split()), name
+        assert VLM("http://localhost:1/v1", model=name).client.model == options["model"]
+    assert presets.names() == ["internvl3-78b-awq", "qwen2.5-vl-72b-awq"]
+
+
+def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_rooms: str) -> None:
+    """Both tasks, with the scripted model, over HTTP with faults; what was said is enough to run them again."""
+    faults = Misbehaviour({"429": 0.1, "500": 0.05, "malformed": 0.05, "refusal": 0.05}, seed=1, retry_after=0.01)
+    with VlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
+        file = a_file(tmp_path, two_rooms)
+        preset = tmp_path / "short.yaml"
+        preset.write_text("decisions: 4\n")
+        for task, options in (("ar", {"episode_file": str(file)}), ("imagenav", {"scenes": two_rooms})):
+            recipe = AgentRecipe(
+                "vlm", "copy", policy_options={"vlm": {"vlm": server.url, "dialect": "vllm", "tries": 2}}
+            )
+            log = evaluate(task, recipe, 1, 0, tmp_path / task, progress=False, preset=str(preset), **options)
+            (episode,) = log.episodes
+            assert episode["status"] == "done"
+            rows = list(log.store.decisions("copy"))
+            assert all(each["model"] == "scripted" for row in rows for each in row["exchanges"])
+            assert log.costs()[0]["spent_vlm_input_tokens"] > 0
+            if task == "ar":
+                assert episode["metrics"]["success"] == 1.0
+    for task in ("ar", "imagenav"):  # the server is gone
+        checked = wiw.verify(tmp_path / task, episodes=1)
+        assert checked.same, str(checked)
+
+
+def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
+    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
+        policy = VLM(server.url, model="mock", cache="off", attempts=1)
+        log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
+        (episode,) = log.episodes
+        assert episode["status"] == "failed" and episode["kind"] == "vlm/status"
+
+
+def test_the_command_line_against_the_tiny_random_model(
+    tmp_path: Path, two_rooms: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("transformers")
+    from wiw.vlm.tiny import make_tiny
+    from wiw.vlm.transformers import TransformersClient
+
+    with VlmServer(TransformersClient(make_tiny(tmp_path / "tiny"), device="cpu")) as server:
+        common = ["--policy", "vlm", "--vlm", server.url, "--episodes", "1", "--no-report"]
+        preset = tmp_path / "short.yaml"
+        preset.write_text("decisions: 2\ncandidates: 2\nhorizon: 2\n")
+        file = a_file(tmp_path, two_rooms)
+        assert (
+            main(
+                [
+                    "run",
+                    "ar",
+                    *common,
+                    "--episode-file",
+                    str(file),
+                    "--preset",
+                    str(preset),
+                    "--out",
+                    str(tmp_path / "ar"),
+                ]
+            )
+            == 0
+        )
+        preset.write_text("decisions: 2\ncandidates: 2\nhorizon: 2\nexecute: 1\n")
+        assert main(
+            ["run", "imagenav", *common, "--scenes", two_rooms, "--preset", str(preset), "--world-model", "copy",
+             "--out", str(tmp_path / "nav")]
+        ) == 0  # fmt: skip
+    for name in ("ar", "nav"):
+        rows = [
+            row
+            for arm in wiw.load_run(tmp_path / name).arms
+            for row in wiw.load_run(tmp_path / name).store.decisions(arm)
+        ]
+        assert rows and all(each["model"] == "tiny" for row in rows for each in row["exchanges"])
+    assert main(["run", "imagenav", "--vlm", "mock"]) == 2 and "give --policy vlm" in capsys.readouterr().err
