@@ -309,6 +309,14 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
         assert checked.same, str(checked)
 
 
+def test_recipes_that_name_no_server_are_replayed_too() -> None:
+    assert AgentRecipe("vlm").replaying(Path("r")).policy_options == {"vlm": {"vlm": "replay:r", "cache": "off"}}
+    recipe = AgentRecipe("heuristic", revision="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
+    assert recipe.replaying(Path("r")).policy_options["vlm"] == {"vlm": "replay:r", "cache": "off", "tries": 2}
+    assert recipe.describe()["policy_options"] == {"vlm": {"tries": 2}}, "the address is no part of the identity"
+    assert AgentRecipe("matcher").replaying(Path("r")) == AgentRecipe("matcher")
+
+
 def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
     with VlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1)

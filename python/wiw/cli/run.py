@@ -126,7 +126,7 @@ def run(
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
         model_options=model_options(model, world_model_option),
-        policy_options=_vlm_options(given, [policy, revision or "", *(name.partition("+")[0] for name in names or [])]),
+        policy_options=vlm_options(given, [policy, revision or "", *(name.partition("+")[0] for name in names or [])]),
     )  # fmt: skip
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 
@@ -182,7 +182,7 @@ def finish(log: Any, report: bool) -> int:
     return 1 if numbers.invalid else 0
 
 
-def _vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
+def vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
     """Options of policy vlm; its own address, so that the record says where it asked."""
     from wiw.errors import ArgumentError
 

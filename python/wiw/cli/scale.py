@@ -39,6 +39,8 @@ def scale(
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
     cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
+    vlm: Annotated[str | None, arg(metavar="URL")] = None,
+    vlm_model: Annotated[str | None, arg(metavar="NAME")] = None,
 ) -> int:
     """Success against the number of futures that a world model imagines, all amounts on the same episodes.
 
@@ -71,8 +73,10 @@ def scale(
         cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
             folder for every model; or off.
         cache_gb: Most gigabytes of that folder.
+        vlm: For policy vlm, as in `wiw run`.
+        vlm_model: Likewise.
     """
-    from wiw.cli.run import stoppable
+    from wiw.cli.run import stoppable, vlm_options
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
     from wiw.evaluation.scale import scale as run_scale
 
@@ -80,6 +84,7 @@ def scale(
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), horizon=horizon,
         model_options=model_options(model, world_model_option),
+        policy_options=vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""]),
     )  # fmt: skip
     flags = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
     recipe = TaskRecipe(task, task_options(task, task_option, flags))

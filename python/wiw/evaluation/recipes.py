@@ -124,8 +124,10 @@ class AgentRecipe:
     def replaying(self, run: Path) -> AgentRecipe:
         """The same agent with the answers that a run has recorded in the place of its language model."""
         replay = {"vlm": f"replay:{run}", "cache": "off"}
+        named: dict[str, Mapping[str, Any]] = {name: {} for name in (self.policy, self.revision) if name == "vlm"}
         options = {
-            policy: {**given, **(replay if "vlm" in given else {})} for policy, given in self.policy_options.items()
+            policy: {**given, **(replay if policy == "vlm" or "vlm" in given else {})}
+            for policy, given in (named | dict(self.policy_options)).items()
         }
         return replace(self, policy_options=options)
 

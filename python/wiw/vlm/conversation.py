@@ -78,13 +78,13 @@ def _seed(seed: int, attempt: int) -> int:
 
 
 def _chosen(request: Request, most: int, votes: int) -> Talk:
-    """Multiple choice: the last round's text, the least mass, and votes if any round took them."""
+    """Multiple choice: text and mass of the last round, where the best choices meet; "votes" if any round took them."""
     found = yield from _elected(request, range(len(request.choices)), most, votes)
     if isinstance(found, Reply):
         return found
     probabilities, rounds = found
     by = "votes" if any(reply.by == "votes" for reply in rounds) else "logprobs"
-    return Reply(rounds[-1].text, probabilities=probabilities, mass=min(reply.mass for reply in rounds), by=by)
+    return Reply(rounds[-1].text, probabilities=probabilities, mass=rounds[-1].mass, by=by)
 
 
 def _elected(
