@@ -470,6 +470,10 @@ def test_a_file_that_ends_the_importer_is_an_error_here(tmp_path: Path, monkeypa
 def test_resolve_names_scenes(tmp_path: Path) -> None:
     assert scenes.resolve("apartments:val:3") == ["apartments:val/0", "apartments:val/1", "apartments:val/2"]
     assert scenes.resolve("apartments:test/7") == ["apartments:test/7"]
+    assert scenes.resolve("apartments:test:60:62") == ["apartments:test/60", "apartments:test/61"]
+    for spec in ("apartments:test:62:60", "apartments:test:7:7", "apartments:test:1:2:3", "apartments:test:-1:3"):
+        with pytest.raises(ArgumentError, match="val:40:60"):
+            scenes.resolve(spec)
     mesh = str(square(tmp_path))
     assert scenes.resolve(mesh) == [mesh]
     with pytest.raises(ArgumentError, match="expected apartments"):

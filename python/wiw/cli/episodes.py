@@ -35,7 +35,7 @@ def episodes(
     Args:
         task: See `wiw list`.
         out: JSON; gzipped if the name ends in .gz.
-        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         episodes: How many.
         per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
         seed: The episodes are a function of it and the scenes.

@@ -78,7 +78,7 @@ def run(
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
             other plans, or from elsewhere; placebo-shuffled:MODEL names another.
-        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
         scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.

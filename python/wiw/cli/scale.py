@@ -58,7 +58,7 @@ def scale(
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
         imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
-        scenes: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         episodes: How many.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.

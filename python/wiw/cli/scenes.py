@@ -23,7 +23,7 @@ def scenes(
     $ wiw scenes house.glb --out house.png
 
     Args:
-        spec: apartments:train|val|test[:N], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        spec: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         out: Where to write the sheet, a PNG.
         views: Panoramas of each scene.
         backend: Renderer.

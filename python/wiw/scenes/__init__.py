@@ -123,8 +123,9 @@ def absolute(spec: str | PathLike[str]) -> str:
 def resolve(spec: str | PathLike[str]) -> list[str]:
     """The single scenes that a scene spec names, in order, none of them loaded.
 
-    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, each named
-    "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
+    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" those
+    from number 40 up to, not including, 60, each named "apartments:val/7"; anything else is the path of a mesh or a
+    Gazebo world.
 
     Raises:
         ArgumentError: the split or the count is not one.
@@ -137,15 +138,16 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
                 f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]"
             )
         return [spec]
-    match = re.fullmatch(r"apartments:(train|val|test)(?::([1-9][0-9]*)|/([0-9]+))?", spec)
-    if match is None:
+    match = re.fullmatch(r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?", spec)
+    if match is None or int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
         raise ArgumentError(
-            f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40 or apartments:val/7"
+            f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40, apartments:val:40:60 or "
+            "apartments:val/7"
         )
-    split, count, index = match.groups()
+    split, first, end, index = match.groups()
     if index is not None:
         return [spec]
-    return [f"apartments:{split}/{i}" for i in range(int(count or SPLIT_SIZE))]
+    return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
 
 
 def open_scene(name: str) -> Scene:

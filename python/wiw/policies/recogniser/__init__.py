@@ -73,7 +73,7 @@ class Recognition(Policy):
         views: int = 2,
         lost: float = 0.5,
         turning: float = 0.05,
-        trust: float = 0.1,
+        trust: float = 0.3,
     ) -> None:
         self.file = Path(WEIGHTS if weights is None else weights)
         self.recogniser = Recogniser.load(self.file)
