@@ -6,8 +6,9 @@ from __future__ import annotations
 import base64
 import hashlib
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,10 @@ class Album:
     def put(self, name: str, kind: str, data: bytes) -> str:
         """What an `src` attribute says of a picture; `name` tells it from the others of the run."""
         return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> str:
+        """The same for a JPEG that is still to be made."""
+        return self.put(name, "jpeg", make())
 
 
 @dataclass(frozen=True)
@@ -249,7 +254,9 @@ def _step(row: Mapping[str, Any], images: Mapping[str, bytes], album: Album, nam
     return Step(
         row["decision"] + 1,
         glyphs(row["executed"]),
-        _panorama(panorama, album, f"{name}-seen") if panorama else None,
+        album.draw(f"{name}-seen", partial(_panorama, panorama, album.panorama_width, album.quality))
+        if panorama
+        else None,
         tuple(_candidates(row, images, album, name)),
         glyphs(row["actions"]) if written_anew else "",
         _way(row, "before"),
@@ -300,8 +307,9 @@ def _candidates(row: Mapping[str, Any], images: Mapping[str, bytes], album: Albu
     for index, (proposal, score) in enumerate(zip(proposals, scores, strict=True)):
         strips = {kind: images.get(f"{kind}/{index}") for kind in ("imagined", "true")}
         real = row["real_frames"][index] if row["real_frames"] else []
+        frames = len(real) or len(proposal["actions"])
         shown = {
-            kind: _strip(jpeg, len(real) or len(proposal["actions"]), album, f"{name}-{kind}-{index}")
+            kind: album.draw(f"{name}-{kind}-{index}", partial(_strip, jpeg, frames, album.frame_height, album.quality))
             for kind, jpeg in strips.items()
             if jpeg
         }
@@ -328,20 +336,21 @@ def glyphs(actions: Sequence[int]) -> str:
     return "".join(GLYPHS.get(action, f"({action})") for action in actions)
 
 
-def _panorama(jpeg: bytes, album: Album, name: str) -> str:
+def _panorama(jpeg: bytes, width: int, quality: int) -> bytes:
+    """The part of a panorama that is shown, at most so many pixels wide."""
     band = _part(decode_jpeg(jpeg), BAND, (0, 1))
-    return _jpeg(band, min(1.0, album.panorama_width / band.shape[1]), album, name)
+    return _jpeg(band, min(1.0, width / band.shape[1]), quality)
 
 
-def _strip(jpeg: bytes, frames: int, album: Album, name: str) -> str:
-    """Frames side by side; of panoramas only the part towards which the agent looks."""
+def _strip(jpeg: bytes, frames: int, height: int, quality: int) -> bytes:
+    """Frames side by side, at most so many pixels high; of panoramas only the part towards which the agent looks."""
     image = decode_jpeg(jpeg)
     tiles = np.split(image, frames, axis=1)
     if tiles[0].shape[1] > 1.6 * tiles[0].shape[0]:
         tiles = [_part(tile, BAND, FRONT) for tile in tiles]
     gap = np.full((len(tiles[0]), GAP, 3), 255, np.uint8)
     spaced = np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1)
-    return _jpeg(spaced, min(1.0, album.frame_height / len(spaced)), album, name)
+    return _jpeg(spaced, min(1.0, height / len(spaced)), quality)
 
 
 def _part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[float, float]) -> NDArray[np.uint8]:
@@ -351,7 +360,7 @@ def _part(image: NDArray[np.uint8], rows: tuple[float, float], columns: tuple[fl
     ]
 
 
-def _jpeg(image: NDArray[np.uint8], scale: float, album: Album, name: str) -> str:
+def _jpeg(image: NDArray[np.uint8], scale: float, quality: int) -> bytes:
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    return album.put(name, "jpeg", encode_jpeg(image, album.quality))
+    return encode_jpeg(image, quality)

@@ -7,11 +7,13 @@ Both draw an episode from the same values and template parts.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wiw._core import core
 from wiw.evaluation.faults import whole_folder
 from wiw.evaluation.report.episodes import Album, Story, outcomes_by_episode, place, taken_for, tell, wording
 from wiw.evaluation.report.plots import arm_colors
@@ -23,22 +25,48 @@ if TYPE_CHECKING:
 
 
 class Beside(Album):
-    """Pictures as files of a folder, each written once."""
+    """Pictures as files of a folder, each written once; those that are to be made are made by a pool's threads."""
 
     panorama_width, frame_height, quality = 1024, 132, 76
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, pool: Executor) -> None:
+        self._folder, self._pool = folder, pool
         self._folder.mkdir()
-        self.count = self.size = 0
+        self._sizes: dict[str, int] = {}
+        self._making: list[Future[str]] = []
+
+    @property
+    def count(self) -> int:
+        """Pictures that were written."""
+        return len(self._sizes)
+
+    @property
+    def size(self) -> int:
+        """Their bytes."""
+        return sum(self._sizes.values())
 
     def put(self, name: str, kind: str, data: bytes) -> str:
         """The picture's address, seen from an episode's page. Names are numbers and our own words, never the run's."""
-        file = self._folder / f"{name}.{'jpg' if kind == 'jpeg' else kind}"
-        if not file.exists():
+        file = self._folder / _file(name, kind)
+        if file.name not in self._sizes:
             file.write_bytes(data)
-            self.count, self.size = self.count + 1, self.size + len(data)
+            self._sizes[file.name] = len(data)
         return f"../{self._folder.name}/{file.name}"
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> str:
+        """The address of a picture that will be there after `finish`."""
+        self._making.append(self._pool.submit(lambda: self.put(name, "jpeg", make())))
+        return f"../{self._folder.name}/{_file(name, 'jpeg')}"
+
+    def finish(self) -> None:
+        """Waits for the pictures that are being made; raises what making one has raised."""
+        making, self._making = self._making, []
+        for picture in making:
+            picture.result()
+
+
+def _file(name: str, kind: str) -> str:
+    return f"{name}.{'jpg' if kind == 'jpeg' else kind}"
 
 
 @dataclass(frozen=True)
@@ -92,8 +120,8 @@ def write_view(log: RunLog, folder: Path) -> Site:
     Raises:
         FileError: the folder holds something that is no view, or cannot be written.
     """
-    with whole_folder(folder, replace=is_view) as draft:
-        album = Beside(draft / "images")
+    with whole_folder(folder, replace=is_view) as draft, ThreadPoolExecutor(core.num_threads()) as pool:
+        album = Beside(draft / "images", pool)
         pages = draft / "episodes"
         pages.mkdir()
         outcomes = outcomes_by_episode(log.store, log.arms)
@@ -107,6 +135,7 @@ def write_view(log: RunLog, folder: Path) -> Site:
             common |= {"before": told[number - 1] if number else None}
             common |= {"after": told[number + 1] if number + 1 < len(told) else None}
             (pages / line.file).write_text(_episode(story, scenes, common), encoding="utf-8")
+            album.finish()
     return Site(folder / "index.html", len(told), album.count, album.size)
 
 
