@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
+from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from urllib.parse import unquote
 
@@ -14,11 +15,12 @@ from fakes import LineAgent, LineTask
 from PIL import Image
 
 from wiw.cli import main
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.evaluation.evaluate import run_arms
-from wiw.evaluation.rows import encode_jpeg
+from wiw.evaluation.rows import decode_jpeg, encode_jpeg
 from wiw.evaluation.store import store_path
 from wiw.evaluation.view import write_view
+from wiw.evaluation.view.site import Beside
 from wiw.types import Episode
 
 EVIL = """<img src=x onerror="document.title='owned'">'"/../&"""
@@ -110,6 +112,20 @@ def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):
     with pytest.raises(FileError, match="holds something already"):
         log.view(tmp_path / "v")
     assert (tmp_path / "v" / "thesis.tex").exists()
+
+
+def test_a_picture_that_cannot_be_made_is_told(tmp_path):
+    with ThreadPoolExecutor(2) as pool:
+        album = Beside(tmp_path / "images", pool)
+        assert [album.draw(name, lambda name=name: name.encode()) for name in "ab"] == [
+            "../images/a.jpg",
+            "../images/b.jpg",
+        ]
+        album.finish()
+        assert (tmp_path / "images/b.jpg").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
+        album.draw("c", lambda: decode_jpeg(b"no picture"))
+        with pytest.raises(StoreError, match="no JPEG"):
+            album.finish()
 
 
 def test_a_run_that_goes_on_shows_what_has_ended(tmp_path):
