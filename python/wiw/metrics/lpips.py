@@ -135,7 +135,8 @@ def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
     if absent:
         raise WeightsError(
             f"LPIPS: {' and '.join(absent)} not found in {folder}. It needs two published files there, "
-            f"{BACKBONE.name} ({BACKBONE.size}) and {HEADS.name} ({HEADS.size}):\n"
+            f"{BACKBONE.name} ({BACKBONE.size}) and {HEADS.name} ({HEADS.size}, also in the lpips package as "
+            f"lpips/weights/v0.1/{HEADS.name}):\n"
             f"  curl -L --create-dirs --output-dir {folder} -O {BACKBONE.url} -O {HEADS.url}"
         )
     for file in (BACKBONE, HEADS):
