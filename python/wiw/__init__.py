@@ -24,6 +24,7 @@ __all__ = [
     "accepts",
     "action",
     "annotate",
+    "check_model",
     "compare",
     "envs",
     "errors",
@@ -54,6 +55,7 @@ _HOME = {
     "Policy": "wiw.policies.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
+    "check_model": "wiw.evaluation.model_check",
     "compare": "wiw.evaluation.compare",
     "evaluate": "wiw.evaluation.evaluate",
     "load_run": "wiw.evaluation.runlog",
@@ -85,6 +87,7 @@ if TYPE_CHECKING:
     from wiw import action, annotate, envs, errors, metrics, nav, panorama, registry, render, reproject, scenes, types
     from wiw.evaluation.compare import compare
     from wiw.evaluation.evaluate import evaluate
+    from wiw.evaluation.model_check import check_model
     from wiw.evaluation.power import power
     from wiw.evaluation.runlog import load_run
     from wiw.evaluation.scale import scale

@@ -29,6 +29,8 @@ def test_help_teaches_by_examples(capsys):
         (["resume"], "wiw resume runs/first"),
         (["report"], "--out first.html"),
         (["view"], "--keep-images all"),
+        (["serve"], "--world-model remote:ws://127.0.0.1:8765"),
+        (["check-model"], "wiw check-model my_model.py:MyModel"),
         (["verify"], "--episodes 10"),
         (["export"], "--rerun first.rrd"),
         ([], "75 stopped by SIGTERM"),

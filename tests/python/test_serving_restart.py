@@ -139,10 +139,3 @@ def test_what_cannot_be_served_is_said(arguments, said, capsys, monkeypatch):
     monkeypatch.delenv("WIW_TOKEN", raising=False)
     assert main(["serve", *arguments]) == 2
     assert said in capsys.readouterr().err
-
-
-def test_help_shows_both_ends(capsys):
-    with pytest.raises(SystemExit):
-        main(["serve", "--help"])
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "--world-model remote:ws://127.0.0.1:8765" in shown and "WIW_TOKEN=secret wiw serve" in shown

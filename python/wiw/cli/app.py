@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 
 import wiw
+from wiw.cli.check_model import check_model
 from wiw.cli.compare import compare
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
@@ -52,6 +53,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (export, "export", "A run as CSV or Parquet tables, or as a Rerun recording."),
     (verify, "verify", "Run some episodes of a run again, and compare."),
     (view, "view", "Pages to walk through a run, to every decision."),
+    (check_model, "check-model", "Whether a world model keeps its contract, in plain words."),
     (serve, "serve", "Serve a world model to other processes or machines."),
     (doctor, "doctor", "What this machine can do, and what to mend."),
     (scenes, "scenes", "Look at scenes: pictures and figures."),

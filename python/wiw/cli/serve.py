@@ -42,7 +42,8 @@ def serve(
 
     Rows of all episodes of all clients become full batches of the model. A client whose server is killed waits until
     it is back, as long as its deadline allows, and asks again what was not answered. SIGTERM or Ctrl-C finishes what
-    was taken and ends; a second one ends at once. docs/serving.md has the protocol.
+    was taken and ends; a second one ends at once. `wiw check-model MODEL` tells beforehand whether the model keeps its
+    contract; docs/serving.md has the protocol.
 
     Args:
         model: Name, path.py:Class or package.module:Class. See `wiw list`.

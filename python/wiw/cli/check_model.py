@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw check-model`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from wiw.cli.options import Options, model_options
+
+
+def check_model(
+    model: Positional[Annotated[str, arg(metavar="MODEL")]],
+    /,
+    *,
+    world_model_option: Options = (),
+    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val:1",
+) -> int:
+    """Asks a world model a few rollouts, and says in plain words what is wrong with its answers.
+
+    $ wiw check-model my_model.py:MyModel
+    $ wiw check-model svd --world-model-option steps=2
+    $ wiw check-model remote:ws://127.0.0.1:8765
+
+    Looked at are type, dtype, shape, number of frames and NaN, frame 0, what the model does to its inputs, whether the
+    same seeds give the same frames, whether a row depends on those beside it, whether `causal` is true, whether the
+    plan makes a difference, and how long it takes. Exit code 1 if the contract is broken.
+
+    Args:
+        model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
+        world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
+        scenes: Where the observations come from: apartments:val:1, a mesh, or a Gazebo world.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from wiw.evaluation import model_check
+
+    findings = model_check.check_model(model, scenes, **model_options(model, world_model_option))
+    console = Console(highlight=False, soft_wrap=True)
+    for finding in findings:
+        mark = "[red]wrong[/]" if finding.serious else "[yellow]note[/] "
+        console.print(f"{mark}  [bold]{finding.kind}[/]  {escape(finding.text)}")
+    broken = any(finding.serious for finding in findings)
+    console.print(f"{escape(model)} {'breaks its contract' if broken else 'keeps its contract'}")
+    return int(broken)

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Questions to a world model as the loop asks them, row by row, to be asked in other company."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.loop.agent import Query
+from wiw.loop.attempts import Attempts
+from wiw.loop.clock import Clock
+from wiw.loop.imagine import imagine
+from wiw.policies.base import FrameSpec
+from wiw.registry import TASKS
+from wiw.types import Conditioning, Control, Key, Proposal
+from wiw.world_models.base import WorldModel, checked_rollout
+
+EPISODES = 2
+Frames = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One row of a rollout."""
+
+    image: Frames
+    depth: Any
+    simulator: Any
+    control: Control
+    seed: np.uint64
+
+
+class Questions:
+    """What the loop would ask a model in the first moments of some episodes.
+
+    Args:
+        model: who is asked.
+        scenes: where the episodes are.
+    """
+
+    def __init__(self, model: WorldModel, scenes: str) -> None:
+        self._model = model
+        self._queries = _queries(scenes)
+        self.row_seconds = 0.0
+        """What a row took in the last call."""
+        self.changed: set[str] = set()
+        """What of its inputs the model has changed."""
+
+    def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
+        """The rows of these plans of primitives, in each episode."""
+        recorder = _Recorder(self._model)
+        proposals = [[Proposal(np.array(plan, np.int8)) for plan in plans] for _ in self._queries]
+        origins = [range(len(plans)) for _ in proposals]
+        imagine(recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        return [
+            Row(
+                observations.image[place],
+                None if observations.depth is None else observations.depth[place],
+                None if observations.simulators is None else observations.simulators[place],
+                replace(control, shared=0),
+                seeds[place],
+            )
+            for observations, controls, seeds in recorder.asked
+            for place, control in enumerate(controls)
+        ]
+
+    def ask(self, rows: Sequence[Row], shared: int = 0) -> Frames:
+        """The model's answer, in calls of as many rows as it takes best, held to the contract.
+
+        With `shared`, the first frames are not asked for: the same question to the model, but not to a server that
+        remembers its answers.
+        """
+        begin, most = time.perf_counter(), self._model.accepts.best_batch
+        rows = [replace(row, control=replace(row.control, shared=shared)) for row in rows]
+        answers = [self._call(rows[first : first + most]) for first in range(0, len(rows), most)]
+        self.row_seconds = (time.perf_counter() - begin) / len(rows)
+        return np.concatenate(answers)
+
+    def _call(self, rows: Sequence[Row]) -> Frames:
+        observations = Conditioning(
+            np.stack([row.image for row in rows]),
+            depth=None if rows[0].depth is None else np.stack([row.depth for row in rows]),
+            simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
+        )
+        controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
+        given: dict[str, NDArray[Any]] = {"observations.image": observations.image, "seeds": seeds}
+        if observations.depth is not None:
+            given["observations.depth"] = observations.depth
+        kept = {name: array.copy() for name, array in given.items()}
+        frames = checked_rollout(self._model, observations, controls, seeds)
+        self.changed |= {name for name, array in given.items() if not np.array_equal(array, kept[name])}
+        return np.array(frames)
+
+
+class _Recorder(Attempts):
+    """Notes what the loop asks of a model, and answers that nothing moves."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(model)
+        self.asked: list[tuple[Conditioning, Sequence[Control], NDArray[np.uint64]]] = []
+
+    def __call__(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        self.asked.append((observations, controls, seeds))
+        return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+
+
+def _queries(scenes: str) -> list[Query]:
+    """The first moments of some episodes."""
+    task = TASKS.make("imagenav", scenes=scenes)
+    queries = []
+    for index in range(EPISODES):
+        env = task.environment(depth=True)
+        observation = env.begin(task.episode(index))
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
+    return queries

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw.check_model` finds each way of breaking the contract, and says so; a model that keeps it is left in peace."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.cli import main
+from wiw.errors import ArgumentError, RegistryError
+from wiw.serving.background import served
+
+DECLARED = {"control": "trajectory", "size": (48, 96), "best_batch": 4}
+
+
+class Honest(wiw.WorldModel):
+    """Darkens the image by where the plan leads, with noise of the row's own seed."""
+
+    accepts = wiw.accepts(**DECLARED, causal=True)
+
+    def rollout(self, observations, controls, seeds):
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+        for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
+            noise = np.random.default_rng(int(seed)).integers(0, 20, len(control.actions)).astype(np.uint8)
+            shade = (20 * np.abs(control.trajectory).sum(1)).astype(np.uint8) + noise
+            frames[row, 1:] = frames[row, 1:] // 2 + shade[:, None, None, None]
+        return frames
+
+
+def spoilt(spoil, **declared):
+    """An honest model whose answer is spoilt; `spoil(frames, observations, controls, seeds)`."""
+
+    class Spoilt(Honest):
+        accepts = wiw.accepts(**{**DECLARED, **declared})
+
+        def rollout(self, observations, controls, seeds):
+            frames = super().rollout(observations, controls, seeds)
+            answer = spoil(frames, observations, controls, seeds)
+            return frames if answer is None else answer
+
+    return Spoilt
+
+
+def dark(frames, *_):
+    frames[:, 0] = 0
+
+
+def shift(frames, *_):
+    return np.concatenate([frames[:, 1:], frames[:, -1:]], 1)
+
+
+def by_chance(frames, *_):
+    frames[:, 1:] += np.random.default_rng().integers(0, 99, frames[:, 1:].shape).astype(np.uint8)
+
+
+def by_the_batch(frames, observations, controls, seeds):
+    frames[:, 1:] += np.uint8(30 * len(frames))
+
+
+def from_the_first_seed(frames, observations, controls, seeds):
+    frames[:, 1:] += np.random.default_rng(int(seeds[0])).integers(0, 99, frames[0, 1:].shape).astype(np.uint8)
+
+
+def nearly(frames, *_):
+    frames[:, 1:] += np.uint8(len(frames))
+
+
+def looking_ahead(frames, observations, controls, seeds):
+    for row, control in enumerate(controls):
+        frames[row, 1:] += np.uint8(40 * np.abs(control.trajectory[-1]).sum())
+
+
+def overwriting(frames, observations, controls, seeds):
+    observations.image[:] = 0
+
+
+def raising(frames, *_):
+    raise RuntimeError("CUDA error: no kernel image")
+
+
+BROKEN = {
+    "raised": (raising, {}, r"`rollout` raised RuntimeError: CUDA error: no kernel image \(test_model_check\.py, line"),
+    "shape": (
+        lambda frames, *_: frames[:, :, :40],
+        {},
+        r"expected uint8 \(1, 5, 48, 96, 3\).*got uint8 \(1, 5, 40",
+    ),
+    "dtype": (lambda frames, *_: frames / np.float32(255), {}, "got float32"),
+    "nan": (lambda frames, *_: frames * np.float32("nan"), {}, "with NaN"),
+    "type": (lambda frames, *_: frames.tolist(), {}, "got list"),
+    "frames": (lambda frames, *_: frames[:, 1:], {}, r"actions \+ 1.*got uint8 \(1, 4"),
+    "frame 0": (dark, {}, "Frame 0 is not the observation: it differs by up to"),
+    "frame 0, shifted": (shift, {}, "Frame k is what follows action k"),
+    "random": (by_chance, {}, "Asked twice with the same seeds, 6 of 6 rows differ"),
+    "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same in a batch of 4"),
+    "batch, seeds": (from_the_first_seed, {}, "its own seed, not the batch's from the first one"),
+    "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),
+    "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
+    "needs": (dark, {"needs": ("history",)}, "needs history, but a model can be given"),
+    "needs, poses": (dark, {"space": "pose7"}, "plans in discrete primitives"),
+}
+
+
+def found(model, scene, **options):
+    return {finding.kind: finding for finding in wiw.check_model(model, scene, **options)}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_each_breach_is_found_and_told(name, two_rooms):
+    spoil, declared, text = BROKEN[name]
+    findings = found(spoilt(spoil, **declared), two_rooms)
+    kind = name.partition(",")[0]
+    assert findings[kind].serious, findings
+    assert re.search(text, str(findings[kind])), str(findings[kind])
+    assert set(findings) <= {kind, "frame 0"}
+
+
+@pytest.mark.parametrize(
+    "declared", [{}, {"frames": 5}, {"frames": 14}, {"frames": 2}, {"best_batch": 1}, {"needs": ("depth",)}]
+)
+def test_an_honest_model_is_left_in_peace(declared, two_rooms):
+    assert found(spoilt(lambda *_: None, **declared), two_rooms) == {}
+    assert found(Honest, two_rooms) == {}
+
+
+def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):
+    from wiw.evaluation import model_check
+
+    findings = found(spoilt(nearly), two_rooms)
+    assert not findings["batch"].serious and "the order in which a GPU adds up" in str(findings["batch"])
+    still = found(
+        spoilt(lambda frames, observations, *_: np.repeat(observations.image[:, None], frames.shape[1], 1)), two_rooms
+    )
+    assert not still["plan"].serious and "('trajectory')" in str(still["plan"])
+    monkeypatch.setattr(model_check, "LONG_RUN", 0.0)
+    slow = found(Honest, two_rooms)
+    assert not slow["slow"].serious and "about 6000 of them" in str(slow["slow"])
+
+
+def test_identity_is_looked_at_too(two_rooms):
+    class Odd(Honest):
+        accepts = wiw.accepts(**DECLARED, cacheable=True)
+
+        def __init__(self):
+            self._handle = object()
+
+        def describe(self):
+            return {"weights": object()}
+
+    findings = found(Odd, two_rooms)
+    assert "no JSON" in str(findings["describe"]) and "Odd._handle, a object" in str(findings["fingerprint"])
+
+
+def test_what_cannot_be_made(two_rooms):
+    class Unmade(Honest):
+        def __init__(self):
+            raise OSError("no weights")
+
+    assert "It cannot be made: OSError: no weights (test_model_check.py" in str(found(Unmade, two_rooms)["raised"])
+    with pytest.raises(RegistryError, match="Did you mean warp"):
+        wiw.check_model("wrap", two_rooms)
+    with pytest.raises(ArgumentError, match="no world model"):
+        wiw.check_model("none", two_rooms)
+
+
+def test_a_function_and_a_served_model_are_checked_as_any(two_rooms):
+    def rollout(observations, controls, seeds):
+        return Honest().rollout(observations, controls, seeds)
+
+    assert found(rollout, two_rooms, accepts=Honest.accepts) == {}
+    with served(Honest) as server:
+        assert found(f"remote:{server.address}", two_rooms) == {}
+    with served(spoilt(by_chance)) as server:
+        assert set(found(f"remote:{server.address}", two_rooms)) == {"random"}
+    with served(spoilt(lambda frames, *_: frames[:, 1:])) as server:
+        assert set(found(f"remote:{server.address}", two_rooms)) == {"frames"}
+
+
+def test_the_command_says_it_and_ends_accordingly(tmp_path: Path, two_rooms, capsys):
+    file = tmp_path / "mine.py"
+    text = """
+import numpy as np
+import wiw
+
+
+class Mine(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", size=(48, 96), best_batch=2)
+    first = {first}
+
+    def rollout(self, observations, controls, seeds):
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+        frames[:, 0] += self.first
+        return frames
+"""
+    for first, code, said in ((0, 0, "keeps its contract"), (1, 1, "Frame 0 is not the observation")):
+        file.write_text(text.format(first=first))
+        assert main(["check-model", f"{file}:Mine", "--scenes", two_rooms]) == code
+        assert said in capsys.readouterr().out
+    assert main(["check-model", f"{file}:Its"]) == 2
+    assert "cannot be loaded" in capsys.readouterr().err
