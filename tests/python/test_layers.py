@@ -16,7 +16,19 @@ CPP_ROWS = [
     {"render", "nav", "planner", "reproject", "annotate"},
     {"env"},
 ]
-FACES = {"types", "errors", "registry", "panorama", "scenes", "render", "nav", "action", "annotate", "reproject"}
+FACES = {
+    "types",
+    "errors",
+    "registry",
+    "networks",
+    "panorama",
+    "scenes",
+    "render",
+    "nav",
+    "action",
+    "annotate",
+    "reproject",
+}
 PYTHON_ROWS = [
     {"_core"},
     FACES,

@@ -4,19 +4,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, WeightsError
+from wiw.networks import explained, is_path
+
+__all__ = ["SAMPLES", "SAMPLE_BYTES", "Weights", "digest", "explained", "fetch", "is_path", "require_kind"]
 
 SAMPLES, SAMPLE_BYTES = 16, 1 << 16
 """Of each file of weights this much is read to identify it: training changes all of a network."""
-
-UNREACHABLE = {"ConnectionError", "TransportError"}
-"""Names of the errors of a network in `requests` and `httpx`, of which the hub's client has had either."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,6 @@ def fetch(
     return Weights(snapshot, {"commit": snapshot.name})
 
 
-def is_path(name: str) -> bool:
-    """Whether a name is a path and not a hub repository, OWNER/NAME."""
-    return name.startswith(("/", ".", "~")) or name.count("/") != 1
-
-
 def _download(
     name: str, pipeline: str, revision: str | None, variant: str | None, components: Mapping[str, Any]
 ) -> Path:
@@ -64,47 +59,6 @@ def _download(
         return Path(getattr(diffusers, pipeline).download(name, revision=revision, variant=variant, **components))
     except Exception as error:
         raise explained(error, name, revision) from error
-
-
-def explained(error: BaseException, name: str, revision: str | None) -> WeightsError:
-    """What an error of the hub's client means for the user."""
-    from huggingface_hub import errors
-
-    chain = list(_chain(error))
-
-    def met(*kinds: type[BaseException]) -> bool:
-        return any(isinstance(link, kinds) for link in chain)
-
-    by_hand = f"or download it elsewhere (hf download {name} --local-dir FOLDER) and give weights=FOLDER"
-    if met(errors.GatedRepoError):
-        text = f"'{name}' is gated: accept its terms at https://huggingface.co/{name}, then `hf auth login`"
-        return WeightsError(text, "gated")
-    if met(errors.RevisionNotFoundError):
-        text = f"'{name}' has no revision '{revision}'; https://huggingface.co/{name}/commits/main lists its commits"
-        return WeightsError(text, "revision")
-    if met(errors.RepositoryNotFoundError):
-        text = (
-            f"the hub has no repository '{name}', or it is private: check the name, or `hf auth login`; "
-            "weights= also takes a folder"
-        )
-        return WeightsError(text, "missing")
-    unreachable = any(kind.__name__ in UNREACHABLE for link in chain for kind in type(link).__mro__)
-    if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
-        text = f"'{name}' is not on this machine and the hub is out of reach: connect (unset HF_HUB_OFFLINE), {by_hand}"
-        return WeightsError(text, "network")
-    return WeightsError(f"'{name}' cannot be downloaded: {error}; try again, {by_hand}")
-
-
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and what it was raised from or while handling, the last one first."""
-    seen: set[int] = set()
-    pending = [error]
-    while pending:
-        link = pending.pop()
-        if link is not None and id(link) not in seen:
-            seen.add(id(link))
-            yield link
-            pending += [link.__context__, link.__cause__]
 
 
 def require_kind(folder: Path, pipelines: Sequence[str], marks: Mapping[str, bool]) -> None:
