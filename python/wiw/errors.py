@@ -74,7 +74,7 @@ class RolloutError(InfrastructureError):
 
 
 class RemoteError(RolloutError):
-    """A served world model gave no answer, or a message between it and its client is not as agreed.
+    """A served model gave no answer, or a message between it and its client is not as agreed.
 
     `kind` is "connection" (nobody is there), "deadline", "token", "version", "model" (the server has come back with
     another one), "message" (malformed, or too large), "row" (not what the model accepts), or "raised".

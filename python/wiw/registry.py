@@ -199,6 +199,26 @@ TRACKERS = Registry(
         "sam2": "wiw.perception.sam2:Sam2",
     },
 )
+DETECTORS = Registry(
+    "detector",
+    "",
+    {
+        "owlvit": "wiw.perception.owlvit:OwlViT",
+        "grounding-dino": "wiw.perception.grounding_dino:GroundingDino",
+        "simulator": "wiw.perception.simulator:TrueBoxes",
+        "remote:": "wiw.perception.remote:Remote",
+    },
+)
+SEGMENTERS = Registry(
+    "segmenter",
+    "",
+    {"sam2": "wiw.perception.sam2_image:Sam2Image", "simulator": "wiw.perception.simulator:TrueMasks"},
+)
+SEMANTICS = Registry(
+    "source of semantics",
+    "",
+    {"rednet": "wiw.perception.rednet:RedNet", "simulator": "wiw.perception.semantics:TrueSemantics"},
+)
 METRICS = Registry(
     "metric",
     "wiw.metrics",

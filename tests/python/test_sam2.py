@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, DependencyError
 from wiw.types import Observation, Target
 
 
@@ -18,7 +18,7 @@ def test_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     from wiw.perception.sam2 import Sam2
 
     monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ArgumentError, match="pip install torch transformers, or track by reprojection"):
+    with pytest.raises(DependencyError, match=r"transformers not installed; pip install 'wiw\[torch\]'"):
         Sam2("facebook/sam2.1-hiera-tiny")
     with pytest.raises(ArgumentError, match="prompt: expected 'box' or 'mask'"):
         Sam2("facebook/sam2.1-hiera-tiny", prompt="point")  # type: ignore[arg-type]
@@ -27,51 +27,11 @@ def test_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the weights of a network of about a million numbers, 64 pixels a side."""
-    torch = pytest.importorskip("torch", reason="torch is not installed: pip install wiw[torch]")
+    pytest.importorskip("torch", reason="torch is not installed: pip install wiw[torch]")
     pytest.importorskip("transformers", reason="transformers is not installed: pip install wiw[torch]")
-    from transformers import Sam2HieraDetConfig, Sam2VideoConfig, Sam2VideoModel, Sam2VisionConfig
+    import tiny_detectors
 
-    torch.manual_seed(0)
-    backbone = Sam2HieraDetConfig(
-        hidden_size=8,
-        num_attention_heads=1,
-        blocks_per_stage=[1, 2, 2, 1],
-        embed_dim_per_stage=[8, 16, 32, 64],
-        num_attention_heads_per_stage=[1, 2, 4, 8],
-        global_attention_blocks=[4],
-        window_size_per_stage=[8, 4, 4, 2],
-        image_size=[64, 64],
-        window_positional_embedding_background_size=[4, 4],
-    )
-    vision = Sam2VisionConfig(
-        backbone_config=backbone,
-        backbone_channel_list=[64, 32, 16, 8],
-        backbone_feature_sizes=[[16, 16], [8, 8], [4, 4]],
-        fpn_hidden_size=128,
-    )
-    config = Sam2VideoConfig(
-        vision_config=vision,
-        prompt_encoder_config={"hidden_size": 128, "image_size": 64},
-        mask_decoder_config={
-            "hidden_size": 128,
-            "mlp_dim": 32,
-            "num_attention_heads": 2,
-            "iou_head_hidden_dim": 32,
-        },
-        image_size=64,
-        memory_attention_hidden_size=128,
-        memory_attention_num_layers=1,
-        memory_attention_feed_forward_hidden_size=32,
-        memory_attention_rope_feat_sizes=[4, 4],
-        memory_encoder_hidden_size=128,
-        memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128,
-        memory_fuser_embed_dim=128,
-        memory_fuser_intermediate_dim=32,
-    )
-    folder = tmp_path_factory.mktemp("sam2")
-    Sam2VideoModel(config).save_pretrained(folder)
-    return folder
+    return tiny_detectors.save_sam2(tmp_path_factory.mktemp("sam2"), video=True)
 
 
 def observation(across_the_seam: bool = False) -> Observation:

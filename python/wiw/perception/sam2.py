@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.errors import ArgumentError
+from wiw.networks import device as usable
+from wiw.perception import pretrained
 from wiw.perception.boxes import Mask, box_of, width_of
 from wiw.perception.tracking import Tracker, target_of
 from wiw.types import Box, Observation
-
-MEAN = (0.485, 0.456, 0.406)
-STD = (0.229, 0.224, 0.225)
-"""Of the images that the network was trained on, channel by channel."""
 
 
 class Sam2(Tracker):
@@ -29,22 +27,29 @@ class Sam2(Tracker):
     Args:
         weights: a folder or hub name that `transformers.Sam2VideoModel.from_pretrained` takes, or such a model.
         prompt: what the first frame is marked with: the target's "box", as in the paper, or its "mask".
-        device: of torch.
+        device: of torch; the GPU if there is one.
+        revision: of the hub's repository.
 
     Raises:
-        ArgumentError: torch or transformers is not installed, or an unknown prompt.
+        ArgumentError: an unknown prompt, or there is no such device.
+        DependencyError: torch or transformers is not installed.
+        WeightsError: the weights cannot be had or are another network's; its `kind` says why.
     """
 
     def __init__(
         self,
         weights: Any = "facebook/sam2.1-hiera-tiny",
         prompt: Literal["box", "mask"] = "box",
-        device: str = "cpu",
+        device: str | None = None,
+        revision: str | None = None,
     ) -> None:
         if prompt not in ("box", "mask"):
             raise ArgumentError(f"Sam2: prompt: expected 'box' or 'mask', got {prompt!r}")
-        self.prompt, self.device = prompt, device
-        self._model = (_loaded(weights) if isinstance(weights, str | Path) else weights).to(device).eval()
+        pretrained.library()
+        self.prompt, self.device = prompt, usable(device)
+        if isinstance(weights, str | Path):
+            weights = pretrained.network("Sam2VideoModel", ("sam2_video",), weights, revision, self.device)
+        self._model = weights.to(self.device).eval()
 
     def masks(
         self,
@@ -99,12 +104,8 @@ class Sam2(Tracker):
         import torch
         from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
-        pixels = torch.from_numpy(np.ascontiguousarray(video)).to(self.device).permute(0, 3, 1, 2).float() / 255
-        side = self._side
-        pixels = torch.nn.functional.interpolate(pixels, (side, side), mode="bilinear", antialias=True)
-        mean, std = (torch.tensor(values, device=self.device)[:, None, None] for values in (MEAN, STD))
         return Sam2VideoInferenceSession(
-            video=(pixels - mean) / std,
+            video=pretrained.square(video, self._side, self.device),
             video_height=video.shape[1],
             video_width=video.shape[2],
             inference_device=self.device,
@@ -131,16 +132,6 @@ class Sam2(Tracker):
     @property
     def _side(self) -> int:
         return int(self._model.image_size)
-
-
-def _loaded(weights: str | Path) -> Any:
-    try:
-        from transformers import Sam2VideoModel
-    except ImportError as error:
-        raise ArgumentError(
-            f"Sam2: needs torch and transformers ({error}); pip install torch transformers, or track by reprojection"
-        ) from error
-    return Sam2VideoModel.from_pretrained(weights)
 
 
 def _fitted(image: NDArray[np.uint8], frames: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the named things are in images: detectors behind one interface."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, ContractError
+
+Images = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
+"""uint8 [B, H, W, 3], or B images of several sizes."""
+Ids = NDArray[np.uint32] | Sequence[NDArray[np.uint32]] | None
+"""uint32 [B, H, W], or one [H, W] an image: instance ids of the simulator."""
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What was found in one image, the surest first."""
+
+    boxes: NDArray[np.float32]
+    """float32 [N, 4]: left, top, right, bottom in pixels, as `wiw.types.Box`."""
+    scores: NDArray[np.float32]
+    """float32 [N] from 0 to 1. What a score is worth differs from detector to detector."""
+    labels: tuple[str, ...]
+    """N of the names that were asked for."""
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    def take(self, rows: NDArray[np.integer]) -> Detections:
+        """Those of the given rows, in their order."""
+        return Detections(self.boxes[rows], self.scores[rows], tuple(self.labels[row] for row in rows))
+
+
+class Detector(ABC):
+    """Finds things by their names. Subclasses write `find`; everybody else calls `detect`."""
+
+    needs: tuple[str, ...] = ()
+    """"ids" where images must come with the simulator's instance ids."""
+
+    @abstractmethod
+    def find(
+        self, images: Sequence[NDArray[np.uint8]], names: Sequence[str], ids: Sequence[NDArray[np.uint32]]
+    ) -> list[Detections]:
+        """What is found in each image, in any order; `ids` is empty unless the detector needs it."""
+
+    def detect(self, images: Images, names: Sequence[str], ids: Ids = None) -> list[Detections]:
+        """Finds the named things in each image: boxes within the image, the surest first.
+
+        Args:
+            images: perspective views. A thing across the seam of a panorama is found in two halves; cut views instead.
+            names: e.g. ["chair", "coffee table"]; without any nothing is found.
+            ids: the simulator's instance ids of the images, for detectors that need them; others never see them.
+
+        Raises:
+            ArgumentError: arrays of other shapes or types, names that are empty or come twice, or no ids where needed.
+            ContractError: the detector's answer is not one detection for each image, with names that were asked for.
+        """
+        names = list(names)
+        if any(not name.strip() for name in names) or len(set(names)) < len(names):
+            raise ArgumentError(f"detect: expected names that differ and are not empty, got {names}")
+        seen, pointed = checked_images("detect", images, ids, "ids" in self.needs)
+        if not seen or not names:
+            return [nothing() for _ in seen]
+        answers = self.find(seen, names, pointed)
+        if len(answers) != len(seen):
+            raise ContractError(f"{type(self).__name__}: {len(seen)} images, but {len(answers)} answers")
+        return [_within(_checked(self, answer, names), image) for answer, image in zip(answers, seen, strict=True)]
+
+
+def nothing() -> Detections:
+    """No detections."""
+    return Detections(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), ())
+
+
+def checked_images(
+    where: str, images: Images, ids: Ids, needed: bool
+) -> tuple[list[NDArray[np.uint8]], list[NDArray[np.uint32]]]:
+    """The images one by one, and their ids where they are needed.
+
+    Raises:
+        ArgumentError: other shapes or types, or no ids.
+    """
+    seen = list(images)
+    for image in seen:
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            came = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise ArgumentError(f"{where}: expected images uint8 [H, W, 3], got {came}")
+    if not needed:
+        return seen, []
+    if ids is None:
+        raise ArgumentError(
+            f"{where}: this one knows the simulator's instance ids only; pass ids=, one [H, W] an image"
+        )
+    pointed = [np.asarray(array) for array in ids]
+    if [array.shape for array in pointed] != [image.shape[:2] for image in seen]:
+        raise ArgumentError(
+            f"{where}: expected ids of the images' sizes {[image.shape[:2] for image in seen]}, "
+            f"got {[array.shape for array in pointed]}"
+        )
+    return seen, pointed
+
+
+def without_duplicates(found: Detections, overlap: float) -> Detections:
+    """The surest of the boxes of one name that share more than `overlap` of their union (greedily)."""
+    order = np.argsort(-found.scores, kind="stable")
+    labels, kept = np.array(found.labels), []
+    while len(order):
+        best, rest = order[0], order[1:]
+        kept.append(int(best))
+        same = (labels[rest] == labels[best]) & (overlaps(found.boxes[best], found.boxes[rest]) > overlap)
+        order = rest[~same]
+    return found.take(np.array(kept, np.int64))
+
+
+def overlaps(box: NDArray[np.float32], boxes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Intersection over union of one box [4] with each of [N, 4]; 0 with boxes of no area."""
+    sides = np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2])
+    shared = np.prod(np.maximum(sides, 0), axis=1)
+    areas = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) + np.prod(box[2:] - box[:2])
+    return np.asarray(shared / np.maximum(areas - shared, np.finfo(np.float32).tiny), np.float32)
+
+
+def _checked(detector: Detector, answer: Detections, names: Sequence[str]) -> Detections:
+    count = len(answer.labels)
+    if answer.boxes.shape != (count, 4) or answer.scores.shape != (count,) or not set(answer.labels) <= set(names):
+        raise ContractError(
+            f"{type(detector).__name__}: expected boxes [N, 4], scores [N] and N labels among {list(names)}, got "
+            f"{answer.boxes.shape}, {answer.scores.shape} and {answer.labels}"
+        )
+    if not (np.isfinite(answer.boxes).all() and np.isfinite(answer.scores).all()):
+        raise ContractError(f"{type(detector).__name__}: boxes or scores are not finite", "nan")
+    return answer
+
+
+def _within(found: Detections, image: NDArray[np.uint8]) -> Detections:
+    """Sorted by score, with boxes cut at the image's edges; without those that lie outside."""
+    height, width = image.shape[:2]
+    boxes = np.clip(found.boxes, 0, np.array([width, height, width, height])).astype(np.float32)
+    inside = (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
+    order = np.argsort(-found.scores, kind="stable")
+    cut = Detections(boxes, found.scores.astype(np.float32), found.labels)
+    return cut.take(order[inside[order]])

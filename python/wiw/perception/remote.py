@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A detector in a process of its own, asked over HTTP; `docs/perception.md` has the protocol and a server's script."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from http.client import HTTPException
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import ProxyHandler, Request, build_opener
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, RemoteError
+from wiw.perception.detection import Detections, Detector, nothing
+
+VERSION = 1
+MOST_BYTES = 64 * 2**20
+"""Of an answer."""
+
+
+class Remote(Detector):
+    """Sends images and names, and reads boxes.
+
+    Args:
+        address: http://HOST:PORT. There is no token and no encryption: keep it on this machine, or in a tunnel.
+        seconds: for which an answer is waited for.
+
+    Raises:
+        ArgumentError: no such address, or no time.
+    """
+
+    def __init__(self, address: str, seconds: float = 60.0) -> None:
+        if not address.startswith(("http://", "https://")):
+            raise ArgumentError(f"expected a detector's address http://HOST:PORT, got '{address}'")
+        if not seconds > 0:
+            raise ArgumentError(f"seconds: expected more than 0, got {seconds}")
+        self.address, self.seconds = address.rstrip("/"), seconds
+
+    def find(
+        self, images: Sequence[NDArray[np.uint8]], names: Sequence[str], ids: Sequence[NDArray[np.uint32]]
+    ) -> list[Detections]:
+        """One request for all images.
+
+        Raises:
+            RemoteError: nobody is there ("connection"), no answer in time ("deadline"), an error of the server
+                ("raised"), or an answer that is not as agreed ("message").
+        """
+        question = {"version": VERSION, "names": list(names), "images": [_png(image) for image in images]}
+        said = self._post(json.dumps(question).encode())
+        try:
+            answers = json.loads(said)["detections"]
+            return [_detections(answer) for answer in answers]
+        except (ValueError, KeyError, TypeError) as error:
+            raise RemoteError(
+                f"{self.address}: expected {{'detections': [[{{'box': 4 numbers, 'score': number, 'label': name}}]]}} "
+                f"with a list for each image, got {said[:80]!r} ({type(error).__name__}: {error})",
+                "message",
+            ) from error
+
+    def _post(self, body: bytes) -> bytes:
+        request = Request(f"{self.address}/detect", body, {"Content-Type": "application/json"})
+        try:
+            with build_opener(ProxyHandler({})).open(request, timeout=self.seconds) as answer:
+                said = bytes(answer.read(MOST_BYTES + 1))
+        except HTTPError as error:
+            text = error.read(2000).decode(errors="replace").strip()
+            raise RemoteError(f"{self.address} answered {error.code}: {text}", "raised") from error
+        except (OSError, HTTPException) as error:
+            if isinstance(error, TimeoutError) or isinstance(getattr(error, "reason", None), TimeoutError):
+                text = (
+                    f"{self.address}: no answer within {self.seconds} s; ask for fewer images or wait longer (seconds=)"
+                )
+                raise RemoteError(text, "deadline") from error
+            text = f"{self.address} cannot be reached ({error}); start the detector's server, see docs/perception.md"
+            raise RemoteError(text, "connection") from error
+        if len(said) > MOST_BYTES:
+            raise RemoteError(f"{self.address}: an answer of more than {MOST_BYTES} bytes", "message")
+        return said
+
+
+def _png(image: NDArray[np.uint8]) -> str:
+    return base64.b64encode(cv2.imencode(".png", image[..., ::-1])[1].tobytes()).decode()
+
+
+def _detections(answer: list[dict[str, Any]]) -> Detections:
+    if not answer:
+        return nothing()
+    boxes = np.array([found["box"] for found in answer], np.float32)
+    scores = np.array([found["score"] for found in answer], np.float32)
+    if boxes.shape != (len(answer), 4) or scores.shape != (len(answer),):
+        raise ValueError(f"boxes {boxes.shape} and scores {scores.shape}")
+    return Detections(boxes, scores, tuple(str(found["label"]) for found in answer))
