@@ -38,7 +38,7 @@ from wiw.types import Conditioning, Control
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
-from wiw.world_models.remote import Remote
+from wiw.world_models.remote import Remote, link
 
 SIZE = (8, 16)
 
@@ -454,6 +454,16 @@ def test_another_version_is_refused_at_the_handshake():
             Remote(f"ws://127.0.0.1:{old.socket.getsockname()[1]}")
         assert caught.value.kind == "version"
         old.shutdown()
+
+
+def test_a_server_that_says_nothing_is_given_up_when_patience_ends(monkeypatch):
+    monkeypatch.setattr(link, "HANDSHAKE", 0.2)
+    with serve_sync(lambda connection: time.sleep(1.0), "127.0.0.1", 0) as mute:
+        threading.Thread(target=mute.serve_forever, daemon=True).start()
+        with pytest.raises(RemoteError, match="TimeoutError") as caught:
+            Remote(f"ws://127.0.0.1:{mute.socket.getsockname()[1]}", patience=2.0)
+        assert caught.value.kind == "connection"
+        mute.shutdown()
 
 
 def test_rows_that_the_model_does_not_take_are_refused_one_by_one():

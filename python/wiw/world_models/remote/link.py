@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 import numpy as np
 from numpy.typing import NDArray
 from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import wiw
 from wiw.errors import ContractError, RemoteError
@@ -143,7 +143,7 @@ class Link:
                 if error.response.status_code in (401, 403):
                     self._give_up(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
                 self._trouble = str(error)
-            except (OSError, TimeoutError, WebSocketException) as error:
+            except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
                 self._trouble = f"{type(error).__name__}: {error}"
             if not self._open and self._welcome.done():
                 self._wanted.clear()
