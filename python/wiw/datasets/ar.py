@@ -287,6 +287,27 @@ def _best_view(
     return _View(ends[end], int(primitives[end]), float(sizes[best]), min(1.0, float(shares[best])))
 
 
+def best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRules()) -> NDArray[np.float64]:
+    """Where the target is seen best within the budget: as the episode says, else as measured; float64 [3]."""
+    known = episode.info.get("best_position")
+    if known is not None:
+        return np.asarray(known, np.float64)
+    start, target = np.asarray(episode.start_position, np.float64), int(episode.info["target"])
+    best = _best_view(world, start, episode.start_yaw, target, rules)
+    if best is not None:
+        return best.position
+    ends, _ = _reachable(world, start, episode.start_yaw, rules.budget)
+    return np.asarray(ends[seen(world, ends, COARSE)[:, target].argmax()], np.float64)
+
+
+def clarity(world: World, place: NDArray[np.float64], instance: int, rules: EpisodeRules = EpisodeRules()) -> float:
+    """How well an instance is seen from a place, 0 to 1: its visible share, times its size up to `rules.enough`."""
+    points = np.asarray(place, np.float64)[None]
+    size = float(seen(world, points)[0, instance])
+    whole = float(alone(world, points, instance)[0]) if size else 0.0
+    return min(1.0, size / whole) * min(1.0, size / rules.enough) if whole else 0.0
+
+
 def _reachable(
     world: World, start: NDArray[np.float64], yaw: float, budget: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.envs.guide import Guide, Way
 from wiw.envs.trip import (
     PRIMITIVES,
     NavigationTask,
@@ -60,6 +61,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         self.action_space = action_space(task)  # type: ignore[assignment]
         self.observation_space = observation_space(task, depth)
         self._core: Any = None
+        self._way: Way | None = None
         self._trip: Trip | None = None
         self._goal: Goal | None = None
         self._observation: Observation | None = None
@@ -108,6 +110,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
     def begin(self, episode: Episode) -> Observation:
         """Starts a given episode and observes."""
         self._core, self._trip, self._goal = start(self.task, episode)
+        self._way = None
         return self._observe()
 
     def run(self, actions: Sequence[int] | NDArray[np.int8], answer: Answer | None = None) -> Segment:
@@ -160,6 +163,13 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         return self._core.fork()
 
     # -- privileged ----------------------------------------------------------------------------------------------------
+
+    def guide(self) -> Guide:
+        """The truth about plans from here, for stages of the loop that an experiment tells it."""
+        trip = self.trip
+        if self._way is None:
+            self._way = Way(trip.world.navmesh, self.task.destination(trip))
+        return Guide(self.task, trip, self._core.fork(), self._way)
 
     @property
     def trip(self) -> Trip:

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from wiw.loop.fidelity import remembered, replay
 from wiw.loop.imagine import Imagination, imagine, model_spec
 from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
+from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
 from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
@@ -50,6 +51,8 @@ class Query:
     """Fork of the environment; only looked at when the world model declares that it needs one."""
     stranger: Query | None = None
     """First moment of another episode; only looked at by an agent with placebo="swapped"."""
+    guide: Any = None
+    """What plans are truly worth; only looked at by an agent with swaps."""
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ class Agent:
             (`wiw.loop.fidelity`); changes no decision, and needs a simulator with every query.
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
         placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
+        swaps: stages that are told the truth, of "imagination", "scoring" and "proposals" (`wiw.loop.swaps`).
 
     Raises:
         WeightsError: those of LPIPS are not there.
@@ -129,7 +133,11 @@ class Agent:
         placebo: Placebo | None = None,
         pool: int | None = None,
         imagine_fraction: float = 1.0,
+        swaps: Collection[str] = (),
     ) -> None:
+        self.swaps = checked_swaps(swaps)
+        if "imagination" in self.swaps:
+            model, placebo = "oracle", None
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
         """The numbers that were not left to the task."""
@@ -173,10 +181,11 @@ class Agent:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What observations must carry beyond images: "depth", "simulator"."""
+        """What queries must carry beyond images: "depth", "simulator", "guide"."""
         model = () if self.model is None else self.model.accepts.needs
         replays = ("simulator",) if self.fidelity else ()
-        return tuple(sorted({*self.policy.needs, *self.revision.needs, *model, *replays}))
+        truth = ("guide",) if GUIDED & set(self.swaps) else ()
+        return tuple(sorted({*self.policy.needs, *self.revision.needs, *model, *replays, *truth}))
 
     def decide(self, observation: Any, goal: Goal, key: Key, simulator: Any = None) -> Decision:
         """One decision for one episode; `observation` is an Observation or the environment's dict.
@@ -201,6 +210,8 @@ class Agent:
             proposals = self.policy.propose(proposing, self.pool, self.horizon)
             check_proposals(self.policy, proposals, len(queries), self.pool, self.horizon)
             proposals = [plans[: self.candidates] for plans in proposals]
+        if "proposals" in self.swaps:
+            proposals = true_plans(queries, proposals, self.candidates, self.horizon)
         futures = self._futures(queries, proposing, revising, proposals, clock)
         with clock("revise"):
             shown = [future.proposals for future in futures], [future.rollouts for future in futures]
@@ -220,6 +231,7 @@ class Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
         parts |= {"placebo": self.placebo, "pool": self._given_pool, "imagine_fraction": self.imagine_fraction}
+        parts |= {"swaps": self.swaps}
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, Any]) -> Agent:
@@ -247,6 +259,7 @@ class Agent:
             **({} if self.placebo is None else {"placebo": self.placebo}),
             **({} if self._given_pool is None else {"pool": self.pool}),
             **({} if self.imagine_fraction == 1 else {"imagine_fraction": self.imagine_fraction}),
+            **({} if not self.swaps else {"swaps": list(self.swaps)}),
         }
 
     @property
@@ -286,6 +299,14 @@ class Agent:
             )
             for place, future in zip(asking, imagined, strict=True):
                 futures[place] = future
+        return self._judged(queries, futures) if "scoring" in self.swaps else futures
+
+    def _judged(self, queries: Sequence[Query], futures: list[_Future]) -> list[_Future]:
+        """The same with true scores where nothing was imagined either."""
+        alone = [place for place, future in enumerate(futures) if future.rollouts is None]
+        scores = true_scores([queries[place] for place in alone], [futures[place].proposals for place in alone])
+        for place, score in zip(alone, scores, strict=True):
+            futures[place] = replace(futures[place], scores=score)
         return futures
 
     def _imagined(
@@ -332,7 +353,8 @@ class Agent:
         beams.spend(imagined.calls)
         with clock("revise"):
             scores = self.revision.score(revising, beams.proposals, imagined.rollouts)
-            return imagined, checked_scores(self.revision, scores, beams.proposals)
+            found = checked_scores(self.revision, scores, beams.proposals)
+        return imagined, true_scores(queries, beams.proposals) if "scoring" in self.swaps else found
 
     def _check_depth(self, model: WorldModel) -> None:
         if model.accepts.view != "panorama":
@@ -387,6 +409,9 @@ class Agent:
         costs: Mapping[str, Any],
     ) -> Decision:
         actions, chosen = self.revision.revise(situation, future.proposals, future.scores)
+        if "scoring" in self.swaps:  # where the reviser would write a plan of its own, too
+            chosen = int(np.argmax(future.scores))
+            actions = future.proposals[chosen].actions
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
         self._life(query).executed += actions[:execute].tolist()

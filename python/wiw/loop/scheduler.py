@@ -48,9 +48,12 @@ class Trial:
     done: bool = field(default=False)
 
     def query(self, agent: Agent) -> Query:
-        """What the agent is asked; a fork of the simulator goes along only where the world model declares its need."""
+        """What the agent is asked; a fork of the simulator goes along only where the world model declares its need, and
+        a guide only where stages are told the truth.
+        """
         simulator = self.env.fork() if "simulator" in agent.needs else None
-        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator, self.stranger)
+        guide = self.env.guide() if "guide" in agent.needs else None
+        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator, self.stranger, guide)
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Executes the decision's first segment and observes."""

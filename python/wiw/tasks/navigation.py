@@ -101,6 +101,17 @@ class NavigationTask(ABC):
         """Whether the answers given so far end the episode."""
         return False
 
+    def destination(self, trip: Trip) -> NDArray[np.float64]:
+        """Where an agent that knew the scene would go."""
+        return trip.goal_position
+
+    def progress(self, trip: Trip, fork: Any, left: float) -> float:
+        """How good it would be to stand where a fork of the simulator stands, the higher the better.
+
+        `left` counts the primitives of the shortest way from there to the destination; here the fewer, the better.
+        """
+        return -left
+
     # ------------------------------------------------------------------------------------------------------------------
 
     @staticmethod

@@ -118,6 +118,14 @@ class AR(NavigationTask):
         final = self.final(trip)
         return trip.ended and final is not None and final.label == trip.episode.info["category"]
 
+    def destination(self, trip: Trip) -> NDArray[np.float64]:
+        """Where the target is seen best."""
+        return ar.best_place(trip.world, trip.episode)
+
+    def progress(self, trip: Trip, fork: Any, left: float) -> float:
+        """How well the target is truly seen, 0 to 1; where that is equal, the way to the best view decides."""
+        return ar.clarity(trip.world, fork.position, int(trip.episode.info["target"])) - 0.001 * left
+
     def final(self, trip: Trip) -> Answer | None:
         """The answer that counts, of those given so far."""
         if not trip.answers:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,10 +74,18 @@ class ImageNav(NavigationTask):
             return True
         if self.rules.checked == "decision" and not trip.at_decision:
             return False
+        return self._within(trip, trip.positions[-1])
+
+    def progress(self, trip: Trip, fork: Any, left: float) -> float:
+        """0 within the goal's sphere, else less by the primitives to its centre."""
+        return 0.0 if self._within(trip, fork.position) else -left
+
+    def _within(self, trip: Trip, place: NDArray[np.float64]) -> bool:
         radius = trip.episode.info.get("radius", self.rules.radius)
-        if trip.distance_to_goal() > radius:  # no walk is shorter than the straight line
+        if np.linalg.norm(place - trip.goal_position) > radius:  # no walk is shorter than the straight line
             return False
-        return self.rules.distance == "euclidean" or trip.geodesic_to_goal() <= radius
+        walked = trip.world.navmesh.geodesic_distance
+        return self.rules.distance == "euclidean" or float(walked(place, trip.goal_position)) <= radius
 
     def result(self, trip: Trip) -> dict[str, float]:
         """Metrics of one finished episode; `spl` is its contribution, 0 to 1."""
