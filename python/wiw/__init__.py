@@ -24,6 +24,7 @@ __all__ = [
     "accepts",
     "action",
     "annotate",
+    "attribute",
     "check_model",
     "compare",
     "envs",
@@ -55,6 +56,7 @@ _HOME = {
     "Policy": "wiw.policies.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
+    "attribute": "wiw.evaluation.attribute",
     "check_model": "wiw.evaluation.model_check",
     "compare": "wiw.evaluation.compare",
     "evaluate": "wiw.evaluation.evaluate",
@@ -85,6 +87,7 @@ def __dir__() -> list[str]:
 
 if TYPE_CHECKING:
     from wiw import action, annotate, envs, errors, metrics, nav, panorama, registry, render, reproject, scenes, types
+    from wiw.evaluation.attribute import attribute
     from wiw.evaluation.compare import compare
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.model_check import check_model

@@ -16,7 +16,13 @@ from wiw.policies.base import FrameSpec
 from wiw.types import Proposal
 
 AHEAD = [FORWARD] * 5
-FAN = (AHEAD, [TURN_LEFT, TURN_LEFT, *AHEAD[2:]], [TURN_RIGHT, TURN_RIGHT, *AHEAD[2:]])
+FAN = (
+    AHEAD,
+    [TURN_LEFT, TURN_LEFT, *AHEAD[2:]],
+    [TURN_RIGHT, TURN_RIGHT, *AHEAD[2:]],
+    [TURN_LEFT, *AHEAD[1:]],
+    [TURN_RIGHT, *AHEAD[1:]],
+)
 SPIN = ([TURN_LEFT] * 5, [TURN_RIGHT] * 5, [TURN_LEFT] * 3)
 
 

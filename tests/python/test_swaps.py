@@ -95,11 +95,13 @@ def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path
 
 def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None:
     env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    worths = [env.guide().worth(plan) for plan in FAN]
+    worths = [env.guide().worth(plan) for plan in FAN[:3]]
     for policy, model in ((Noise(), None), (Noise(), "copy")):
         decision = decided(wiw.Agent(policy, model, swaps=["scoring"]), env)
         np.testing.assert_array_equal(decision.scores, worths)
-        assert decision.chosen == int(np.argmax(worths)) and decision.actions.tolist() == list(map(int, FAN[decision.chosen]))
+        assert decision.chosen == int(np.argmax(worths)) and decision.actions.tolist() == list(
+            map(int, FAN[decision.chosen])
+        )
     own = decided(wiw.Agent(Writer(), "copy", swaps=["scoring"]), env)
     assert own.chosen is not None and len(own.actions) > 1
     shared = decided(wiw.Agent(Noise(), "oracle", imagine_fraction=0.0, swaps=["scoring"]), env)

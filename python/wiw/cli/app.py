@@ -10,6 +10,7 @@ from typing import Any
 import tyro
 
 import wiw
+from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
 from wiw.cli.compare import compare
 from wiw.cli.demo import demo
@@ -46,6 +47,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
+    (blame, "blame", "Which stage of the loop a run's failures are due to."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "How many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),

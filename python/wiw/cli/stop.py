@@ -62,13 +62,13 @@ def _guard(watch: int, done: threading.Event) -> None:
             os._exit(EXIT_RESUME)
 
 
-def stoppable(work: Callable[[], Any], folder: Path) -> Any:
-    """Does the work; when it is stopped, says how to go on with it."""
+def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:
+    """Does the work on a run; when it is stopped, says which command goes on with it."""
     from wiw.evaluation.store import store_path
 
     try:
         return work()
     except BaseException as stop:
         if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
-            print(f"\nstopped; everything so far is kept. Go on with:  wiw resume {folder}", file=sys.stderr)
+            print(f"\nstopped; everything so far is kept. Go on with:  wiw {command} {folder}", file=sys.stderr)
         raise

@@ -134,6 +134,9 @@ def resume_run(
         _at_least("workers", workers, 1)
     store = RunStore.resume(run)
     try:
+        if "attributes" in store.config:
+            own, whole = store.path.parent, store.path.parent.parent
+            raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
         task, agents = recipes_of(store)
         built = task.build()
         store.require_task(built.describe())
@@ -309,11 +312,23 @@ def _finish(
     retry_failed: bool = False,
 ) -> RunLog:
     """Runs what is missing, closes the store and opens it for reading."""
+    pending = {arm: store.pending(arm, retry_failed) for arm in agents}
+    return run_pending(store, task, agents, pending, workers, progress)
+
+
+def run_pending(
+    store: RunStore,
+    task: Any,
+    agents: Mapping[str, Any],
+    pending: Mapping[str, list[int]],
+    workers: int,
+    progress: bool,
+) -> RunLog:
+    """Runs these episodes of each arm, closes the store and opens it for reading."""
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
     plan = Plan(task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes)
-    pending = {arm: store.pending(arm, retry_failed) for arm in agents}
     board = make_board(progress and any(pending.values()))
     try:
         for arm, indices in pending.items():

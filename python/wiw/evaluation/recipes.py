@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -64,6 +64,7 @@ class AgentRecipe:
     """What the world model is made with, by name."""
     policy_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
+    swaps: Sequence[str] | None = None
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.evaluation.blame import blame
 from wiw.evaluation.costs import costs
 from wiw.evaluation.fidelity import fidelity
 from wiw.evaluation.store import RunStore
@@ -113,6 +114,14 @@ class RunLog:
         See `wiw.evaluation.fidelity.ArmFidelity`; each decision's own figures are in `decisions`, column "fidelity".
         """
         return Records(line.as_dict() for line in fidelity(self))
+
+    def blame(self) -> Records:
+        """Which stage each arm's failures are due to, as far as `wiw.attribute` has run them again: one dict an arm.
+
+        See `wiw.evaluation.blame.ArmBlame`.
+        """
+        found = blame(self.store)
+        return Records(line.as_dict() for line in found.arms) if found is not None else Records()
 
     def report(self, path: str | Path | None = None) -> Path:
         """Writes a self-contained HTML report and returns its path; default `report.html` in the run's folder."""

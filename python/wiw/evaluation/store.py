@@ -115,15 +115,23 @@ class RunStore:
         lock = _lock(path) if path.exists() else None
         store = cls._open(path, lock)
         with store._closed_on_error():
-            if store.wiw_version != wiw.__version__:
-                raise StoreError(
-                    f"{path} was begun by wiw {store.wiw_version}, this is {wiw.__version__}: results of two versions "
-                    "must not be mixed; install that version or start a new run"
-                )
+            store.require_version()
             if config is not None:
                 _require_same(path, store.config, json.loads(to_json(config)))
             store._discard_partial()
         return store
+
+    def require_version(self) -> None:
+        """Holds the run to the version of wiw that began it.
+
+        Raises:
+            StoreError: this is another.
+        """
+        if self.wiw_version != wiw.__version__:
+            raise StoreError(
+                f"{self.path} was begun by wiw {self.wiw_version}, this is {wiw.__version__}: results of two versions "
+                "must not be mixed; install that version or start a new run"
+            )
 
     def require_task(self, task: dict[str, Any]) -> None:
         """Holds the run to the task it was begun with, whose preset may be a file that has changed since.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.evaluation.blame import blame
 from wiw.evaluation.report.maps import (
     MapFrame,
     Mark,
@@ -130,11 +131,12 @@ class Attempt:
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
         if self.reached:
             return f"{self.words.won} in {count}"
+        due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
         if self.choices:
             label = taken_for(metrics, self.choices)
-            return f"taken for {label} in {count}" if label else f"not answered in {count}"
+            return (f"taken for {label} in {count}" if label else f"not answered in {count}") + due
         left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
-        return f"{self.words.lost} in {count}{left}"
+        return f"{self.words.lost} in {count}{left}{due}"
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,10 @@ def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str
 
 def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
     """How each episode ended, by arm in the order of `arms`; episodes that no arm has ended are left out."""
+    blamed = blame(store)
+    verdicts = blamed.verdicts() if blamed is not None else {}
     by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    by_arm |= {key: {**by_arm[key], "blame": verdict} for key, verdict in verdicts.items()}
     found: dict[int, dict[str, Mapping[str, Any]]] = {}
     for index in sorted({episode for _, episode in by_arm}):
         found[index] = {arm: by_arm[arm, index] for arm in arms if (arm, index) in by_arm}

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from wiw.evaluation.blame import SWAPS, VERDICTS, Blame, blame, mended_cells, verdict_cells
 from wiw.evaluation.costs import cost_columns, costs
 from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
@@ -40,7 +41,7 @@ def render(log: RunLog) -> str:
     """A run's report as HTML, without anything outside the page. All text from the run is escaped."""
     summary, config, info = log.numbers(), log.store.config, log.store.info
     told, pictures = stories(log.store, log.arms)
-    truths, ledger = fidelity(log), costs(log)
+    truths, ledger, blamed = fidelity(log), costs(log), blame(log.store)
     measured, paid = shown_columns(truths), cost_columns(ledger)
     return (
         environment()
@@ -53,13 +54,17 @@ def render(log: RunLog) -> str:
             version=log.store.wiw_version,
             words=wording(log.store),
             sentence=sentence(summary),
-            plots=_plots(log, summary, truths),
+            plots=_plots(log, summary, truths, blamed),
             stories=told,
             pictures=pictures,
             costs=[(line, line.cells()[: len(paid)]) for line in ledger],
             cost_columns=paid,
             fidelity=[(line, line.cells(measured)) for line in truths],
             fidelity_columns=[(column.title, column.about) for column in measured],
+            blame=[(line, mended_cells(line), verdict_cells(line)) for line in blamed.arms] if blamed else [],
+            swaps=list(SWAPS),
+            verdicts=VERDICTS,
+            blame_notes=blamed.notes() if blamed else [],
             failures=[row for row in log.episodes if row["status"] == "failed"],
             radius=config["task"].get("radius"),
             config=json.dumps(config, indent=2, ensure_ascii=False),
@@ -131,7 +136,9 @@ def _reach(differences: Sequence[Difference]) -> dict[str, float]:
     return reach
 
 
-def _plots(log: RunLog, summary: Summary, truths: Sequence[ArmFidelity]) -> list[tuple[str, str, Markup]]:
+def _plots(
+    log: RunLog, summary: Summary, truths: Sequence[ArmFidelity], blamed: Blame | None
+) -> list[tuple[str, str, Markup]]:
     """Title, explanation and drawing of each plot."""
     done: dict[str, list[Mapping[str, Any]]] = {
         arm: [row for row in log.episodes if row["arm"] == arm and row["status"] == "done"] for arm in log.arms
@@ -157,4 +164,7 @@ def _plots(log: RunLog, summary: Summary, truths: Sequence[ArmFidelity]) -> list
     if sum(not math.isnan(line.rank) for line in truths) > 1:
         about = "Does the arm that orders plans rightly also succeed? Kendall's tau against the true futures."
         found.append(("Controllability and success", about, plots.success_by_rank(truths, summary)))
+    if blamed is not None and any(line.episodes for line in blamed.arms):
+        about = "Failed episodes by the stage that has to be told the truth to mend them."
+        found.append(("Which stage is to blame", about, plots.blame_by_arm(blamed)))
     return found

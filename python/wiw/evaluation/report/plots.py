@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from wiw.evaluation.blame import Blame
 from wiw.evaluation.fidelity import ArmFidelity
 from wiw.evaluation.intervals import wilson
 from wiw.evaluation.summary import Summary
@@ -23,6 +24,13 @@ INK = "#010203"
 """Stands for the page's text colour."""
 PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
 ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b"}
+BLAME_COLORS = {
+    "imagination": "#4c78a8",
+    "scoring": "#d1495b",
+    "proposals": "#b5651d",
+    "joint": "#8e6bbf",
+    "beyond": "#8b9099",
+}
 FEW = 24
 """Below this many episodes single outcomes are shown instead of binned rates."""
 
@@ -88,6 +96,27 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     axes.set_ylabel("success rate, %")
     _legend(axes)
     return _svg(figure, "success-by-rank")
+
+
+def blame_by_arm(found: Blame) -> Markup:
+    """Failures of each arm by what they are due to, as stacked bars."""
+    lines = list(reversed(found.arms))
+    figure, axes = _figure()
+    left = np.zeros(len(lines))
+    for verdict, color in BLAME_COLORS.items():
+        counts = np.array([line.verdicts[verdict] for line in lines], np.float64)
+        axes.barh(range(len(lines)), counts, left=left, height=0.55, color=color, label=verdict)
+        for y, (start, count) in enumerate(zip(left, counts, strict=True)):
+            if count:
+                axes.text(start + count / 2, y, f"{count:.0f}", ha="center", va="center", color="white", fontsize=9)
+        left += counts
+    axes.set_yticks(range(len(lines)), [line.arm for line in lines])
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("failed episodes")
+    axes.grid(visible=False, axis="y")
+    _legend(axes)
+    return _svg(figure, "blame-by-arm")
 
 
 def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
