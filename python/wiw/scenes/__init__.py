@@ -123,9 +123,8 @@ def absolute(spec: str | PathLike[str]) -> str:
 def resolve(spec: str | PathLike[str]) -> list[str]:
     """The single scenes that a scene spec names, in order, none of them loaded.
 
-    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" those
-    from number 40 up to, not including, 60, each named "apartments:val/7"; anything else is the path of a mesh or a
-    Gazebo world.
+    "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
+    numbers 40 to 59, each named "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
 
     Raises:
         ArgumentError: the split or the count is not one.
