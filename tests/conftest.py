@@ -87,7 +87,8 @@ def world_model_options(
         if name not in saved:
             tiny_pipelines.save(name, folder / name)
             saved.add(name)
-        return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name]}
+        trained = {"checkpoint": str(folder / name / "trained")} if name.endswith("-action") else {}
+        return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name], **trained}
 
     @cache
     def runway() -> dict[str, Any]:

@@ -69,6 +69,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "cosmos-predict2": {"size": (32, 32), "frames": 5, "steps": 1, "guardrail": False},
     "sana-wm": {"size": (64, 64), "frames": 9, "steps": 1},
     "nwm": {"steps": 2, "batch": 1},
+    "svd-action": {"size": (64, 128), "frames": 3, "steps": 1},
+    "ltx-action": {"size": (64, 128), "frames": 9, "steps": 1},
+    "wan2.1-action": {"size": (32, 64), "frames": 5, "steps": 1},
+    "wan2.2-5b-action": {"size": (32, 64), "frames": 5, "steps": 1},
+    "wan2.2-a14b-action": {"size": (32, 64), "frames": 5, "steps": 2},
+    "cosmos-predict2-action": {"size": (32, 64), "frames": 5, "steps": 1, "guardrail": False},
 }
 """What makes a rollout of each cheap; `weights` is the folder that `save` has written."""
 
@@ -76,7 +82,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
 def save(name: str, folder: Path) -> Path:
     """Builds the tiny pipeline of a world model and saves it; the same weights each time."""
     torch.manual_seed(0)
-    BUILDERS[name]().save_pretrained(folder)
+    pipeline = BUILDERS[name.removesuffix("-action")]()
+    pipeline.save_pretrained(folder)
+    if name.endswith("-action"):
+        import tiny_actions
+
+        tiny_actions.save(name, pipeline, folder / "trained")
     return folder
 
 

@@ -18,14 +18,15 @@ from wiw.errors import ArgumentError, WeightsError
 from wiw.types import Conditioning, Control
 from wiw.world_models.nwm.motion import motions, normalised
 
-torch = pytest.importorskip("torch")
-diffusers = pytest.importorskip("diffusers")
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 
-from tiny_nwm import TINY, TinyNWM, randomised  # noqa: E402
-from wiw.world_models.nwm import NWM  # noqa: E402
-from wiw.world_models.nwm.cdit import SIZES, Architecture, Block, CDiT, MotionEmbedder, NumberEmbedder  # noqa: E402
-from wiw.world_models.nwm.diffusion import sample, scheduler  # noqa: E402
-from wiw.world_models.nwm.images import rows_seen, to_frames, to_network  # noqa: E402
+import torch
+
+from tiny_nwm import TINY, TinyNWM, randomised
+from wiw.world_models.nwm import NWM
+from wiw.world_models.nwm.cdit import SIZES, Architecture, Block, CDiT, MotionEmbedder, NumberEmbedder
+from wiw.world_models.nwm.diffusion import sample, scheduler
+from wiw.world_models.nwm.images import rows_seen, to_frames, to_network
 
 
 @pytest.fixture(scope="module")
