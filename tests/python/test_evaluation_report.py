@@ -112,14 +112,14 @@ def test_a_run_without_an_ended_episode_still_has_a_page(tmp_path):
     assert "Failures of infrastructure" in render(log)
 
 
-def summary(wins, n=40):
+def summary(wins, n=40, saved=0.0):
     outcomes = [
         {
             "arm": arm,
             "episode": i,
             "scene": f"s{i % 8}",
             "status": "done",
-            "metrics": {"success": float(arm == "warp" and i < wins), "actions": 9.0},
+            "metrics": {"success": float(arm == "warp" and i < wins), "actions": 9.0 - saved * (arm == "warp") + i % 2},
         }
         for arm in ("none", "warp")
         for i in range(n)
@@ -130,6 +130,8 @@ def summary(wins, n=40):
 def test_the_sentence_claims_no_more_than_the_interval_bears():
     assert "may be chance" in sentence(summary(1))
     assert "may be chance" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
+    assert "primitives" not in sentence(summary(1))
+    assert "It took 2.0 primitives fewer" in sentence(summary(1, saved=2.0))
     assert sentence(summarise(["none"], [], 3)) == ""
 
 

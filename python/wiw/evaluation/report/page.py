@@ -87,7 +87,8 @@ def sentence(summary: Summary) -> str:
     for line in shown[:3]:
         share = line.estimates["success"].value
         rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {line.judged} episodes"
-        parts.append(rate + _verdict(_found(summary, line.name, "none")))
+        found = (_found(summary, line.name, "none", metric) for metric in ("success", "actions"))
+        parts.append(rate + _verdict(next(found)) + _way(next(found)))
     return " ".join(parts)
 
 
@@ -102,8 +103,17 @@ def _verdict(difference: Difference | None) -> str:
     return f", {against}; with so few episodes that may be chance ({interval})."
 
 
-def _found(summary: Summary, arm: str, base: str) -> Difference | None:
-    wanted = (arm, base, "success")
+def _way(difference: Difference | None) -> str:
+    """What it took, if it differs."""
+    if difference is None or not difference.estimate.excludes_zero:
+        return ""
+    found = difference.estimate
+    kind = "more" if found.value > 0 else "fewer"
+    return f" It took {abs(found.value):.1f} primitives {kind} ({signed(found.low)} to {signed(found.high)})."
+
+
+def _found(summary: Summary, arm: str, base: str, metric: str) -> Difference | None:
+    wanted = (arm, base, metric)
     return next((d for d in summary.differences if (d.arm, d.base, d.metric) == wanted), None)
 
 
