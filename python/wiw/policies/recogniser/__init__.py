@@ -125,7 +125,7 @@ class Recognition(Policy):
         plans: dict[bytes, Proposal] = {}
         for rank, heading in enumerate(steering.headings(seen, bearing, memory.side)):
             actions = steering.plan(heading, free, horizon)
-            plans.setdefault(actions.tobytes(), Proposal(actions, prior=-float(rank)))
+            plans.setdefault(actions.tobytes(), Proposal(actions, prior=0.0 - rank))
         return list(plans.values())[:candidates]
 
     def score(
