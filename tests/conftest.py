@@ -82,6 +82,8 @@ def world_model_options(
             return runway()
         if not requires.packages:
             return {}
+        if name == "warpnet":
+            return {"weights": warpnet()}
         import tiny_pipelines
 
         if name not in saved:
@@ -89,6 +91,14 @@ def world_model_options(
             saved.add(name)
         trained = {"checkpoint": str(folder / name / "trained")} if name.endswith("-action") else {}
         return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name], **trained}
+
+    @cache
+    def warpnet() -> str:
+        from wiw.world_models.warpnet.network import Network
+        from wiw.world_models.warpnet.weights import save
+
+        save(folder / "warpnet.safetensors", Network(16, (8, 8, 8)), {})
+        return str(folder / "warpnet.safetensors")
 
     @cache
     def runway() -> dict[str, Any]:

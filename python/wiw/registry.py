@@ -176,6 +176,7 @@ WORLD_MODELS = Registry(
         "wan2.2-5b-action": "wiw.world_models.actions.variants:Wan22SmallAction",
         "wan2.2-a14b-action": "wiw.world_models.actions.variants:Wan22Action",
         "cosmos-predict2-action": "wiw.world_models.actions.variants:CosmosPredict2Action",
+        "warpnet": "wiw.world_models.warpnet:WarpNet",
         "remote:": "wiw.world_models.remote:Remote",
     },
     "wiw.world_models.base:WorldModel",

@@ -139,7 +139,7 @@ class Recogniser:
 
         looks = joined(sets)
         owners = torch.from_numpy(np.repeat(np.arange(len(sets)), [len(each) for each in sets]))
-        with torch.inference_mode(), _one_thread():
+        with torch.inference_mode(), one_thread():
             rows = [
                 self.network.looks(  # one at a time: how rows round may hang on how many there are
                     pictures(torch.from_numpy(looks.images[i : i + 1]), torch.from_numpy(looks.boxes[i : i + 1])),
@@ -164,7 +164,7 @@ class Recogniser:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """Of torch: faster for single looks, above all on a busy machine, and rounds alike on any number of cores."""
     import torch
 

@@ -1,33 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Looks of many scenes: kept on disk scene by scene, so that a command that was stopped goes on where it was."""
+"""What is learnt from, of many scenes: kept on disk scene by scene, so that a command that was stopped goes on."""
 
 from __future__ import annotations
 
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
+from functools import partial
 from hashlib import blake2b
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from wiw import scenes
-from wiw.datasets.worlds import world
+from wiw.datasets.worlds import World, world
 from wiw.errors import FileError
 from wiw.perception.glimpses import Glimpses
 from wiw.scenes.store import build_digest
 from wiw.training.looks import LookRules, Looks, look_around, merged
+from wiw.training.walks import WalkRules, Walks, walk_about
+from wiw.training.walks import merged as merged_walks
 
-FIELDS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
-VERSION = 1
-"""Of what is looked at and how; raise it when `looks` or `glimpses` give something else."""
-
+Arrays = Mapping[str, NDArray[Any]]
 Bar = Callable[[Iterable[str], str, int], Iterable[str]]
 """Shows how far an iterable of so many items has come."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is gathered from each scene."""
+
+    name: str
+    """In words, for bars."""
+    fields: tuple[str, ...]
+    """Of the arrays that `make` gives."""
+    make: Callable[[World], Arrays]
+    """Runs in other processes: a function of a module, or a `partial` of one."""
+    identity: tuple[Any, ...]
+    """JSON-able: all that the arrays depend on beside the scene, and a version to raise when `make` changes."""
+
+
+LOOKS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
+WALKS = ("images", "distances", "places")
 
 
 def gathered(
@@ -39,61 +59,84 @@ def gathered(
         FileError: the folder cannot be written.
         ArgumentError: the scenes show nothing of `categories`.
     """
+    make = partial(_looks, seed=seed, categories=tuple(categories), rules=rules)
+    job = Job("looks", LOOKS, make, (1, list(categories), seed, asdict(rules)))
+    found = _gather(specs, job, folder, workers, bar)
+    parts = [(Glimpses(a["images"], a["boxes"], a["scalars"]), a["owners"], a["kinds"], a["labels"]) for a in found]
+    return merged([Looks(*part) for part in parts])
+
+
+def gathered_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers: int, bar: Bar) -> Walks:
+    """Walks through all scenes of a spec, likewise.
+
+    Raises:
+        FileError: the folder cannot be written.
+        ArgumentError: nowhere in the scenes can one walk straight ahead.
+    """
+    job = Job("walks", WALKS, partial(_walks, seed=seed, rules=rules), ("walks", 1, seed, asdict(rules)))
+    return merged_walks([Walks(*(a[name] for name in WALKS)) for a in _gather(specs, job, folder, workers, bar)])
+
+
+def _looks(world: World, seed: int, categories: Sequence[str], rules: LookRules) -> Arrays:
+    looks = look_around(world, seed, categories, rules)
+    found = looks.glimpses
+    values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
+    return dict(zip(LOOKS, values, strict=True))
+
+
+def _walks(world: World, seed: int, rules: WalkRules) -> Arrays:
+    walks = walk_about(world, seed, rules)
+    return {name: getattr(walks, name) for name in WALKS}
+
+
+def _gather(specs: str, job: Job, folder: Path, workers: int, bar: Bar) -> list[Arrays]:
+    """Arrays of all scenes of a spec, in their order."""
     names = scenes.resolve(specs)
-    files = {name: folder / f"{_digest(name, categories, seed, rules)}.npz" for name in names}
-    missing = [name for name in names if _read(files[name]) is None]
+    files = {name: folder / f"{_digest(name, job)}.npz" for name in names}
+    missing = [name for name in names if _read(files[name], job) is None]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        list(bar(_made(missing, files, categories, seed, rules, workers), f"looks of {specs}", len(missing)))
+        list(bar(_made(missing, files, job, workers), f"{job.name} of {specs}", len(missing)))
     except OSError as error:
         raise FileError(f"{folder}: cannot be written ({error.strerror}); choose another with --cache") from error
-    found = [_read(files[name]) for name in names]
-    return merged([looks for looks in found if looks is not None])
+    found = [_read(files[name], job) for name in names]
+    return [arrays for arrays in found if arrays is not None]
 
 
-def _made(
-    names: Sequence[str],
-    files: dict[str, Path],
-    categories: Sequence[str],
-    seed: int,
-    rules: LookRules,
-    workers: int,
-) -> Iterable[str]:
+def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) -> Iterable[str]:
     """Names of scenes as they are done."""
     if workers <= 1 or len(names) <= 1:
         for name in names:
-            yield _make(name, files[name], categories, seed, rules)
+            yield _make(name, files[name], job)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(_make, name, files[name], categories, seed, rules) for name in names]
+        jobs = [pool.submit(_make, name, files[name], job) for name in names]
         try:
-            for job in as_completed(jobs):
-                yield job.result()
+            for each in as_completed(jobs):
+                yield each.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _make(name: str, file: Path, categories: Sequence[str], seed: int, rules: LookRules) -> str:
-    looks = look_around(world(name), seed, categories, rules)
-    found = looks.glimpses
-    values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
+def _make(name: str, file: Path, job: Job) -> str:
+    arrays = job.make(world(name))
     part = file.with_name(f"{file.stem}.{os.getpid()}.part")
     with part.open("wb") as stream:
-        np.savez(stream, **dict(zip(FIELDS, values, strict=True)))  # type: ignore[arg-type]
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
     part.replace(file)
     return name
 
 
-def _read(file: Path) -> Looks | None:
+def _read(file: Path, job: Job) -> Arrays | None:
     """None where there is no whole file."""
     try:
         with np.load(file) as values:
-            images, boxes, scalars, owners, kinds, labels = (values[name] for name in FIELDS)
+            return {name: values[name] for name in job.fields}
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None
-    return Looks(Glimpses(images, boxes, scalars), owners, kinds, labels)
 
 
-def _digest(name: str, categories: Sequence[str], seed: int, rules: LookRules) -> str:
-    identity = [VERSION, build_digest(), scenes.absolute(name), list(categories), seed, asdict(rules)]
+def _digest(name: str, job: Job) -> str:
+    version, *rest = job.identity
+    identity = [version, build_digest(), scenes.absolute(name), *rest]
     return blake2b(json.dumps(identity).encode(), digest_size=12).hexdigest()

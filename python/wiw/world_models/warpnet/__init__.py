@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The trainable world model: from one colour panorama to any place near by, with no depth given."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.perception.recogniser import one_thread
+from wiw.types import Conditioning, Control
+from wiw.world_models import devices
+from wiw.world_models.base import Requirements, WorldModel, accepts
+from wiw.world_models.fingerprint import code_digest
+
+if TYPE_CHECKING:
+    from wiw.world_models.warpnet.network import Network
+
+STILL = 1e-4
+"""Metres: who has moved less stands where it stood."""
+
+
+class WarpNet(WorldModel):
+    """Guesses how far away everything will be, warps the panorama by that, and paints what the warp cannot know.
+
+    Where a plan leads is one jump (turn towards the place, go straight, turn back), however many primitives it takes,
+    so errors do not add up. Turns are rolls of the panorama, exact to a column. Colours come from the panorama in full
+    size; distances and painting are the network's, in a small one.
+
+    Args:
+        weights: a file of `wiw train warpnet`.
+
+    Raises:
+        DependencyError: torch or safetensors is not installed.
+        WeightsError: no such file, damaged, or of another version.
+    """
+
+    accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True)
+    requires = Requirements(("torch", "safetensors"), "torch")
+
+    def __init__(self, weights: str | Path) -> None:
+        devices.require(self.requires)
+        from wiw.world_models.warpnet.weights import load
+
+        self.weights = str(weights)
+        self._network, self.card = load(weights)
+
+    @classmethod
+    def of(cls, network: Network) -> WarpNet:
+        """The world model of a network at hand, such as one in training."""
+        model = cls.__new__(cls)
+        model.weights, model._network, model.card = "", network.eval(), {}
+        return model
+
+    def describe(self) -> dict[str, Any]:
+        """The weights' file and a digest of them, and torch's version."""
+        import torch
+
+        return {
+            "name": type(self).__name__,
+            "weights": self.weights,
+            "digest": self._digest(),
+            "torch": torch.__version__,
+        }
+
+    def fingerprint(self) -> str:
+        """Digest of code, weights and torch's version; where the weights lie does not count."""
+        said = {**self.describe(), "weights": ""}
+        code = code_digest(type(self)) + code_digest(type(self._network))
+        return blake2b(f"{code}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Panoramas; frames that another row answers and frames of padding are left unwritten."""
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
+        frames[:, 0] = observations.image
+        with one_thread():
+            for image, control, future in zip(observations.image, controls, frames, strict=True):
+                wanted = slice(control.shared, control.length)
+                self._follow(image, control.trajectory[wanted], future[1 + control.shared :])
+        return frames
+
+    def _follow(self, image: NDArray[np.uint8], trajectory: NDArray[np.float64], out: NDArray[np.uint8]) -> None:
+        """Writes the view from each pose; where the agent only turns, its last view is turned."""
+        place, seen = np.zeros(2), image
+        for (*to, azimuth), frame in zip(trajectory, out, strict=False):
+            if np.abs(np.subtract(to, place)).max() > STILL:
+                place, seen = np.array(to), self.moved(image, to[0], to[1])
+            frame[:] = turned(seen, azimuth)
+
+    def moved(self, image: NDArray[np.uint8], forward: float, left: float) -> NDArray[np.uint8]:
+        """uint8 [H, W, 3]: what a panorama shows from that many metres away, headed as before."""
+        ahead = float(np.hypot(forward, left))
+        if ahead < STILL:
+            return image
+        heading = float(np.arctan2(left, forward))
+        return turned(self._ahead(np.ascontiguousarray(turned(image, heading)), ahead), -heading)
+
+    def _ahead(self, image: NDArray[np.uint8], metres: float) -> NDArray[np.uint8]:
+        import torch
+
+        from wiw.world_models.warpnet.network import blend, enlarged, warp
+
+        with torch.inference_mode():
+            ahead = torch.tensor([metres])
+            found = self._network(to_network(shrunk(image, self._network.size)[None]), ahead)
+            guess = enlarged(torch.cat([found.log_distance, found.painted, found.mask], dim=1), *image.shape[:2])
+            sharp = warp(to_network(image[None]), guess[:, :1], ahead)
+            colours = blend(sharp, guess[:, 1:4], guess[:, 4:])[0].permute(1, 2, 0)
+            return (colours * 127.5 + 127.5).round().clamp(0, 255).byte().numpy()
+
+    def _digest(self) -> str:
+        digest = blake2b(digest_size=8)
+        for name, value in self._network.state_dict().items():
+            digest.update(name.encode() + value.numpy().tobytes())
+        return digest.hexdigest()
+
+
+def turned(image: NDArray[Any], azimuth: float) -> NDArray[Any]:
+    """The panorama [H, W, ...] after a turn to the left by so many radians, rounded to a column."""
+    return np.roll(image, round(azimuth / (2 * np.pi) * image.shape[1]), axis=1)
+
+
+def shrunk(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """The panorama in another size, as means over areas."""
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
+
+
+def to_network(images: NDArray[np.uint8]) -> Any:
+    """Float [B, 3, H, W] in [-1, 1] of uint8 [B, H, W, 3]."""
+    import torch
+
+    return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 127.5 - 1

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""warpnet's training: what pairs are, that lessons can be repeated, and that a short one is worth something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.cli.app import main
+from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError
+
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+from wiw.training.walks import WalkRules, Walks, merged, straight_ways, walk_about  # noqa: E402
+from wiw.training.warpnet import Recipe, drawn, measured, train  # noqa: E402
+from wiw.world_models.warpnet import WarpNet  # noqa: E402
+from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Threads that wait for each other spin: on a busy machine two are slower than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def walks(two_rooms: str) -> Walks:
+    return walk_about(world(two_rooms), 0, WalkRules(places=10, stops=3, height=24))
+
+
+def test_walks_are_straight_and_free(two_rooms: str, walks: Walks) -> None:
+    here = world(two_rooms)
+    ways = straight_ways(here, 30, 5, 0.6, 2.4)
+    assert len(ways) == 30
+    for way in ways:
+        assert 0.6 <= way.length + 1e-9 <= 2.4 + 2e-9
+        poses = way.poses(here, np.linspace(0, way.length, 9))
+        assert here.navmesh.is_navigable(poses[:, :3, 3] - [0, 1, 0]).all()
+        np.testing.assert_allclose(np.diff(poses[:, :3, 3], axis=0) @ -poses[0, :3, 2], way.length / 8, atol=1e-6)
+    assert walks.images.shape == (10, 3, 24, 48, 3)
+    assert (np.diff(walks.places, axis=1) >= 0).all()
+    assert (walks.places[:, 0] == 0).all()
+    again = walk_about(here, 0, WalkRules(places=10, stops=3, height=24))
+    np.testing.assert_array_equal(again.images, walks.images)
+    np.testing.assert_array_equal(again.distances, walks.distances)
+    both = merged([walks, again])
+    assert len(both) == 20
+    with pytest.raises(ArgumentError, match="walk straight"):
+        merged([])
+
+
+def test_a_pair_is_a_way_ahead(walks: Walks) -> None:
+    """Whichever way and however mirrored: with the true distances the source warped is the target."""
+    pairs = drawn(walks, 64, np.random.default_rng(0))
+    assert (pairs.ahead >= 0).all() and pairs.ahead.max() > 0.5
+    made = warp(pairs.source, pairs.log_distance, pairs.ahead)
+    far = pairs.ahead > 0.2
+    error = (made - pairs.target).abs().mean(dim=(1, 2, 3))[far]
+    still = (pairs.source - pairs.target).abs().mean(dim=(1, 2, 3))[far]
+    assert (error < still).float().mean() > 0.85
+    assert error.mean() < 0.6 * still.mean()
+
+
+def test_the_same_lesson_gives_the_same_network(walks: Walks) -> None:
+    once, again, other = (
+        train(walks, Recipe(epochs=1, batch=10, widths=(4, 4, 4), seed=seed))[0].state_dict() for seed in (1, 1, 2)
+    )
+    assert all(torch.equal(once[name], again[name]) for name in once)
+    assert not torch.equal(once["distance.last.weight"], other["distance.last.weight"])
+    hurried = train(walks, Recipe(epochs=500, batch=10, widths=(4, 4, 4)), minutes=0.5 / 60)[1]
+    assert 1 <= hurried.epochs < 500
+    with pytest.raises(ArgumentError, match="epochs"):
+        Recipe(epochs=0)
+
+
+def test_training_makes_it_better_than_a_plain_room(two_rooms: str, walks: Walks) -> None:
+    """In the same rooms, on other ways."""
+    others = walk_about(world(two_rooms), 1, WalkRules(places=10, stops=3, height=24))
+    pairs = drawn(others, 64, np.random.default_rng(0))
+    network, _ = train(walks, Recipe(epochs=30, widths=(8, 16, 16)))
+    with torch.inference_mode():
+        trained, untrained = (
+            (each(pairs.source, pairs.ahead).colours - pairs.target).abs().mean()
+            for each in (network, Network(24, (8, 16, 16)))
+        )
+    assert trained < 0.95 * untrained
+
+
+@pytest.mark.slow
+def test_the_command_makes_a_model_that_beats_the_floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
+    command = ["train", "warpnet", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "10"]
+    options = ["--out", str(out), "--cache", str(cache), "--workers", "1"]
+    assert main([*command, *options, "--epochs", "3"]) == 0
+    assert "steps of 0.2 m ahead" in capsys.readouterr().out
+    model = WarpNet(out)
+    psnr = model.card["held_out"]["psnr"]
+    assert psnr["warpnet"]["3"] > psnr["copy"]["3"] + 2
+    assert psnr["warp"]["3"] > psnr["warpnet"]["3"]
+    assert model.card["scenes"] == "apartments:train:2"
+    assert model.card["recipe"]["epochs"] == 3
+    assert [file.suffix for file in sorted(cache.iterdir())] == [".npz"] * 2
+
+    before = {file: file.stat().st_mtime_ns for file in cache.iterdir()}
+    assert main([*command, *options, "--epochs", "1"]) == 0
+    assert before == {file: file.stat().st_mtime_ns for file in cache.iterdir()}
+
+
+def test_scenes_without_room_ahead_are_told(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wiw.training.warpnet.straight_ways", lambda *_: [])
+    model = WarpNet.of(Network(8, (4, 4, 4)))
+    with pytest.raises(ArgumentError, match=r"1\.6 m free"):
+        measured(model, two_rooms, 0)
+
+
+def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "x")]
+    assert main(["train", "warpnet", *out, "--categories", "chair"]) == 2
+    assert "recognises nothing" in capsys.readouterr().err
