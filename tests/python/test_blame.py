@@ -159,7 +159,7 @@ def test_infrastructure_is_not_blamed_but_named(
     broken.touch()
     assert main(["blame", str(run)]) == 1
     shown = capsys.readouterr()
-    assert "1 episode failed for infrastructure and are not attributed: 1." in shown.out.replace("\n", " ")
+    assert "1 episode failed for infrastructure, so nothing is blamed for them: 1." in shown.out.replace("\n", " ")
     assert "--retry-failed" in shown.err
     (line,) = wiw.load_run(run).blame()
     assert line["infrastructure"] == [1] and line["examined"] == 0 and set(line["broken"]) == {0, 2}

@@ -121,7 +121,8 @@ class Blame:
         found = []
         for line in self.arms:
             if line.infrastructure:
-                found.append(_named(line.arm, "failed for infrastructure and are not attributed", line.infrastructure))
+                text = "failed for infrastructure, so nothing is blamed for them"
+                found.append(_named(line.arm, text, line.infrastructure))
             if line.broken:
                 episode, cause = next(iter(line.broken.items()))
                 text = "could not be run again, as infrastructure failed"
@@ -156,7 +157,7 @@ class Blame:
         from rich.table import Table
 
         console = Console()
-        console = Console(width=None if console.is_terminal else max(console.width, 100))
+        console = Console(width=None if console.is_terminal else max(console.width, 120))
         for title, columns, cells in (
             ("Failures that a swap turns into successes, %", (*SWAPS,), mended_cells),
             ("Which stage is to blame, episodes", (*VERDICTS,), verdict_cells),
@@ -263,6 +264,6 @@ def _share(examined: list[EpisodeBlame], swap: str, seed: int) -> Estimate:
 
 
 def _named(arm: str, what: str, episodes: Any) -> str:
-    """E.g. "warp: 2 episodes failed for infrastructure and are not attributed: 3, 8."."""
+    """E.g. "warp: 2 episodes failed for infrastructure, so nothing is blamed for them: 3, 8."."""
     count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
     return f"{arm}: {count} {what}: {', '.join(map(str, episodes))}."
