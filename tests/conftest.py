@@ -80,10 +80,8 @@ def world_model_options(
             pytest.skip(f"no {', '.join(missing)}: pip install 'wiw[{requires.extra}]'")
         if name == "runway-gen4":
             return runway()
-        if not requires.packages:
+        if not requires.weights:  # none, or those that come with it
             return {}
-        if name == "warpnet":
-            return {"weights": warpnet()}
         import tiny_pipelines
 
         if name not in saved:
@@ -91,14 +89,6 @@ def world_model_options(
             saved.add(name)
         trained = {"checkpoint": str(folder / name / "trained")} if name.endswith("-action") else {}
         return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name], **trained}
-
-    @cache
-    def warpnet() -> str:
-        from wiw.world_models.warpnet.network import Network
-        from wiw.world_models.warpnet.weights import save
-
-        save(folder / "warpnet.safetensors", Network(16, (8, 8, 8)), {})
-        return str(folder / "warpnet.safetensors")
 
     @cache
     def runway() -> dict[str, Any]:

@@ -26,7 +26,7 @@ from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.world_models.warpnet import WarpNet, to_network, turned  # noqa: E402
+from wiw.world_models.warpnet import BUILT_IN, WarpNet, to_network, turned  # noqa: E402
 from wiw.world_models.warpnet.network import Network, enlarged, rays, warp  # noqa: E402
 from wiw.world_models.warpnet.weights import load, save  # noqa: E402
 
@@ -203,9 +203,35 @@ def test_what_is_no_weights_is_refused(tmp_path: Path) -> None:
 def test_without_torch_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("wiw.world_models.base.importlib.util.find_spec", lambda name: None)
     with pytest.raises(DependencyError, match=r"pip install 'wiw\[torch\]'"):
-        wiw.world_model("warpnet", weights="w.safetensors")
+        wiw.world_model("warpnet")
 
 
 def test_torch_is_not_loaded_before_it_is_needed() -> None:
     code = "import sys, wiw.world_models.warpnet; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# -- as it comes with wiw ----------------------------------------------------------------------------------------------
+
+
+def test_the_weights_that_come_with_it_beat_the_floor(two_rooms: str) -> None:
+    """In a bare room unlike any apartment."""
+    model = wiw.world_model("warpnet")
+    poses = np.stack([camera_pose(np.array([-2.4, 0, z]), 0.0) for z in (1.4, 0.8)])
+    before, after = world(two_rooms).renderer.panorama(poses, outputs=("color",))["color"]
+    made = model.moved(before, 0.6, 0.0)
+    floor = wiw.metrics.psnr(before, after, weights="latitude")
+    assert wiw.metrics.psnr(made, after, weights="latitude") > floor + 1.5
+    assert BUILT_IN.stat().st_size < 4 * 2**20
+
+
+def test_its_card_has_the_recipe_and_what_it_is_worth() -> None:
+    card = wiw.world_model("warpnet").card
+    psnr, ssim = card["held_out"]["psnr"], card["held_out"]["ssim"]
+    assert set(psnr) == set(ssim) == {"copy", "warpnet", "warp"}
+    assert set(psnr["copy"]) == {"1", "3", "5", "8"}
+    assert psnr["warpnet"]["3"] > psnr["copy"]["3"] + 3
+    assert psnr["warp"]["3"] > psnr["warpnet"]["3"]
+    assert card["scenes"].startswith("apartments:train")
+    assert card["val"].startswith("apartments:val")
+    assert card["recipe"]["epochs"] >= 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The trainable world model: from one colour panorama to any place near by, with no depth given."""
+"""The built-in learned world model: from one colour panorama to any place near by, with no depth given."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from wiw.world_models.fingerprint import code_digest
 if TYPE_CHECKING:
     from wiw.world_models.warpnet.network import Network
 
+BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STILL = 1e-4
 """Metres: who has moved less stands where it stood."""
 
@@ -33,7 +34,7 @@ class WarpNet(WorldModel):
     size; distances and painting are the network's, in a small one.
 
     Args:
-        weights: a file of `wiw train warpnet`.
+        weights: a file of `wiw train warpnet`; None means those that come with wiw.
 
     Raises:
         DependencyError: torch or safetensors is not installed.
@@ -43,18 +44,18 @@ class WarpNet(WorldModel):
     accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True)
     requires = Requirements(("torch", "safetensors"), "torch")
 
-    def __init__(self, weights: str | Path) -> None:
+    def __init__(self, weights: str | Path | None = None) -> None:
         devices.require(self.requires)
         from wiw.world_models.warpnet.weights import load
 
-        self.weights = str(weights)
-        self._network, self.card = load(weights)
+        self.weights = None if weights is None else str(weights)
+        self._network, self.card = load(weights or BUILT_IN)
 
     @classmethod
     def of(cls, network: Network) -> WarpNet:
         """The world model of a network at hand, such as one in training."""
         model = cls.__new__(cls)
-        model.weights, model._network, model.card = "", network.eval(), {}
+        model.weights, model._network, model.card = None, network.eval(), {}
         return model
 
     def describe(self) -> dict[str, Any]:
@@ -70,7 +71,7 @@ class WarpNet(WorldModel):
 
     def fingerprint(self) -> str:
         """Digest of code, weights and torch's version; where the weights lie does not count."""
-        said = {**self.describe(), "weights": ""}
+        said = {**self.describe(), "weights": None}
         code = code_digest(type(self)) + code_digest(type(self._network))
         return blake2b(f"{code}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 
