@@ -107,7 +107,8 @@ class GroundingDino(Detector):
         chances = said.logits.sigmoid().cpu().numpy()
         scores = np.stack([chances[..., place].max(axis=-1) for place in places], axis=-1)
         boxes = said.pred_boxes.cpu().numpy()
-        return [self._read(*row, image, list(text)) for *row, image in zip(scores, boxes, images, strict=True)]
+        rows = zip(scores, boxes, images, strict=True)
+        return [self._read(score, box, image, list(text)) for score, box, image in rows]
 
     def _laid_out(self, text: dict[str, list[int]]) -> tuple[list[int], list[slice]]:
         """Tokens of "[CLS] name. name. [SEP]", and where each name's are."""

@@ -105,7 +105,7 @@ class Sam2(Tracker):
         from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
         return Sam2VideoInferenceSession(
-            video=pretrained.square(video, self._side, self.device),
+            video=pretrained.square(list(video), self._side, self.device),
             video_height=video.shape[1],
             video_width=video.shape[2],
             inference_device=self.device,
