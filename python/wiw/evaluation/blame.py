@@ -159,8 +159,8 @@ class Blame:
         console = Console()
         console = Console(width=None if console.is_terminal else max(console.width, 120))
         for title, columns, cells in (
-            ("Failures that a swap turns into successes, %", (*SWAPS,), mended_cells),
-            ("Which stage is to blame, episodes", (*VERDICTS,), verdict_cells),
+            ("Failures that a swap turns into successes, %", (*SWAPS,), _mended_cells),
+            ("Which stage is to blame, episodes", (*VERDICTS,), _verdict_cells),
         ):
             table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
             table.add_column("arm", style="bold")
@@ -180,12 +180,12 @@ class Blame:
         return "\n".join(lines)
 
 
-def mended_cells(line: ArmBlame) -> list[str]:
+def _mended_cells(line: ArmBlame) -> list[str]:
     """For each swap, e.g. "46.3 [38.9, 54.0]"; a dash where it changes nothing or nothing was examined."""
     return [show_estimate(line.mended[swap]) if swap in line.mended else "–" for swap in SWAPS]
 
 
-def verdict_cells(line: ArmBlame) -> list[str]:
+def _verdict_cells(line: ArmBlame) -> list[str]:
     """For each verdict how many failures it explains."""
     return [str(count) for count in line.verdicts.values()]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from wiw.evaluation.blame import SWAPS, VERDICTS, Blame, blame, mended_cells, verdict_cells
+from wiw.evaluation.blame import SWAPS, VERDICTS, Blame, blame
 from wiw.evaluation.costs import cost_columns, costs
 from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
@@ -61,7 +61,7 @@ def render(log: RunLog) -> str:
             cost_columns=paid,
             fidelity=[(line, line.cells(measured)) for line in truths],
             fidelity_columns=[(column.title, column.about) for column in measured],
-            blame=[(line, mended_cells(line), verdict_cells(line)) for line in blamed.arms] if blamed else [],
+            blame=blamed.arms if blamed else (),
             swaps=list(SWAPS),
             verdicts=VERDICTS,
             blame_notes=blamed.notes() if blamed else [],
