@@ -153,7 +153,7 @@ def test_episodes_of_other_systems_are_evaluated(
     assert row["metrics"]["success"] == (form == "world-in-world with steps")  # 9 m around the goal are both rooms
     if ideal is not None:
         assert row["metrics"]["spl"] == pytest.approx(min(1.0, ideal / max(ideal, row["metrics"]["actions"])))
-    assert log.report().read_text().count("m to go") == 1
+    assert log.report().read_text().count("m to the goal") == 1
     assert resume_run(tmp_path / "run", progress=False).complete
 
 
