@@ -11,9 +11,9 @@ import wiw
 
 PROBE = """
 import json, sys, time
-begin = time.perf_counter()
+begin = time.process_time()
 import wiw
-seconds = time.perf_counter() - begin
+seconds = time.process_time() - begin
 print(json.dumps({"seconds": seconds, "modules": sorted(m for m in sys.modules if "." not in m)}))
 """
 
