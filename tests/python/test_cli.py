@@ -11,6 +11,7 @@ import pytest
 
 from wiw.cli import main
 from wiw.cli.doctor import examine
+from wiw.errors import ArgumentError
 from wiw.evaluation.runlog import load_run
 from wiw.tasks.imagenav import ImageNav
 
@@ -301,3 +302,13 @@ v 2 2 -2
 f 1 4 3 2
 f 1 2 6 5
 """
+
+
+def test_each_task_names_the_policy_that_runs_it():
+    from wiw.cli.options import default_policy
+    from wiw.registry import POLICIES, TASKS
+
+    assert (default_policy("imagenav"), default_policy("ar")) == ("matcher", "recogniser")
+    assert {default_policy(name) for name in TASKS.names()} <= set(POLICIES.names())
+    with pytest.raises(ArgumentError, match="names no default"):
+        default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")

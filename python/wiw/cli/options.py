@@ -72,3 +72,17 @@ def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> d
         if name in flags:
             raise ArgumentError(f"--task-option: '{name}' has a flag of its own, --{name.replace('_', '-')}")
     return {**{name: value for name, value in flags.items() if value is not None}, **options}
+
+
+def default_policy(task: str) -> str:
+    """What runs a task where `--policy` names nothing.
+
+    Raises:
+        ArgumentError: the task names none either.
+    """
+    from wiw.registry import TASKS
+
+    name = getattr(TASKS.find(task), "default_policy", None)
+    if name is None:
+        raise ArgumentError(f"--policy: task '{task}' names no default; choose one of `wiw list policies`")
+    return str(name)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, model_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, task_options
 from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
@@ -26,7 +26,7 @@ def run(
     *,
     world_model: Name = "none",
     world_model_option: Options = (),
-    policy: Name = "matcher",
+    policy: MaybeName = None,
     revision: MaybeName = None,
     arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
@@ -73,7 +73,7 @@ def run(
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
         world_model_option: An option of --world-model, such as weights=FOLDER or steps=30; may be given again.
-        policy: Proposes plans; name or path.py:Class.
+        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser.
         revision: Scores imagined futures; the policy's own choice if not given.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
@@ -120,6 +120,7 @@ def run(
         "episode_file": episode_file, "scene_folder": scene_folder,
     }  # fmt: skip
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
+    policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)
     names = _arms(arms, world_model)
     given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, model_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, task_options
 
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -22,7 +22,7 @@ def scale(
     *,
     world_model: Name = "warp",
     world_model_option: Options = (),
-    policy: Name = "matcher",
+    policy: Annotated[str | None, arg(metavar="NAME")] = None,
     revision: Annotated[str | None, arg(metavar="NAME")] = None,
     candidates: Values = None,
     imagine_fraction: Values = None,
@@ -54,7 +54,7 @@ def scale(
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        policy: Proposes plans; name or path.py:Class.
+        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser.
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
         imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
@@ -80,6 +80,7 @@ def scale(
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
     from wiw.evaluation.scale import scale as run_scale
 
+    policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), horizon=horizon,

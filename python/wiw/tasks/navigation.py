@@ -42,6 +42,8 @@ class NavigationTask(ABC):
     name: str
     metrics: tuple[str, ...]
     rules_class: type
+    default_policy: str
+    """Runs it where none is named."""
     wording = Wording()
     """How reports speak of its episodes."""
     choices: tuple[str, ...] = ()

@@ -63,6 +63,7 @@ class AR(NavigationTask):
     """
 
     name = "ar"
+    default_policy = "recogniser"
     metrics = ("success", "mean_trajectory")
     rules_class = ARRules
     wording = Wording(

@@ -52,6 +52,7 @@ class ImageNav(NavigationTask):
     """
 
     name = "imagenav"
+    default_policy = "matcher"
     metrics = ("success", "spl", "mean_trajectory")
     rules_class = ImageNavRules
     wording = Wording(
