@@ -235,3 +235,15 @@ def test_its_card_has_the_recipe_and_what_it_is_worth() -> None:
     assert card["scenes"].startswith("apartments:train")
     assert card["val"].startswith("apartments:val")
     assert card["recipe"]["epochs"] >= 1
+
+
+def test_constants_made_for_a_rollout_serve_training_too() -> None:
+    from wiw.world_models.warpnet.network import plain_room, rays
+
+    for made in (rays, plain_room):
+        made.cache_clear()
+        with torch.inference_mode():
+            made(4, 8)
+        weight = torch.ones(1, requires_grad=True)
+        (made(4, 8) * weight).sum().backward()
+        assert weight.grad is not None and torch.isfinite(weight.grad).all()

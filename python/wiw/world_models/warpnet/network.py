@@ -44,6 +44,7 @@ def blend(warped: Tensor, painted: Tensor, mask: Tensor) -> Tensor:
 
 
 @cache
+@torch.inference_mode(False)  # training may use what was first made for a rollout
 def rays(height: int, width: int) -> Tensor:
     """[3, H, W]: unit vectors of a panorama's pixels; +x right, +y up, -z ahead."""
     latitude = torch.pi * (0.5 - (torch.arange(height) + 0.5) / height)[:, None]
@@ -53,6 +54,7 @@ def rays(height: int, width: int) -> Tensor:
 
 
 @cache
+@torch.inference_mode(False)  # training may use what was first made for a rollout
 def plain_room(height: int, width: int) -> Tensor:
     """[1, H, W]: log-distances in a round room 2.6 m high and 5 m wide, seen from its middle, 1 m above the floor."""
     up = rays(height, width)[1:2]
