@@ -5,8 +5,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, BackendError, FileError
+from wiw.networks import one_thread
 from wiw.perception.calibration import softmax
 from wiw.perception.glimpses import Glimpses, joined
 
@@ -161,19 +161,6 @@ class Recogniser:
                 "`wiw train recogniser`"
             )
         return [self.categories.index(name) for name in choices]
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Of torch: faster for single looks, above all on a busy machine, and rounds alike on any number of cores."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def require_torch() -> None:

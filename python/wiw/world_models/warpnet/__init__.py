@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.perception.recogniser import one_thread
+from wiw.networks import one_thread
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
