@@ -3,9 +3,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from wiw._core import core
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.reproject import pose, warp
+from wiw.training.course import taught
 from wiw.training.walks import Walks, straight_ways
 from wiw.world_models.warpnet import WarpNet, to_network
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
@@ -71,15 +71,7 @@ def train(
         show: called after each step with its number, how many there are, and a running mean of the loss.
     """
     an_epoch = max(1, walks.places.size // recipe.batch)
-    if minutes is not None:
-        seconds = _Lesson(walks, recipe).seconds_a_step()
-        recipe = replace(recipe, epochs=max(1, min(recipe.epochs, int(60 * minutes / (seconds * an_epoch)))))
-    lesson = _Lesson(walks, recipe)
-    steps, mean = recipe.epochs * an_epoch, float("nan")
-    for step in range(steps):
-        loss = lesson.step(recipe.rate * _pace(step / steps))
-        mean = loss if step == 0 else 0.98 * mean + 0.02 * loss
-        show(step + 1, steps, mean)
+    lesson, recipe = taught(lambda: _Lesson(walks, recipe), recipe, an_epoch, minutes, _pace, show)
     return lesson.network.eval(), recipe
 
 
@@ -106,11 +98,6 @@ class _Lesson:
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._optimiser.step()
         return float(loss.detach())
-
-    def seconds_a_step(self, trials: int = 10) -> float:
-        """Median time of some steps after the first two, which are slow."""
-        moments = [time.monotonic() for _ in range(trials) if self.step(0.0) is not None]
-        return float(np.median(np.diff(moments[1:])))
 
 
 def _pace(done: float) -> float:
