@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import io
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -153,7 +154,7 @@ def test_episodes_that_were_not_judged_are_counted_and_said():
     assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
     assert (summary["warp"].asked, summary["warp"].judged, summary["none"].judged) == (5, "3/5", "4/5")
     said = " ".join(notes(summary))
-    assert "warp: 3 of 5 episodes asked were judged, 1 failed for infrastructure, 1 are still to run" in said
+    assert "warp: 3 of 5 episodes asked were judged, 1 failed for infrastructure, 1 still to run" in said
     assert "over all 5, SR would lie between 60.0 and 100.0 %" in said
 
 
@@ -253,3 +254,11 @@ def test_few_scenes_that_happen_to_be_alike_do_not_make_an_interval_narrow():
     spl = [0.9, 0.0, 0.88, 0.0, 0.0, 0.91]  # one of two reached in each of three scenes
     low, high = clustered_t(spl, ["a", "a", "b", "b", "c", "c"], "rate")
     assert high - low > 0.6
+
+
+def test_intervals_of_means_end_where_values_do():
+    actions, scenes = [3, 60, 60, 60], ["a", "a", "b", "b"]
+    found, plain = (estimate_mean(actions, scenes, headline) for headline in (TRAJ, replace(TRAJ, least=-math.inf)))
+    assert plain.low < 0 and found.low == 0 and found.high == plain.high
+    worse = estimate_difference([0, 0, 50, 50], [3, 60, 60, 60], scenes, TRAJ)
+    assert worse.low < 0

@@ -56,7 +56,8 @@ class Difference:
 def estimate_mean(values: ArrayLike, scenes: Sequence[str], headline: Headline, *, seed: int = 0) -> Estimate:
     """Mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
     data = np.asarray(values, np.float64)
-    return _estimate(data, scenes, headline, "rate" if headline.kind == "rate" else "length", seed)
+    found = _estimate(data, scenes, headline, "rate" if headline.kind == "rate" else "length", seed)
+    return replace(found, low=max(found.low, headline.scale * headline.least))
 
 
 def estimate_difference(

@@ -278,7 +278,8 @@ def notes(summary: Summary) -> list[str]:
     )
     if widest is not None and widest.high - widest.low > 30:
         found.append(
-            f"{widest.n} episodes say little: intervals of SR are up to {widest.high - widest.low:.0f} points wide."
+            f"So few episodes ({widest.n}) say little: intervals of SR are up to "
+            f"{widest.high - widest.low:.0f} points wide."
         )
     return found
 
@@ -287,7 +288,7 @@ def _missing(line: ArmSummary) -> str:
     """What the rate could be if nobody had been left out: with every missing episode lost, and with every one won."""
     said = f"{line.name}: {line.done} of {line.asked} episodes asked were judged"
     said += f", {line.failed} failed for infrastructure" if line.failed else ""
-    said += f", {line.pending} are still to run" if line.pending else ""
+    said += f", {line.pending} still to run" if line.pending else ""
     if "success" not in line.estimates:
         return f"{said}."
     won = line.estimates["success"].value * line.done

@@ -30,6 +30,8 @@ class Headline:
     """An episode's value from its metrics, where the task does not measure it; with a KeyError it has none."""
     about: str = ""
     """One line for `wiw list`."""
+    least: float = -math.inf
+    """What no episode's value is below, so that intervals of their mean end there."""
 
     @property
     def scale(self) -> float:
@@ -64,4 +66,6 @@ class Headline:
 
 SUCCESS = Headline("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
 SPL = Headline("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
-MEAN_TRAJECTORY = Headline("actions", "Mean Traj", "length", False, about="Mean number of executed primitives.")
+MEAN_TRAJECTORY = Headline(
+    "actions", "Mean Traj", "length", False, about="Mean number of executed primitives.", least=0.0
+)
