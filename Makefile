@@ -12,7 +12,8 @@ help:       ## this list
 setup:      ## Debian packages, .venv, the package in editable mode
 	@scripts/setup
 
-demo: setup ## the main job: ImageNav on generated apartments with four world models, table and report
+demo:       ## the main job: ImageNav on generated apartments with five world models, table and report
+	@scripts/setup torch
 	$(BIN)/wiw demo
 
 test:       ## all tests: ctest, then pytest

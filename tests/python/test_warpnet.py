@@ -247,3 +247,15 @@ def test_constants_made_for_a_rollout_serve_training_too() -> None:
         weight = torch.ones(1, requires_grad=True)
         (made(4, 8) * weight).sum().backward()
         assert weight.grad is not None and torch.isfinite(weight.grad).all()
+
+
+def test_the_demo_leaves_it_out_where_torch_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from wiw.cli.demo import ARMS, _arms
+
+    assert _arms() == list(ARMS)
+    assert not capsys.readouterr().out
+    monkeypatch.setattr("wiw.world_models.base.importlib.util.find_spec", lambda name: None)
+    assert _arms() == ["none", "copy", "warp", "oracle"]
+    assert "warpnet is left out: torch" in capsys.readouterr().out

@@ -33,7 +33,7 @@ from wiw.errors import Error
 
 DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
-  $ wiw demo                                              no world model, copy, warp and oracle, side by side
+  $ wiw demo                                              world models from the floor to the ceiling, side by side
   $ wiw run imagenav --world-model warp --episodes 50     one world model
   $ wiw run imagenav --world-model my_model.py:MyModel    your own
 
@@ -43,7 +43,7 @@ Exit codes: 0 done, 1 the run is invalid (verify: it differs), 2 error, 130 stop
 within 5 seconds; after both of these everything recorded is kept and `wiw resume` goes on."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
-    (demo, "demo", "Watch it work: four arms on a handful of episodes, a table and a report."),
+    (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
     (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
