@@ -175,8 +175,9 @@ class WorldModel(ABC):
         """Text that changes with everything the answers depend on beside what the model is handed; names cached
         rollouts.
 
-        Default: a digest of the class, its source file, `describe()` and all attributes, arrays and torch networks by
-        content. Override it where that takes long, or where an attribute is of another kind.
+        Default: a digest of the class, its source file (in a notebook its code, and what that reads), `describe()` and
+        all attributes, arrays and torch networks by content. Override it where that takes long, or where an attribute
+        is of another kind.
 
         Raises:
             ArgumentError: an attribute's content cannot be told; names it.
