@@ -141,6 +141,26 @@ def test_an_arm_may_have_a_policy_of_its_own():
     assert type(ready.policy).__name__ == "Heuristic" and ready.candidates == 4 and ready.model is not None
 
 
+def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
+    class Mine(wiw.WorldModel):
+        accepts = wiw.accepts(control="trajectory")
+
+        def rollout(self, observations, controls, seeds):
+            raise NotImplementedError
+
+    agent, mine = wiw.Agent("matcher", candidates=4), Mine()
+    made = arm_recipes(agent, {"off": None, "this": mine, "that": Mine, "floor": "copy", "h": "heuristic+none"})
+    built = {name: recipe.build({}) for name, recipe in made.items()}
+    assert built["this"].model is mine and built["off"].model is None and built["h"].model is None
+    assert [type(built[name].model).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
+    assert type(built["h"].policy).__name__ == "Heuristic" and {each.candidates for each in built.values()} == {4}
+    assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
+    with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
+        arm_recipes(agent, [mine, Mine])
+    with pytest.raises(ArgumentError, match="by name or path.py:Class.*evaluate a wiw.Agent"):
+        arm_recipes(AgentRecipe("matcher"), [mine])
+
+
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
     first = run(tmp_path / "run")
     with pytest.raises(StoreError, match="holds a run already"):

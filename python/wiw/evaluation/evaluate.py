@@ -33,7 +33,7 @@ def evaluate(
     out: str | Path | None = None,
     workers: int = 1,
     progress: bool = True,
-    arms: Sequence[str] | None = None,
+    arms: Sequence[Any] | Mapping[str, Any] | None = None,
     *,
     live: int = 4,
     keep_images: int | Literal["all"] = 2,
@@ -49,6 +49,7 @@ def evaluate(
 
         log = wiw.evaluate(env, agent, episodes=20)
         log = wiw.evaluate(env, agent, episodes=20, arms=["none", "copy", "warp", "oracle"])
+        log = wiw.evaluate(env, agent, episodes=20, arms={"none": "none", "mine": MyModel(), "oracle": "oracle"})
         log = wiw.evaluate("imagenav", agent, episodes=20, scenes="apartments:val", preset="official")
 
     All randomness is keyed by (seed, episode, decision, candidate): neither `workers` nor `live` changes a result.
@@ -61,9 +62,10 @@ def evaluate(
         out: folder of the run; None means `runs/<task>-<time>`.
         workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
         progress: whether to show bars.
-        arms: world models to run on the same episodes with this agent's policies, or "policy+model" for one with
-            another built-in policy, such as "heuristic+none"; "placebo-shuffled" and "placebo-swapped" are placebos of
-            the agent's model (else of warp), "placebo-shuffled:oracle" of another; None means the agent's own model.
+        arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
+            "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
+            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
+            mapping gives the arms names of their own. None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
         keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one.
         resume: whether to go on with the run in `out` where it was stopped.

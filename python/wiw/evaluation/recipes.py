@@ -201,19 +201,40 @@ def agent_recipe(agent: Any) -> AgentRecipe | Ready:
 def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | Ready]:
     """The same agent with each of several world models, by arm name; with the model it has where `arms` is None.
 
+    `arms` are names and world models (classes or instances), or a mapping of the arms' own names to these.
+
     Raises:
-        ArgumentError: an arm is named twice, or none is.
+        ArgumentError: an arm is named twice, or none is; a world model in memory for an `AgentRecipe`.
     """
     if arms is None:
         return {_own_arm(agent): agent_recipe(agent)}
-    names = [_parts(str(name)) for name in arms]
-    own = getattr(agent, "model", None)
-    made: dict[str, AgentRecipe | Ready] = {
-        _arm_name(policy, model): _with_model(_with_policy(agent, policy), model, own) for policy, model in names
-    }
-    if not names or len(made) < len(names):
-        raise ArgumentError(f"arms: expected different world models, got {[str(name) for name in arms]}")
+    given = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
+    pairs = [_arm(agent, name, model) for name, model in given]
+    made = dict(pairs)
+    if len(made) < max(1, len(pairs)):
+        raise ArgumentError(f"arms: expected different world models, got {[name for name, _ in pairs]}")
     return made
+
+
+def _arm(agent: Any, name: str | None, model: Any) -> tuple[str, AgentRecipe | Ready]:
+    """Name and recipe of an arm."""
+    if _is_in_memory(model):
+        if isinstance(agent, AgentRecipe):
+            raise ArgumentError(
+                f"arms: a recipe's world models go by name or path.py:Class, got {model!r}; evaluate a wiw.Agent with it"
+            )
+        changed = agent.but(model=model)
+        return name or _own_arm(changed), ReadyAgent(changed)
+    policy, kind = _parts("none" if model is None else str(model))
+    with_policy = _with_policy(agent, policy)
+    return name or _arm_name(policy, kind), _with_model(with_policy, kind, getattr(agent, "model", None))
+
+
+def _is_in_memory(model: Any) -> bool:
+    """Whether a world model is given itself, or its class."""
+    from wiw.world_models.base import WorldModel
+
+    return isinstance(model, WorldModel) or (isinstance(model, type) and issubclass(model, WorldModel))
 
 
 def _parts(name: str) -> tuple[str | None, str]:
