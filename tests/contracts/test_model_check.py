@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -165,6 +166,18 @@ def test_what_cannot_be_made(two_rooms):
         wiw.check_model("wrap", two_rooms)
     with pytest.raises(ArgumentError, match="no world model"):
         wiw.check_model("none", two_rooms)
+
+
+def test_a_model_that_hangs_does_not_hang_the_check(two_rooms):
+    ended = threading.Event()
+    try:
+        findings = found(spoilt(lambda *_: ended.wait(60)), two_rooms, deadline=0.3)
+    finally:
+        ended.set()
+    assert findings["deadline"].serious and "No answer in 0.3 s" in str(findings["deadline"])
+    assert set(findings) == {"deadline"}
+    with pytest.raises(ArgumentError, match="seconds above 0"):
+        wiw.check_model(Honest, two_rooms, deadline=0)
 
 
 def test_a_function_and_a_served_model_are_checked_as_any(two_rooms):

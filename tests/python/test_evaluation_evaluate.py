@@ -157,7 +157,7 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
     assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
     with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
         arm_recipes(agent, [mine, Mine])
-    with pytest.raises(ArgumentError, match="by name or path.py:Class.*evaluate a wiw.Agent"):
+    with pytest.raises(ArgumentError, match=r"by name or path\.py:Class.*evaluate a wiw\.Agent"):
         arm_recipes(AgentRecipe("matcher"), [mine])
 
 

@@ -16,6 +16,7 @@ def check_model(
     *,
     world_model_option: Options = (),
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val:1",
+    deadline: Annotated[float, arg(metavar="SECONDS")] = 300.0,
 ) -> int:
     """Asks a world model a few rollouts, and says in plain words what is wrong with its answers.
 
@@ -25,19 +26,20 @@ def check_model(
 
     Looked at are type, dtype, shape, number of frames and NaN, frame 0, what the model does to its inputs, whether the
     same seeds give the same frames, whether a row depends on those beside it, whether `causal` is true, whether the
-    plan makes a difference, and how long it takes. Exit code 1 if the contract is broken.
+    plan makes a difference, and how long it takes, if it answers at all. Exit code 1 if the contract is broken.
 
     Args:
         model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
         scenes: Where the observations come from: apartments:val:1, a mesh, or a Gazebo world.
+        deadline: Most seconds for a call of the model, as in `wiw run`.
     """
     from rich.console import Console
     from rich.markup import escape
 
     from wiw.evaluation import model_check
 
-    findings = model_check.check_model(model, scenes, **model_options(model, world_model_option))
+    findings = model_check.check_model(model, scenes, deadline=deadline, **model_options(model, world_model_option))
     console = Console(highlight=False, soft_wrap=True)
     for finding in findings:
         mark = "[red]wrong[/]" if finding.serious else "[yellow]note[/] "

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError, Error
 from wiw.evaluation.questions import Frames, Questions, Row
+from wiw.loop.attempts import DEADLINE, LateError
 from wiw.loop.contract import check_model as check_needs
 from wiw.registry import world_model
 from wiw.world_models.base import WorldModel
@@ -40,8 +41,8 @@ class Finding:
     """One thing that was found out about a world model."""
 
     kind: str
-    """"needs", "raised", the kind of a `ContractError`, "frame 0", "inputs", "random", "batch", "causal", "plan",
-    "describe", "fingerprint", or "slow"."""
+    """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "inputs", "random", "batch", "causal",
+    "plan", "describe", "fingerprint", or "slow"."""
     text: str
     """What is wrong, what was seen, and what to do."""
     serious: bool = True
@@ -51,7 +52,9 @@ class Finding:
         return self.text
 
 
-def check_model(model: Any, scenes: str | Path = "apartments:val:1", **options: Any) -> list[Finding]:
+def check_model(
+    model: Any, scenes: str | Path = "apartments:val:1", *, deadline: float = DEADLINE, **options: Any
+) -> list[Finding]:
     """Asks a world model a few rollouts as the loop would, and tells what is wrong with its answers.
 
         for finding in wiw.check_model(MyModel()):
@@ -59,11 +62,12 @@ def check_model(model: Any, scenes: str | Path = "apartments:val:1", **options: 
 
     Looked at are type, dtype, shape, number of frames and NaN, frame 0, what it does to its inputs, whether the same
     seeds give the same frames, whether a row depends on those beside it, whether `causal` is true, whether the plan
-    makes a difference, and how long it takes.
+    makes a difference, and how long it takes, if it answers at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
         scenes: where the observations come from.
+        deadline: seconds that a call may take, after which it is not asked any more.
         options: what the model is made with.
 
     Returns:
@@ -71,6 +75,7 @@ def check_model(model: Any, scenes: str | Path = "apartments:val:1", **options: 
 
     Raises:
         RegistryError: no such model; other errors of wiw where it cannot be made.
+        ArgumentError: a deadline that is not above 0.
     """
     try:
         made = world_model(model, **options)
@@ -84,15 +89,15 @@ def check_model(model: Any, scenes: str | Path = "apartments:val:1", **options: 
         check_needs(made, len(PLANS[0]))
     except ArgumentError as error:
         return [Finding("needs", f"{error}.")]
-    return list(_Check(made, str(scenes)).findings())
+    return list(_Check(made, str(scenes), deadline).findings())
 
 
 class _Check:
     """One model under examination."""
 
-    def __init__(self, model: WorldModel, scenes: str) -> None:
-        self.model, self.accepts = model, model.accepts
-        self.asking = Questions(model, scenes)
+    def __init__(self, model: WorldModel, scenes: str, deadline: float) -> None:
+        self.model, self.accepts, self.deadline = model, model.accepts, deadline
+        self.asking = Questions(model, scenes, deadline)
         self.row_seconds = 0.0
 
     def findings(self) -> Iterator[Finding]:
@@ -101,6 +106,13 @@ class _Check:
             yield from self._answers()
         except ContractError as error:
             yield Finding(error.kind, f"{error}.")
+        except LateError:
+            yield Finding(
+                "deadline",
+                f"No answer in {self.deadline:g} s, so it was asked no more. In a run such a call is made three times, "
+                "then its episode has failed. Does it wait for a download, a lock, a server or a prompt? If it is only "
+                "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
+            )
         except Exception as error:
             yield Finding("raised", f"`rollout` raised {_told(error)}.")
         yield from self._identity()

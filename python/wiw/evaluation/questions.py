@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.agent import Query
-from wiw.loop.attempts import Attempts
+from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.clock import Clock
 from wiw.loop.imagine import imagine
 from wiw.policies.base import FrameSpec
 from wiw.registry import TASKS
 from wiw.types import Conditioning, Control, Key, Proposal
-from wiw.world_models.base import WorldModel, checked_rollout
+from wiw.world_models.base import WorldModel
 
 EPISODES = 2
 Frames = NDArray[np.uint8]
@@ -41,10 +41,14 @@ class Questions:
     Args:
         model: who is asked.
         scenes: where the episodes are.
+        deadline: seconds that a call may take.
+
+    Raises:
+        ArgumentError: a deadline that is not above 0.
     """
 
-    def __init__(self, model: WorldModel, scenes: str) -> None:
-        self._model = model
+    def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
+        self._model, self._attempts = model, Attempts(model, deadline)
         self._queries = _queries(scenes)
         self.row_seconds = 0.0
         """What a row took in the last call."""
@@ -74,6 +78,10 @@ class Questions:
 
         With `shared`, the first frames are not asked for: the same question to the model, but not to a server that
         remembers its answers.
+
+        Raises:
+            LateError: a call took longer than the deadline.
+            ContractError: an answer breaks the contract; and whatever the model raises.
         """
         begin, most = time.perf_counter(), self._model.accepts.best_batch
         rows = [replace(row, control=replace(row.control, shared=shared)) for row in rows]
@@ -92,7 +100,7 @@ class Questions:
         if observations.depth is not None:
             given["observations.depth"] = observations.depth
         kept = {name: array.copy() for name, array in given.items()}
-        frames = checked_rollout(self._model, observations, controls, seeds)
+        frames = self._attempts.once(observations, controls, seeds)
         self.changed |= {name for name, array in given.items() if not np.array_equal(array, kept[name])}
         return np.array(frames)
 

@@ -221,7 +221,7 @@ def _arm(agent: Any, name: str | None, model: Any) -> tuple[str, AgentRecipe | R
     if _is_in_memory(model):
         if isinstance(agent, AgentRecipe):
             raise ArgumentError(
-                f"arms: a recipe's world models go by name or path.py:Class, got {model!r}; evaluate a wiw.Agent with it"
+                f"arms: a recipe's world models go by name or path.py:Class, got {model!r}; evaluate a wiw.Agent"
             )
         changed = agent.but(model=model)
         return name or _own_arm(changed), ReadyAgent(changed)

@@ -71,7 +71,7 @@ class Attempts:
         for attempt in range(TRIES):
             self._count(controls)
             try:
-                return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
+                return self.once(observations, controls, seeds)
             except Exception as error:
                 said.append(_said(error))
                 hopeless = isinstance(error, ContractError) and said.count(said[-1]) > 1
@@ -81,13 +81,24 @@ class Attempts:
                 time.sleep(PAUSES[attempt])
         raise AssertionError("unreachable")
 
+    def once(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Likewise, in a single try that counts nowhere.
+
+        Raises:
+            LateError: no answer within the deadline.
+            ContractError: the answer breaks the contract; and whatever the model raises.
+        """
+        return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
+
     def _count(self, controls: Sequence[Control]) -> None:
         self.tally["calls"] += 1
         self.tally["rows"] += len(controls)
         self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
-        kind = error.kind if isinstance(error, ContractError | RolloutError | _LateError) else "raised"
+        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError) else "raised"
         name = type(self.model).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
@@ -102,7 +113,7 @@ class Attempts:
             return self._helper.do(work, self.deadline)
 
 
-class _LateError(Exception):
+class LateError(Exception):
     """The deadline has passed."""
 
     kind = "deadline"
@@ -146,7 +157,7 @@ class _Helper:
         errand = self._last = _Errand(work)
         self._errands.put(errand)
         if not errand.ended.wait(seconds):
-            raise _LateError(f"no answer within {seconds:g} s (deadline); the call was abandoned")
+            raise LateError(f"no answer within {seconds:g} s (deadline); the call was abandoned")
         self._last = None
         if errand.error is not None:
             raise errand.error
@@ -161,7 +172,7 @@ def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
 
 def _said(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, ContractError | _LateError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, ContractError | LateError) else f"{type(error).__name__}: {text}"
 
 
 def _torch_state() -> tuple[bool, bool, int | None] | None:
