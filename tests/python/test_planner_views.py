@@ -78,13 +78,59 @@ def test_small_panoramas_are_area_averages(size):
         assert close(view, cv2.resize(image.astype(float), size[::-1], interpolation=cv2.INTER_AREA), 0.51)
 
 
+def weights(count, source, scale):
+    """[count, source]: what pixels of a view show of those of a frame, `scale` of which they are wide; middles meet."""
+    hit = (np.arange(count) + 0.5 - count / 2)[:, None] * scale + source / 2  # by the rays of the view's pixels
+    left = np.arange(source)
+    if scale >= 1:
+        overlap = np.minimum(hit + scale / 2, left + 1) - np.maximum(hit - scale / 2, left)
+        return np.clip(overlap, 0, None) / scale
+    near = 1 - np.abs(np.clip(hit, 0.5, source - 0.5) - (left + 0.5))
+    return np.clip(near, 0, None) * ((hit >= 0) & (hit < source))
+
+
+def looked_up(frame, size):
+    """The frame in another size by rays, both 90 degrees wide: black where they pass it, means over pixels' areas."""
+    scale = frame.shape[1] / size[1]
+    rows, columns = (weights(side, source, scale) for side, source in zip(size, frame.shape, strict=False))
+    return np.einsum("yv,vuc,xu->yxc", rows, frame.astype(float), columns)
+
+
 @pytest.mark.parametrize(
-    ("size", "how"), [((48, 48), cv2.INTER_AREA), ((72, 128), None), ((100, 150), cv2.INTER_LINEAR)]
+    ("frame", "size"),
+    [
+        ((48, 48), (32, 32)),
+        ((44, 80), (32, 32)),
+        ((80, 44), (32, 32)),
+        ((36, 64), (96, 96)),
+        ((45, 64), (64, 64)),
+        ((72, 128), (72, 128)),
+        ((40, 40), (18, 32)),
+        ((40, 40), (30, 20)),
+    ],
 )
-def test_perspective_frames_are_resized(size, how):
-    view = one_row([1], planner.ViewMaker("front", size), [PANORAMA, PANORAMA], frames="perspective")[0]
-    wanted = PANORAMA if how is None else cv2.resize(PANORAMA.astype(float), size[::-1], interpolation=how)
-    assert close(view, wanted, 0.51)
+def test_perspective_frames_are_shown_in_their_own_directions(frame, size):
+    whole = PANORAMA if frame[0] <= frame[1] else PANORAMA.transpose(1, 0, 2)
+    pixels = np.ascontiguousarray(whole[: frame[0], : frame[1]])
+    view = one_row([1], planner.ViewMaker("front", size), [pixels, pixels], frames="perspective")[0]
+    assert close(view, looked_up(pixels, size), 0.51)
+
+
+@pytest.mark.parametrize("frame", [(176, 320), (320, 176), (200, 200)])
+def test_what_a_perspective_model_is_shown_and_gives_back_is_the_front_view(frame):
+    """Conditioning and way back have the same rays: a model that repeats what it is shown is a window on reality."""
+    smooth = cv2.resize(cv2.GaussianBlur(NOISE, (0, 0), 3), (1024, 576))
+    batch = planner.Batch.build([[[1]]])
+    shown = batch.observations(smooth[None], planner.ViewMaker("front", frame))
+    assert shown.shape == (1, *frame, 3)
+    front = planner.ViewMaker("front", (96, 96))
+    back = batch.views(smooth[None], [np.stack([shown, shown], 1)], front, frames="perspective")[0, 0]
+    real = batch.views(smooth[None], [np.stack([smooth, smooth])[None]], front)[0, 0]
+    tangent = np.abs(np.arange(96) + 0.5 - 48) / 48  # of a row's elevation
+    seen, half_seen = tangent + 1 / 96 <= frame[0] / frame[1], tangent - 1 / 96 < frame[0] / frame[1]
+    assert close(back[seen], real[seen].astype(float), 3)
+    assert (back[~half_seen] == 0).all()
+    assert seen.all() if frame[0] >= frame[1] else seen.sum() == 52
 
 
 def test_perspective_frames_hold_nothing_but_the_front():
@@ -111,6 +157,8 @@ def test_observations_and_depth_of_rows():
     ray = (np.arange(48) + 0.5 - 24) / 24
     length = np.sqrt(1 + ray[None] ** 2 + ray[:, None] ** 2)
     np.testing.assert_allclose(planar, np.broadcast_to(3 / length, planar.shape), rtol=1e-6)
+    wide = batch.depths(np.full((2, 72, 128), 3, np.float32), planner.ViewMaker("front", (24, 48)))
+    np.testing.assert_allclose(wide, planar[:, 12:36], rtol=1e-6)
 
 
 def test_impossible_views_are_refused():

@@ -131,7 +131,8 @@ def test_a_busy_service_is_asked_again(service, made):
 
 
 def test_without_a_key_or_with_options_out_of_range(made, monkeypatch):
-    for options, said in (({"duration": 1}, "2 to 10"), ({"model": "gen3"}, "gen4"), ({"batch": 0}, "batch")):
+    wrong = {"2 to 10": {"duration": 1}, "gen4": {"model": "gen3"}, "batch": {"batch": 0}, "square": {"size": (64, 96)}}
+    for said, options in wrong.items():
         with pytest.raises(ArgumentError, match=said):
             made(**options)
     with pytest.raises(ArgumentError, match="prompts of up to 1000"):

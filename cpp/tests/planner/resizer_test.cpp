@@ -3,6 +3,8 @@
 
 #include <doctest/doctest.h>
 
+#include <algorithm>
+
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
@@ -15,26 +17,41 @@ std::vector<std::uint8_t> ramp(Size size) {
   }
   return pixels;
 }
+
+/// One channel as an image of three.
+std::vector<std::uint8_t> grey(const std::vector<int>& values) {
+  std::vector<std::uint8_t> pixels;
+  for (const int value : values) pixels.insert(pixels.end(), 3, static_cast<std::uint8_t>(value));
+  return pixels;
+}
+
+std::vector<std::uint8_t> resized(const std::vector<std::uint8_t>& pixels, Size from, Size to, Keep keep) {
+  std::vector<std::uint8_t> out(3 * to.pixels());
+  Resizer(from, to, keep)(pixels.data(), 0, out.data());
+  return out;
+}
+
 }  // namespace
 
 TEST_CASE("shrinking is the mean over the area, fractions counted") {
-  const std::vector<std::uint8_t> row = {0, 0, 0, 90, 90, 90, 240, 240, 240};
-  std::vector<std::uint8_t> out(6);
-  Resizer({1, 3}, {1, 2}, false)(row.data(), 0, out.data());
-  CHECK(out[0] == 30);   // (0 + 90 / 2) / 1.5
-  CHECK(out[3] == 190);  // (90 / 2 + 240) / 1.5
+  // (0 + 90 / 2) / 1.5 and (90 / 2 + 240) / 1.5
+  CHECK(resized(grey({0, 90, 240}), {1, 3}, {1, 2}, Keep::kSphere) == grey({30, 190}));
 }
 
-TEST_CASE("growing is linear between centres, closed to a circle where asked") {
-  const std::vector<std::uint8_t> row = {0, 0, 0, 100, 100, 100};
-  std::vector<std::uint8_t> out(12);
-  Resizer({1, 2}, {1, 4}, false)(row.data(), 0, out.data());
-  CHECK(out[0] == 0);
-  CHECK(out[3] == 25);
-  CHECK(out[9] == 100);
-  Resizer({1, 2}, {1, 4}, true)(row.data(), 0, out.data());
-  CHECK(out[0] == 25);
-  CHECK(out[9] == 75);
+TEST_CASE("growing is linear between centres, closed to a circle where it is a sphere") {
+  const auto rows = grey({0, 100, 0, 100});
+  const auto flat = resized(rows, {2, 2}, {4, 4}, Keep::kDirection);
+  CHECK(std::equal(flat.begin(), flat.begin() + 12, grey({0, 25, 75, 100}).begin()));
+  CHECK(resized(grey({0, 100}), {1, 2}, {1, 4}, Keep::kSphere) == grey({25, 25, 75, 75}));
+}
+
+TEST_CASE("directions stay: a wide image gets black rows, a high one loses some") {
+  const auto wide = grey({10, 20, 30, 40});
+  CHECK(resized(wide, {1, 4}, {3, 4}, Keep::kDirection) == grey({0, 0, 0, 0, 10, 20, 30, 40, 0, 0, 0, 0}));
+  CHECK(resized(wide, {1, 4}, {2, 4}, Keep::kDirection) == grey({5, 10, 15, 20, 5, 10, 15, 20}));  // half a row each
+  CHECK(resized(grey({1, 2, 3, 4}), {4, 1}, {2, 1}, Keep::kDirection) == grey({2, 3}));
+  CHECK(resized(grey({200, 200, 200, 200}), {2, 2}, {6, 4}, Keep::kDirection) ==
+        grey({0, 0, 0, 0, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 200, 0, 0, 0, 0}));
 }
 
 TEST_CASE("a shift is a roll before resizing") {
@@ -46,7 +63,7 @@ TEST_CASE("a shift is a roll before resizing") {
       for (int c = 0; c < 3; ++c) rolled[3 * (16 * y + (x + 5) % 16) + c] = pixels[3 * (16 * y + x) + c];
     }
   }
-  const Resizer resizer(size, {4, 8}, true);
+  const Resizer resizer(size, {4, 8}, Keep::kSphere);
   std::vector<std::uint8_t> a(96);
   std::vector<std::uint8_t> b(96);
   resizer(pixels.data(), 5, a.data());
@@ -57,7 +74,9 @@ TEST_CASE("a shift is a roll before resizing") {
 TEST_CASE("awkward ratios keep constants constant") {
   const std::vector<std::uint8_t> white(3 * 577 * 401, 255);
   std::vector<std::uint8_t> out(3 * 100 * 103);
-  Resizer({577, 401}, {100, 103}, false)(white.data(), 0, out.data());
-  for (const auto value : out) REQUIRE(value == 255);
-  CHECK_THROWS_AS(Resizer({0, 5}, {1, 1}, false), ArgumentError);
+  for (const Keep keep : {Keep::kSphere, Keep::kDirection}) {
+    Resizer({577, 401}, {100, 103}, keep)(white.data(), 0, out.data());
+    for (const auto value : out) REQUIRE(value == 255);
+  }
+  CHECK_THROWS_AS(Resizer({0, 5}, {1, 1}, Keep::kSphere), ArgumentError);
 }

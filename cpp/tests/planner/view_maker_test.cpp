@@ -62,6 +62,14 @@ TEST_CASE("perspective frames can only be the front") {
       ArgumentError);
 }
 
+TEST_CASE("a wide frame is shown in its own directions, black above and below") {
+  const Size wide{.height = 8, .width = 16};
+  std::vector<std::uint8_t> frame(3 * wide.pixels(), 9);
+  std::vector<std::uint8_t> view(3 * 8 * 8);
+  ViewMaker({.kind = ViewKind::kFront, .size = {8, 8}}).from_perspective(frame.data(), wide, view.data());
+  for (std::size_t row = 0; row < 8; ++row) CHECK(view[3 * 8 * row] == (row < 2 || row >= 6 ? 0 : 9));
+}
+
 TEST_CASE("images without a pixel are refused") {
   const std::uint8_t* const none = nullptr;
   std::vector<std::uint8_t> out(3 * 8 * 16);

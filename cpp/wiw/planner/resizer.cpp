@@ -23,7 +23,7 @@ int wrapped(int index, int size) { return ((index % size) + size) % size; }
 
 }  // namespace
 
-Resizer::Resizer(Size from, Size to, bool wrap) : from_(from), to_(to) {
+Resizer::Resizer(Size from, Size to, Keep keep) : from_(from), to_(to) {
   constexpr int kLargest = 16384;
   for (const int side : {from.height, from.width, to.height, to.width}) {
     if (side < 1 || side > kLargest) {
@@ -32,35 +32,55 @@ Resizer::Resizer(Size from, Size to, bool wrap) : from_(from), to_(to) {
                           std::to_string(to.width));
     }
   }
-  rows_ = make_axis(from.height, to.height, false);
-  columns_ = make_axis(from.width, to.width, wrap);
+  const bool sphere = keep == Keep::kSphere;
+  columns_ = make_axis(from.width, to.width, from.width, to.width, sphere);
+  rows_ = sphere ? make_axis(from.height, to.height, from.height, to.height, false)
+                 : make_axis(from.height, to.height, from.width, to.width, false);
 }
 
-Resizer::Axis Resizer::make_axis(int from, int to, bool wrap) {
+Resizer::Axis Resizer::make_axis(int from, int to, int in, int out, bool wrap) {
+  const int common = std::gcd(in, out);
+  in /= common;
+  out /= common;
+  return out <= in ? averages(from, to, in, out) : interpolations(from, to, in, out, wrap);
+}
+
+Resizer::Axis Resizer::averages(int from, int to, int in, int out) {
+  int twice_first = from * out - to * in;  // where output 0 begins, in units of 1/(2 out) of an input pixel
+  if (twice_first % 2 != 0) {
+    in *= 2;
+    out *= 2;
+    twice_first *= 2;
+  }
   Axis axis;
-  const int common = std::gcd(from, to);
-  const int in = from / common;
-  const int out = to / common;
-  for (int i = 0; i < to; ++i) {
+  axis.total = static_cast<std::uint32_t>(in);
+  // In units of 1/out of an input pixel: output i covers [begin, begin + in), input j [j * out, (j + 1) * out).
+  for (int i = 0, begin = twice_first / 2; i < to; ++i, begin += in) {
     axis.begin.push_back(axis.taps.size());
-    if (out <= in) {
-      // In units of 1/out of an input pixel: output i covers [i * in, (i + 1) * in), input j [j * out, (j + 1) * out).
-      for (int j = i * in / out; j * out < (i + 1) * in; ++j) {
-        const int overlap = std::min((i + 1) * in, (j + 1) * out) - std::max(i * in, j * out);
-        axis.taps.push_back({j, static_cast<std::uint16_t>(overlap)});
-      }
-    } else {
-      // The output's centre in units of 1/(2 out) of an input pixel, counted from the centre of input 0.
-      const int centre = (2 * i + 1) * in - out;
-      const int below = centre < 0 ? -1 : centre / (2 * out);
-      const int weight = centre - below * 2 * out;
-      const auto place = [&](int j) { return wrap ? wrapped(j, from) : std::clamp(j, 0, from - 1); };
-      axis.taps.push_back({place(below), static_cast<std::uint16_t>(2 * out - weight)});
-      axis.taps.push_back({place(below + 1), static_cast<std::uint16_t>(weight)});
+    for (int j = std::max(begin, 0) / out; j < from && j * out < begin + in; ++j) {
+      const int overlap = std::min(begin + in, (j + 1) * out) - std::max(begin, j * out);
+      axis.taps.push_back({j, static_cast<std::uint16_t>(overlap)});
     }
   }
   axis.begin.push_back(axis.taps.size());
-  axis.total = static_cast<std::uint32_t>(out <= in ? in : 2 * out);
+  return axis;
+}
+
+Resizer::Axis Resizer::interpolations(int from, int to, int in, int out, bool wrap) {
+  Axis axis;
+  axis.total = static_cast<std::uint32_t>(2 * out);
+  const auto place = [&](int j) { return wrap ? wrapped(j, from) : std::clamp(j, 0, from - 1); };
+  for (int i = 0; i < to; ++i) {
+    axis.begin.push_back(axis.taps.size());
+    // The output's centre in units of 1/(2 out) of an input pixel, counted from the centre of input 0.
+    const int centre = (2 * i + 1 - to) * in + (from - 1) * out;
+    if (centre < -out || centre >= (2 * from - 1) * out) continue;
+    const int below = centre < 0 ? -1 : centre / (2 * out);
+    const int weight = centre - below * 2 * out;
+    axis.taps.push_back({place(below), static_cast<std::uint16_t>(2 * out - weight)});
+    axis.taps.push_back({place(below + 1), static_cast<std::uint16_t>(weight)});
+  }
+  axis.begin.push_back(axis.taps.size());
   return axis;
 }
 

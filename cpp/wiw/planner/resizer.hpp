@@ -8,12 +8,18 @@
 
 namespace wiw {
 
-/// Resizes three-channel bytes, each axis for itself: by area average where the image shrinks, linearly (pixel centres
-/// at half integers) where it grows. Weights are exact fractions, so the result is the true mean, rounded.
+/// What stays when an image is resized.
+enum class Keep {
+  kSphere,     // everything: each axis for itself, and columns close to a circle
+  kDirection,  // width and middle, on square pixels: rows are cut off or, where there are none, black
+};
+
+/// Resizes three-channel bytes: by area average where the image shrinks, linearly (pixel centres at half integers)
+/// where it grows. Weights are exact fractions, so the result is the true mean, rounded.
 class Resizer {
  public:
-  /// With `wrap` the columns close to a circle, as in a panorama. Throws ArgumentError for empty sizes.
-  Resizer(Size from, Size to, bool wrap);
+  /// Throws ArgumentError for empty sizes.
+  Resizer(Size from, Size to, Keep keep);
 
   /// Columns of `source` are read as if it had been rolled to the right by `shift` in [0, width). Safe to call from
   /// several threads.
@@ -33,7 +39,10 @@ class Resizer {
     std::vector<std::size_t> begin;
     std::uint32_t total = 0;
   };
-  static Axis make_axis(int from, int to, bool wrap);
+  /// `in` of the `from` input pixels become `out` of the `to` output pixels, and the middle stays the middle.
+  static Axis make_axis(int from, int to, int in, int out, bool wrap);
+  static Axis averages(int from, int to, int in, int out);
+  static Axis interpolations(int from, int to, int in, int out, bool wrap);
 
   Size from_;
   Size to_;

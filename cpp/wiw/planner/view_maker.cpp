@@ -39,8 +39,9 @@ const panorama::PerspectivePlan& ViewMaker::plan(Size size) const {
 
 const Resizer& ViewMaker::resizer(Size size) const {
   const std::scoped_lock lock(mutex_);
+  const Keep keep = spec_.kind == ViewKind::kPanorama ? Keep::kSphere : Keep::kDirection;
   auto& resizer = resizers_[{size.height, size.width}];
-  if (!resizer) resizer = std::make_unique<Resizer>(size, spec_.size, spec_.kind == ViewKind::kPanorama);
+  if (!resizer) resizer = std::make_unique<Resizer>(size, spec_.size, keep);
   return *resizer;
 }
 

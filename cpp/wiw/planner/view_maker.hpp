@@ -42,8 +42,9 @@ class ViewMaker {
 
   /// Views of a panorama after a left turn by `yaw` radians. Throws ArgumentError for a size no panorama has.
   void from_panorama(const std::uint8_t* panorama, Size size, double yaw, std::uint8_t* out) const;
-  /// A perspective frame (HFOV 90 degrees) as the front view. Throws ArgumentError where the spec asks for more than
-  /// such a frame shows.
+  /// A perspective frame (HFOV 90 degrees, square pixels) as the front view: each pixel shows the frame in its own
+  /// direction, and black above and below a frame that is wider than the view. Throws ArgumentError for views that are
+  /// not the front in 90 degrees.
   void from_perspective(const std::uint8_t* frame, Size size, std::uint8_t* out) const;
   /// Depth of the first view after a left turn: distances float [H, W] in a panorama become float [height, width],
   /// planar z in perspective views, distances in panoramas. Nearest pixels, since depths do not blend over edges.

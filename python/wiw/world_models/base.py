@@ -63,7 +63,8 @@ def accepts(
     Args:
         control: which member of `Control` the model reads: "image" (none), "text", "trajectory", "viewpoint", "action".
         view: "perspective" (HFOV 90 front view) or "panorama" (equirectangular).
-        size: (height, width) of its input and output; default 480x480 or 576x1024.
+        size: (height, width) of its input and output; default 480x480 or 576x1024. A perspective view of any shape is
+            90 degrees wide and has square pixels: what a wide one does not reach of an agent's view is black there.
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
         space: "discrete" primitives or "pose7" poses; an agent says so where it cannot give them.
         needs: any of "depth", "semantic", "history", likewise; "simulator" is for `oracle` alone.

@@ -35,7 +35,7 @@ class RunwayGen4(WorldModel):
     Args:
         model: "gen4_turbo", or "gen4.5".
         duration: seconds of a clip, 2 to 10; each costs credits.
-        size: (height, width) of input and output; the service makes 960x960 of it.
+        size: (height, width) of input and output, which are square; the service makes 960x960 of it.
         frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
         batch: rows that are begun at once.
         budget: credits after which nothing more is begun; None is without end.
@@ -73,6 +73,8 @@ class RunwayGen4(WorldModel):
                 f"{self.batch}, {self.poll} and {self.patience}"
             )
         self.size = (int(self.size[0]), int(self.size[1]))
+        if self.size[0] != self.size[1]:
+            raise ArgumentError(f"RunwayGen4: clips are square, 960x960: expected such a size, got {self.size}")
         self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
         devices.require(self.requires)
         self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)

@@ -45,8 +45,8 @@ class VideoModel(WorldModel):
         offload: "model" keeps on the GPU only the network at work, "sequential" only the layer: less memory, slower.
         steps: denoising steps.
         guidance: scale of classifier-free guidance.
-        size: (height, width) of input and output; rounded to what the networks can divide. The agent's front view is
-            square, and another shape is stretched to it.
+        size: (height, width) of input and output; rounded to what the networks can divide. A front view is 90 degrees
+            wide whatever its shape: a wide one shows less above and below, which stays black in the agent's view.
         frames: of a clip, the observation included; rounded up to what the autoencoder can divide.
         batch: rows in one call of the pipeline.
 
