@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
+Space = Literal["discrete", "pose7"]
+"""What plans are made of: primitives, or poses of a gripper (x, y, z, roll, pitch, yaw, gripper)."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,23 @@ def _boxed(observation: Observation, target: Target) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
+class ArmObservation:
+    """What a manipulator perceives; its goals are in words and its plans are poses."""
+
+    front: NDArray[np.uint8]
+    """uint8 [480, 480, 3]: the fixed camera in front of the table."""
+    pose: NDArray[np.float64]
+    """float64 [7]: of the gripper, in the world's frame; `docs/conventions.md` has axes and units."""
+    depth: NDArray[np.float32] | None = None
+    """float32 [480, 480] planar z in metres of the front view, 0 where nothing is hit; None unless asked for."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The observation as gymnasium spaces see it; `depth` only where present."""
+        values: dict[str, Any] = {"front": self.front, "pose": self.pose}
+        return values if self.depth is None else {**values, "depth": self.depth}
+
+
+@dataclass(frozen=True)
 class Goal:
     """What the task asks of the agent. `image` is set for image goals, `text` for questions and instructions."""
 
@@ -138,15 +157,18 @@ class Wording:
 
 @dataclass(frozen=True)
 class Proposal:
-    """One candidate plan: primitive ids int8 [K], 1 <= K <= horizon."""
+    """One candidate plan: primitive ids int8 [K] or gripper poses float64 [K, 7], 1 <= K <= horizon."""
 
-    actions: NDArray[np.int8]
+    actions: NDArray[Any]
     prior: float = 0.0
     """The proposing policy's own preference; higher is better."""
     note: str = ""
+    text: str = ""
+    """The plan in the policy's words, for world models that read text; only of plans made of poses."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "actions", np.asarray(self.actions, np.int8))
+        actions = np.asarray(self.actions)
+        object.__setattr__(self, "actions", actions.astype(np.float64 if actions.ndim == 2 else np.int8, copy=False))
 
 
 @dataclass(frozen=True)
@@ -158,7 +180,7 @@ class Control:
     """
 
     actions: NDArray[np.int8]
-    """int8 [K] primitive ids, padded to the model's frames - 1."""
+    """int8 [K] primitive ids, padded to the model's frames - 1; null tokens where the plan is made of poses."""
     trajectory: NDArray[np.float64]
     """float64 [K, 3]: x forward, y left, azimuth, in the frame of frame 0."""
     viewpoints: NDArray[np.float64]
@@ -166,7 +188,8 @@ class Control:
     text: str = ""
     ids: NDArray[np.generic] | None = None
     """[K] or [K + 1] ids or vectors in the model's own vocabulary (else primitive ids), null token in front where it
-    needs one; None unless the model reads actions."""
+    needs one; float64 [K + 1, 7] gripper poses in space "pose7", that of frame 0 in front; None unless the model reads
+    actions."""
     length: int = 0
     """Actions that are the agent's own; the rest is padding."""
     shared: int = 0
@@ -243,8 +266,8 @@ class Exchange:
 class Decision:
     """The outcome of one pass through propose, imagine, revise, with all evidence kept."""
 
-    actions: NDArray[np.int8]
-    """The plan that was chosen or written anew, int8 [K]."""
+    actions: NDArray[Any]
+    """The plan that was chosen or written anew: int8 [K], or float64 [K, 7] gripper poses."""
     execute: int
     """How many of `actions` are carried out before the next decision."""
     proposals: tuple[Proposal, ...]
@@ -252,7 +275,7 @@ class Decision:
     scores: NDArray[np.float64] | None = None
     chosen: int | None = None
     """Index into `proposals`; None when the reviser wrote a new plan."""
-    observation: Observation | None = None
+    observation: Observation | ArmObservation | None = None
     goal: Goal | None = None
     key: Key | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -315,8 +338,8 @@ class DecisionRecord:
     index: int
     """0 for the first decision of the episode."""
     decision: Decision
-    executed: NDArray[np.int8]
-    """Primitives that were carried out (fewer than planned when the episode ended on the way)."""
+    executed: NDArray[Any]
+    """What was carried out of the plan (less than planned when the episode ended on the way)."""
     before: Truth
     after: Truth
     path: NDArray[np.float64]

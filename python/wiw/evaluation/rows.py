@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.types import Answer, DecisionRecord, EpisodeResult, Fidelity, Truth
+from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fidelity, Truth
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
@@ -30,7 +30,7 @@ class DecisionRow:
     values: dict[str, Any]
     """The other columns by name."""
     images: dict[str, bytes]
-    """JPEG by name: "panorama", "goal", "imagined/0" and so on."""
+    """JPEG by name: "panorama" ("front" of a manipulator), "goal", "imagined/0" and so on."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,8 @@ def _truth(when: str, truth: Truth) -> dict[str, float]:
 def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     decision = record.decision
     if decision.observation is not None:
-        yield "panorama", encode_jpeg(decision.observation.as_dict()["panorama"])
+        name = "front" if isinstance(decision.observation, ArmObservation) else "panorama"
+        yield name, encode_jpeg(decision.observation.as_dict()[name])
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:
         yield "goal", encode_jpeg(decision.goal.image)
     for index, rollout in enumerate(decision.rollouts or ()):

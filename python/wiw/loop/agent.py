@@ -18,6 +18,7 @@ from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.contract import (
+    PLANS,
     check_answerer,
     check_model,
     check_proposals,
@@ -26,14 +27,15 @@ from wiw.loop.contract import (
     checked_scores,
 )
 from wiw.loop.fidelity import remembered, replay
-from wiw.loop.imagine import Imagination, imagine, model_spec
+from wiw.loop.imagine import Imagination, model_spec
+from wiw.loop.imagine_poses import IMAGINE, PoseImagination
 from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
 from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.types import Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout
+from wiw.types import ArmObservation, Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout
 from wiw.world_models.base import WorldModel
 
 _CONSULT = 0x636F6E73
@@ -44,7 +46,7 @@ _CONSULT = 0x636F6E73
 class Query:
     """One live episode that asks for a decision."""
 
-    observation: Observation
+    observation: Observation | ArmObservation
     goal: Goal
     key: Key
     simulator: Any = None
@@ -74,8 +76,8 @@ class _Life:
     proposer: Any
     """Memory of the proposing policy; the reviser's too where one policy is both."""
     reviser: Any
-    executed: list[int]
-    """Primitives of all decisions so far, as far as they were to be carried out."""
+    executed: list[Any]
+    """Actions of all decisions so far, as far as they were to be carried out."""
 
 
 class Agent:
@@ -142,9 +144,14 @@ class Agent:
         self.given = {name: value for name, value in numbers.items() if value is not None}
         """The numbers that were not left to the task."""
         self.policy: Policy = POLICIES.make(policy)
-        self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model)
+        self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model).for_space(self.policy.space)
         self._given_revision = revision
         self.revision: Policy = self._reviser(revision)
+        if self.revision.space != self.policy.space:
+            raise ArgumentError(
+                f"Agent: {type(self.policy).__name__} plans in {PLANS[self.policy.space]}, but the reviser "
+                f"{type(self.revision).__name__} in {PLANS[self.revision.space]}"
+            )
         self.candidates = 3 if candidates is None else candidates
         self.horizon = 5 if horizon is None else horizon
         self.execute = max(1, self.horizon - 2) if execute is None else execute
@@ -171,10 +178,12 @@ class Agent:
         self._limits |= {"fidelity": fidelity, "lpips": lpips}
         self.fidelity = (fidelity or lpips is not None) and self.model is not None
         self._lpips = None if lpips is None or not self.fidelity else Lpips(lpips)
+        if placebo == "shuffled" and self.policy.space == "pose7":
+            raise ArgumentError("Agent: placebo='shuffled' deals primitives anew, and poses are none; use 'swapped'")
         self._ask: Asking | None = None
         if self.model is not None:
             self._ask = remember(Attempts(self.model, deadline), cache, cache_gb)
-            check_model(self.model, self.horizon * self.depth)
+            check_model(self.model, self.horizon * self.depth, self.policy.space)
             if self.depth > 1:
                 self._check_depth(self.model)
         self._lives: dict[tuple[int, int], _Life] = {}
@@ -326,6 +335,7 @@ class Agent:
             imagined, scores = self._look_ahead(ask, queries, revising, beams, clock)
             if last:
                 break
+            assert isinstance(imagined, Imagination)  # of poses there is one level
             with clock("propose"):
                 beams.extend(self.policy, imagined, scores, self.candidates, self.horizon)
         found: list[Fidelity | None] = [None] * len(queries)
@@ -342,14 +352,14 @@ class Agent:
         revising: Sequence[Situation],
         beams: Beams,
         clock: Clock,
-    ) -> tuple[Imagination, list[NDArray[np.float64]]]:
+    ) -> tuple[Imagination | PoseImagination, list[NDArray[np.float64]]]:
         """Imagines and scores the plans of one level."""
         plans: Sequence[Sequence[Proposal]] = beams.proposals
         if self.placebo == "shuffled":
             spec = model_spec(ask.model.accepts)
             plans = [shuffled(own, query.key, spec) for own, query in zip(plans, queries, strict=True)]
         seen = [_stranger(query) for query in queries] if self.placebo == "swapped" else None
-        imagined = imagine(ask, queries, plans, beams.origins, self.revision.frames, clock, seen)
+        imagined = IMAGINE[self.policy.space](ask, queries, plans, beams.origins, self.revision.frames, clock, seen)
         beams.spend(imagined.calls)
         with clock("revise"):
             scores = self.revision.score(revising, beams.proposals, imagined.rollouts)
@@ -357,6 +367,8 @@ class Agent:
         return imagined, true_scores(queries, beams.proposals) if "scoring" in self.swaps else found
 
     def _check_depth(self, model: WorldModel) -> None:
+        if self.policy.space == "pose7":
+            raise ArgumentError(f"Agent: depth={self.depth} proposes from imagined places, and a gripper sees none")
         if model.accepts.view != "panorama":
             raise ArgumentError(
                 f"Agent: depth={self.depth} proposes from imagined panoramas, but {type(model).__name__} imagines the "

@@ -39,13 +39,14 @@ class Beams:
         self.calls: list[Counter[str]] = [Counter() for _ in proposals]
         """What all levels so far have cost each episode."""
         self._situations = situations
-        self._search = planner.BeamSearch(width, depth)
-        self._search.ask([[plan.actions for plan in plans] for plans in proposals])
+        self._search = None if depth == 1 else planner.BeamSearch(width, depth)
+        if self._search is not None:
+            self._search.ask([[plan.actions for plan in plans] for plans in proposals])
 
     @property
     def level(self) -> int:
         """The present level, from 1."""
-        return int(self._search.level) + 1
+        return 1 if self._search is None else int(self._search.level) + 1
 
     def spend(self, calls: Sequence[Mapping[str, int]]) -> None:
         """Adds what a level has cost each episode."""
@@ -59,6 +60,7 @@ class Beams:
 
         The prior of a longer plan is the sum of its parts'.
         """
+        assert self._search is not None  # one level is not extended
         kept = [[int(c) for c in order] for order in self._search.tell(scores)]
         going = [(e, c) for e, order in enumerate(kept) for c in order if STOP not in self.proposals[e][c].actions]
         more = policy.extend(self._at_ends(imagined, going), candidates, horizon) if going else []
@@ -83,7 +85,7 @@ class Beams:
             here = self._situations[e]
             actions = self.proposals[e][c].actions
             odometry = moved(here.observation.odometry, actions)
-            seed = core.fold_key([here.key.seed, self._search.level, c])
+            seed = core.fold_key([here.key.seed, self.level - 1, c])
             key = Key(seed, here.key.episode, here.key.decision)
             executed = (*here.executed, *actions.tolist())
             there.append(Situation(Observation(panorama, front, odometry), here.goal, key, here.memory, executed))

@@ -12,25 +12,31 @@ from numpy.typing import NDArray
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError
 from wiw.policies.base import Policy, Situation
-from wiw.types import Answer, Goal, Proposal
-from wiw.world_models.base import WorldModel
+from wiw.types import Answer, Goal, Proposal, Space
+from wiw.world_models.base import Accepts, WorldModel
 from wiw.world_models.oracle import Oracle
 
 PRIMITIVES = frozenset(map(int, (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)))
 GIVEN = ("depth", "simulator")
 """What the loop can give a world model beyond the image."""
+PLANS = {"discrete": "discrete primitives", "pose7": "poses of a gripper"}
+"""By space, in words."""
 
 
-def check_model(model: WorldModel, longest: int) -> None:
-    """Refuses a world model that asks for what it would not be given; plans have up to `longest` primitives.
+def check_model(model: WorldModel, longest: int, space: Space = "discrete") -> None:
+    """Refuses a world model that asks for what it would not be given; plans have up to `longest` actions of a space.
 
     Raises:
-        ArgumentError: poses instead of primitives, needs that nobody meets, the simulator for another than `Oracle`, or
-            too few frames for a model that cannot go on from an imagined one.
+        ArgumentError: poses instead of primitives or the other way round, panoramas where there are none, needs that
+            nobody meets, the simulator for another than `Oracle`, or too few frames for a model that cannot go on from
+            an imagined one.
     """
     accepts, name = model.accepts, type(model).__name__
-    if accepts.space != "discrete":
-        raise ArgumentError(f"{name} takes space='{accepts.space}', but this agent plans in discrete primitives")
+    follows = accepts.control not in ("image", "text")  # those know nothing of primitives or poses
+    if follows and accepts.space != space:
+        raise ArgumentError(f"{name} takes space='{accepts.space}', but this agent plans in {PLANS[space]}")
+    if space == "pose7":
+        _check_front(accepts, name)
     if missing := [need for need in accepts.needs if need not in GIVEN]:
         raise ArgumentError(f"{name} needs {', '.join(missing)}, but a model can be given {', '.join(GIVEN)}")
     if "simulator" in accepts.needs and not isinstance(model, Oracle):
@@ -38,18 +44,26 @@ def check_model(model: WorldModel, longest: int) -> None:
             f"{name} needs the simulator, which is handed to the oracle alone: it knows where the agent truly is. "
             "Declare what the model sees of the world instead (needs=('depth',)), or derive it from wiw's Oracle"
         )
-    if accepts.needs and accepts.frames and longest > accepts.frames - 1:
+    if space == "discrete" and accepts.needs and accepts.frames and longest > accepts.frames - 1:
         raise ArgumentError(
             f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(accepts.needs)}, which an "
             f"imagined frame does not have, but plans have up to {longest}; lower horizon or depth, or raise frames"
         )
 
 
+def _check_front(accepts: Accepts, name: str) -> None:
+    """Poses are planned before one fixed camera."""
+    if accepts.control not in ("image", "text", "action"):
+        raise ArgumentError(f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none")
+    if accepts.view != "perspective":
+        raise ArgumentError(f"{name} imagines panoramas, but what a gripper does is seen in a front view")
+
+
 def check_proposals(policy: Any, proposals: Any, episodes: int, most: int, horizon: int) -> None:
-    """Holds `propose` and `extend` to at most `most` plans of 1 to `horizon` primitives for each episode.
+    """Holds `propose` and `extend` to at most `most` plans of 1 to `horizon` actions for each episode.
 
     Raises:
-        ContractError: another count, length or primitive.
+        ContractError: another count, length or action.
     """
     name = f"{type(policy).__name__}.propose"
     if not isinstance(proposals, Sequence) or len(proposals) != episodes:
@@ -60,25 +74,35 @@ def check_proposals(policy: Any, proposals: Any, episodes: int, most: int, horiz
         for plan in plans:
             if not isinstance(plan, Proposal):
                 raise ContractError(f"{name}: expected wiw.types.Proposal, got {type(plan).__name__}")
-            _check_plan(name, plan.actions, horizon)
+            _check_plan(name, plan.actions, horizon, policy.space)
 
 
-def checked_plan(policy: Any, actions: Any, longest: int) -> NDArray[np.int8]:
-    """The plan that `revise` decided for, int8 [K].
+def checked_plan(policy: Any, actions: Any, longest: int) -> NDArray[Any]:
+    """The plan that `revise` decided for, int8 [K] or float64 [K, 7].
 
     Raises:
-        ContractError: no primitives, more than `longest`, or unknown ones.
+        ContractError: no actions, more than `longest`, or unknown ones.
     """
     plan = np.asarray(actions)
-    _check_plan(f"{type(policy).__name__}.revise", plan, longest)
-    return plan.astype(np.int8)
+    _check_plan(f"{type(policy).__name__}.revise", plan, longest, policy.space)
+    return plan.astype(np.int8 if policy.space == "discrete" else np.float64)
 
 
-def _check_plan(name: str, actions: NDArray[Any], horizon: int) -> None:
+def _check_plan(name: str, actions: NDArray[Any], horizon: int, space: Space) -> None:
+    if space == "pose7":
+        _check_poses(name, actions, horizon)
+        return
     if actions.ndim != 1 or not 1 <= len(actions) <= horizon:
         raise ContractError(f"{name}: expected plans of 1 to {horizon} primitives, got shape {actions.shape}")
     if unknown := set(actions.tolist()) - PRIMITIVES:
         raise ContractError(f"{name}: expected primitives among {sorted(PRIMITIVES)}, got {sorted(unknown)}")
+
+
+def _check_poses(name: str, poses: NDArray[Any], horizon: int) -> None:
+    if poses.ndim != 2 or poses.shape[1] != 7 or not 1 <= len(poses) <= horizon:
+        raise ContractError(f"{name}: expected plans of 1 to {horizon} poses, float [K, 7], got shape {poses.shape}")
+    if not np.isfinite(poses).all() or not ((poses[:, 6] >= 0) & (poses[:, 6] <= 1)).all():
+        raise ContractError(f"{name}: expected finite poses with a gripper from 0 to 1, got {poses.tolist()}")
 
 
 def checked_scores(policy: Any, scores: Any, proposals: Sequence[Sequence[Proposal]]) -> list[NDArray[np.float64]]:

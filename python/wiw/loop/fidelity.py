@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
 from wiw.loop.contract import checked_scores
-from wiw.loop.imagine import Imagination, imagine
+from wiw.loop.imagine import Imagination
+from wiw.loop.imagine_poses import IMAGINE, PoseImagination
 from wiw.metrics import Lpips, psnr, ssim
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.types import Fidelity, Proposal, Rollout
@@ -43,7 +44,7 @@ def replay(
     queries: Sequence[Any],
     situations: Sequence[Situation],
     proposals: Sequence[Sequence[Proposal]],
-    imagined: Imagination,
+    imagined: Imagination | PoseImagination,
     scores: Sequence[NDArray[np.float64]],
     lpips: Lpips | None = None,
 ) -> list[Fidelity]:
@@ -51,7 +52,8 @@ def replay(
     first = imagined.rollouts[0][0]
     view = FrameSpec(first.view, (first.frames.shape[-3], first.frames.shape[-2]))
     origins = [range(len(plans)) for plans in proposals]
-    true = imagine(Attempts(Oracle(), math.inf), queries, proposals, origins, view, Clock())
+    oracle = Attempts(Oracle().for_space(reviser.space), math.inf)
+    true = IMAGINE[reviser.space](oracle, queries, proposals, origins, view, Clock())
     true_scores = checked_scores(reviser, reviser.score(situations, proposals, true.rollouts), proposals)
     distances = [None] * len(queries) if lpips is None else _distances(lpips, imagined, true)
     rows = zip(imagined.rollouts, true.rollouts, scores, true_scores, distances, strict=True)
@@ -89,7 +91,7 @@ def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
     return float(np.mean(psnr(frames, truth, weights=weights))), float(np.mean(ssim(frames, truth, weights=weights)))
 
 
-def _distances(lpips: Lpips, imagined: Imagination, true: Imagination) -> list[NDArray[np.float64]]:
+def _distances(lpips: Lpips, imagined: Any, true: Any) -> list[NDArray[np.float64]]:
     """Mean LPIPS over the frames of each plan that were imagined, float64 [M] an episode; NaN without any."""
     view = FrameSpec("front" if imagined.view == "perspective" else "surround", PERSPECTIVE)
     return [

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Answer, Exchange, Goal, Key, Observation, Proposal, Rollout
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,14 @@ class FrameSpec:
 class Situation:
     """One live episode at the moment of a decision, as a policy may know it."""
 
-    observation: Observation
+    observation: Any
+    """`Observation`, or `ArmObservation` for a policy that plans in poses."""
     goal: Goal
     key: Key
     memory: Any
     """What `Policy.begin` returned for this episode; the policy may change it."""
-    executed: tuple[int, ...] = ()
-    """Primitives carried out since the episode began."""
+    executed: tuple[Any, ...] = ()
+    """Primitives, or poses, of all decisions since the episode began."""
     imagines: bool = True
     """Whether a world model is asked about the plans proposed now. Where none is, no more than one plan is of use to a
     policy that takes its first."""
@@ -49,6 +50,8 @@ class Policy(ABC):
     All calls are batched over the live episodes. Randomness must be drawn from `situation.key` alone.
     """
 
+    space: Space = "discrete"
+    """What its plans are made of: "discrete" primitives, or "pose7" poses of a gripper."""
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it."""
     frames: FrameSpec = FrameSpec()
@@ -67,7 +70,7 @@ class Policy(ABC):
 
     @abstractmethod
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """At most `candidates` plans of at most `horizon` primitives for each episode, best first."""
+        """At most `candidates` plans of at most `horizon` actions for each episode, best first."""
         raise NotImplementedError
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
@@ -93,7 +96,7 @@ class Policy(ABC):
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int8], int | None]:
+    ) -> tuple[NDArray[Any], int | None]:
         """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
         best = int(np.argmax(scores))
         return proposals[best].actions, best

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.types import Conditioning, Control, ControlKind, View
+from wiw.types import Conditioning, Control, ControlKind, Space, View
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
@@ -30,7 +30,7 @@ class Accepts:
     """A world model's declaration, read by the loop; made by `wiw.accepts(...)`, which checks it."""
 
     control: ControlKind
-    space: str
+    space: Space
     view: View
     size: tuple[int, int]
     frames: int
@@ -49,7 +49,7 @@ def accepts(
     size: tuple[int, int] | None = None,
     frames: int = 0,
     *,
-    space: str = "discrete",
+    space: Space = "discrete",
     needs: Sequence[str] = (),
     causal: bool = False,
     best_batch: int = 8,
@@ -161,6 +161,10 @@ class WorldModel(ABC):
             uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation.
         """
         raise NotImplementedError
+
+    def for_space(self, space: Space) -> WorldModel:
+        """The model for plans of primitives or of poses, where it is asked with both. Default: itself."""
+        return self
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest: the class and its options.

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, Space
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -17,6 +17,10 @@ class Copy(WorldModel):
 
     accepts = accepts(control="image", view="panorama", causal=True, best_batch=64)
 
+    def for_space(self, space: Space) -> WorldModel:
+        """The front view, repeated, where plans are poses."""
+        return self if space == "discrete" else CopyFront()
+
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
@@ -24,3 +28,9 @@ class Copy(WorldModel):
         frames = 1 + len(controls[0].actions)
         image = observations.image
         return np.broadcast_to(image[:, None], (len(image), frames, *image.shape[1:]))
+
+
+class CopyFront(Copy):
+    """The same before the fixed camera of a manipulator."""
+
+    accepts = accepts(control="image", view="perspective", causal=True, best_batch=64)

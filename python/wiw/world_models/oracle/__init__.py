@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, Space
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -20,6 +20,10 @@ class Oracle(WorldModel):
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+
+    def for_space(self, space: Space) -> WorldModel:
+        """The fork of a manipulator's world, where plans are poses."""
+        return self if space == "discrete" else ArmOracle()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -41,4 +45,23 @@ class Oracle(WorldModel):
                 pictures = np.empty((len(views), *image.shape[1:]), np.uint8)
                 renderers[name].panorama(np.stack(poses), image.shape[1:3], pictures, None, None)
                 frames[list(rows), list(steps)] = pictures
+        return frames
+
+
+class ArmOracle(Oracle):
+    """The same where plans are poses: a fork of the physics goes to each of them, one after another."""
+
+    accepts = accepts(control="action", space="pose7", view="perspective", needs=("simulator",), best_batch=64)
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """True front views after each pose."""
+        assert observations.simulators is not None
+        image = observations.image
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
+        frames[:, 0] = image
+        for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
+            assert control.ids is not None
+            frames[row, 1:] = simulator.fork().fronts_after(control.ids[1:], image.shape[1:3])
         return frames

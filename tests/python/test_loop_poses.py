@@ -1,0 +1,285 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop with plans of poses: a task without a world, in which a gripper is a dot that goes to a square."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw._core import core
+from wiw.action import NULL, resample
+from wiw.errors import ArgumentError, ContractError
+from wiw.evaluation.evaluate import evaluate
+from wiw.loop.agent import Query
+from wiw.loop.attempts import Attempts
+from wiw.loop.clock import Clock
+from wiw.loop.imagine_poses import imagine_poses
+from wiw.policies.base import FrameSpec
+from wiw.types import ArmObservation, Episode, Goal, Key, Proposal, Truth
+
+SIDE = 48
+HOME = (0.5, 0.5, 0.5, 0, 0, 0, 1)
+
+
+def picture(pose: Any, target: Any) -> Any:
+    """The dot, as red as the gripper is high, on the square."""
+    image = np.full((SIDE, SIDE, 3), 40, np.uint8)
+    for (x, y), size, colour in ((target, 4, (0, 255, 0)), (pose[:2], 2, (55 + int(200 * pose[2]), 0, 0))):
+        u, v = round(x * (SIDE - 1)), round(y * (SIDE - 1))
+        image[max(0, v - size) : v + size + 1, max(0, u - size) : u + size + 1] = colour
+    return image
+
+
+@dataclass
+class Fork:
+    pose: Any
+    target: Any
+
+    def fork(self) -> Fork:
+        return Fork(self.pose, self.target)
+
+    def fronts_after(self, poses: Any, size: Any) -> Any:
+        assert size == (480, 480)
+        return np.stack([np.kron(picture(pose, self.target), np.ones((10, 10, 1), np.uint8)) for pose in poses])
+
+
+@dataclass
+class Outcome:
+    observation: ArmObservation
+    executed: Any
+    path: Any
+    terminated: bool
+    truncated: bool
+
+
+class DotEnv:
+    def __init__(self, task: DotTask) -> None:
+        self.task = task
+
+    def begin(self, episode: Episode) -> ArmObservation:
+        self.target, self.pose, self.decisions = np.array(episode.goal_position[:2]), np.array(HOME, float), 0
+        self.goal = Goal("dot", text="go to the green square")
+        return self._observe()
+
+    def fork(self) -> Fork:
+        return Fork(self.pose, self.target)
+
+    def run(self, plan: Any) -> Outcome:
+        before, self.decisions = self.pose, self.decisions + 1
+        self.pose = plan[-1]
+        done = self._left() < 0.05
+        path = np.stack([before[:3], *plan[:, :3]])
+        return Outcome(self._observe(), plan, path, done, not done and self.decisions >= self.task.budget)
+
+    def truth(self) -> Truth:
+        return Truth(self.pose[:3], 0.0, self._left(), float("nan"))
+
+    def result(self) -> dict[str, float]:
+        return {"success": float(self._left() < 0.05), "actions": float(self.decisions)}
+
+    def close(self) -> None:
+        pass
+
+    def _left(self) -> float:
+        return float(np.linalg.norm(self.pose[:2] - self.target))
+
+    def _observe(self) -> ArmObservation:
+        return ArmObservation(np.kron(picture(self.pose, self.target), np.ones((10, 10, 1), np.uint8)), self.pose)
+
+
+@dataclass
+class DotTask:
+    seed: int = 0
+    budget: int = 6
+    name: str = "dot"
+    metrics: tuple[str, ...] = ("success", "mean_trajectory")
+    defaults: dict[str, int] = field(default_factory=lambda: {"candidates": 5, "horizon": 5, "execute": 5})
+
+    def describe(self) -> dict[str, Any]:
+        return {"task": self.name, "seed": self.seed}
+
+    def environment(self, depth: bool = False) -> DotEnv:
+        return DotEnv(self)
+
+    def episodes(self, count: int) -> list[Episode]:
+        places = 0.1 + 0.8 * core.uniform(core.fold_key([self.seed, 9]), 2 * count).reshape(-1, 2)
+        return [
+            Episode(f"{i:02d}", f"table/{i}", (0.5, 0.5, 0.0), 0.0, (float(x), float(y), 0.0), 0.0, float("nan"))
+            for i, (x, y) in enumerate(places)
+        ]
+
+
+class Reacher(wiw.Policy):
+    """Steps in five drawn directions; likes futures in which red is near green."""
+
+    space = "pose7"
+    frames = FrameSpec("front", (96, 96))
+
+    def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+        return [[self._plan(s, candidate, horizon) for candidate in range(candidates)] for s in situations]
+
+    def _plan(self, situation: Any, candidate: int, horizon: int) -> Proposal:
+        key = situation.key
+        drawn = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), 2)
+        end = np.array([*drawn, *HOME[2:]])
+        return Proposal(resample(end[None], horizon, start=situation.observation.pose), text=f"towards {drawn}")
+
+    def score(self, situations: Any, proposals: Any, rollouts: Any) -> Any:
+        return [np.array([-self._distance(rollout.frames[-1]) for rollout in plans]) for plans in rollouts]
+
+    def _distance(self, image: Any) -> float:
+        red, green = (np.argwhere(image[:, :, channel] > 128).mean(axis=0) for channel in (0, 1))
+        return float(np.linalg.norm(red - green))
+
+
+class Spy(wiw.WorldModel):
+    """Remembers what it is asked; frame k is as grey as k."""
+
+    accepts = wiw.accepts(control="action", space="pose7", view="perspective", size=(32, 32), frames=14, best_batch=3)
+
+    def __init__(self, **declared: Any) -> None:
+        self._calls: list[Any] = []
+        if declared:
+            self.accepts = wiw.accepts(**{"view": "perspective", "size": (32, 32), **declared})
+
+    def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
+        self._calls.append((observations, controls, seeds))
+        frames = np.arange(len(controls[0].actions) + 1, dtype=np.uint8)[None, :, None, None, None]
+        return np.broadcast_to(frames, (len(controls), frames.shape[1], 32, 32, 3)).copy()
+
+
+def asked(model: Any, plans: Any, episodes: int = 1) -> Any:
+    env = DotEnv(DotTask())
+    queries = []
+    for index, episode in enumerate(DotTask().episodes(episodes)):
+        observation = env.begin(episode)
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
+    proposals = [[Proposal(np.asarray(plan, float), text="to the left") for plan in plans] for _ in queries]
+    origins = [range(len(plans)) for _ in queries]
+    return imagine_poses(Attempts(model), queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+
+
+def plan_of(count: int, end: float = 1.0) -> Any:
+    return resample(np.array([[end, *HOME[1:]]]), count, start=np.array(HOME, float))
+
+
+def test_a_plan_is_imagined_at_the_models_length_and_seen_at_its_own_poses() -> None:
+    model = Spy()
+    found = asked(model, [plan_of(5), plan_of(50)])
+    ((_, controls, _),) = model._calls
+    for control in controls:
+        assert control.ids.shape == (14, 7) and control.length == 13 and (control.actions == NULL).all()
+        np.testing.assert_allclose(control.ids[0], HOME)
+        np.testing.assert_allclose(control.ids[:, 0], np.linspace(0.5, 1.0, 14), atol=0.011)
+    short, long = (rollout.frames[:, 0, 0, 0] for rollout in found.rollouts[0])
+    assert short.tolist() == [3, 5, 8, 10, 13]
+    assert len(long) == 50 and long[-1] == 13 and (np.diff(long.astype(int)) >= 0).all()
+    assert found.calls == [{"consultations": 1, "rows": 2, "frames": 26}]
+    assert found.rollouts[0][0].frames.shape == (5, 48, 48, 3) and not found.rollouts[0][0].real.any()
+
+
+def test_a_model_of_any_length_gets_the_plan_itself() -> None:
+    model = Spy(control="action", space="pose7", best_batch=2)
+    asked(model, [plan_of(5), plan_of(3), plan_of(5, 0.7), plan_of(5, 0.2)])
+    assert [[len(c.ids) for c in controls] for _, controls, _ in model._calls] == [[4], [6, 6], [6]]
+    np.testing.assert_array_equal(model._calls[1][1][0].ids[1:], plan_of(5))
+
+
+def test_equal_plans_of_an_episode_are_asked_once() -> None:
+    model = Spy()
+    found = asked(model, [plan_of(5), plan_of(5), plan_of(5, 0.7)], episodes=2)
+    assert [call["rows"] for call in found.calls] == [2, 2]
+    np.testing.assert_array_equal(found.rollouts[0][0].frames, found.rollouts[0][1].frames)
+    seeds = np.concatenate([seeds for _, _, seeds in model._calls])
+    assert len(set(seeds.tolist())) == 4
+
+
+def test_words_are_the_policys_or_made_of_the_poses() -> None:
+    model = Spy(control="text", frames=9)
+    asked(model, [plan_of(5)])
+    ((observations, controls, _),) = model._calls
+    assert controls[0].text == "to the left" and controls[0].ids is None
+    assert observations.image.shape == (1, 32, 32, 3)
+    env = DotEnv(DotTask())
+    query = Query(env.begin(DotTask().episodes(1)[0]), env.goal, Key(0, 0))
+    bare = [[Proposal(plan_of(2))]]
+    imagine_poses(Attempts(model), [query], bare, [[0]], FrameSpec("front", (48, 48)), Clock())
+    assert model._calls[-1][1][0].text == wiw.action.to_text(plan_of(2))
+
+
+def test_choosing_by_imagination_pays(tmp_path: Path) -> None:
+    arms = {
+        name: wiw.Agent(Reacher(), model, placebo=placebo)
+        for name, model, placebo in [
+            ("none", None, None),
+            ("copy", "copy", None),
+            ("oracle", "oracle", None),
+            ("swapped", "oracle", "swapped"),
+        ]
+    }
+    runs = {
+        name: evaluate(DotTask(), agent, 16, out=tmp_path / name, live=5, progress=False)
+        for name, agent in arms.items()
+    }
+    rates = {name: np.mean([e["metrics"]["success"] for e in log.episodes]) for name, log in runs.items()}
+    assert all(e["status"] == "done" for log in runs.values() for e in log.episodes)
+    assert rates["oracle"] > rates["none"] + 0.15 and rates["oracle"] > rates["swapped"] + 0.15
+
+
+def test_records_hold_poses_pictures_and_fidelity(tmp_path: Path) -> None:
+    log = evaluate(DotTask(), wiw.Agent(Reacher(), "copy", fidelity=True), 1, out=tmp_path, progress=False)
+    decision = log.decisions[0]
+    assert np.shape(decision["actions"]) == (5, 7) and decision["calls"]["rows"] == 5
+    assert min(decision["fidelity"]["psnr"]) > 5
+    pictures = log.store.images(log.arms[0], 0, 0)
+    assert set(pictures) == {"front", *(f"{kind}/{plan}" for kind in ("imagined", "true") for plan in range(5))}
+
+
+def test_results_do_not_depend_on_who_else_is_live(tmp_path: Path) -> None:
+    logs = [
+        evaluate(DotTask(), wiw.Agent(Reacher(), "oracle"), 6, out=tmp_path / str(live), live=live, progress=False)
+        for live in (1, 6)
+    ]
+    one, other = ([d["actions"] for d in log.decisions] for log in logs)
+    assert sorted(map(str, one)) == sorted(map(str, other))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"model": "warp"}, "this agent plans in poses of a gripper"),
+        ({"model": Spy(control="action", space="pose7", view="panorama")}, "imagines panoramas"),
+        ({"model": Spy(control="viewpoint", space="pose7")}, "move none"),
+        ({"model": "copy", "depth": 2}, "a gripper sees none"),
+        ({"model": "copy", "placebo": "shuffled"}, "use 'swapped'"),
+        ({"model": "copy", "revision": "heuristic"}, "plans in poses of a gripper, but the reviser"),
+    ],
+)
+def test_what_poses_cannot_have_is_refused(options: Any, said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        wiw.Agent(Reacher(), **options)
+
+
+@pytest.mark.parametrize(
+    ("poses", "said"),
+    [
+        (np.zeros(5), "float \\[K, 7\\]"),
+        (np.zeros((6, 7)), "1 to 5 poses"),
+        (np.full((5, 7), np.nan), "finite"),
+        (np.full((5, 7), 1.5), "gripper from 0 to 1"),
+    ],
+)
+def test_plans_that_are_none_are_refused(poses: Any, said: str) -> None:
+    class Careless(Reacher):
+        def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+            return [[Proposal(poses)] for _ in situations]
+
+    env = DotEnv(DotTask())
+    observation = env.begin(DotTask().episodes(1)[0])
+    with pytest.raises(ContractError, match=said):
+        wiw.Agent(Careless()).decide(observation, env.goal, Key(0, 0))
