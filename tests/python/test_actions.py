@@ -22,6 +22,7 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 
 import torch
+from test_loop_poses import asked, plan_of
 
 from wiw.world_models.actions import checkpoint
 from wiw.world_models.actions.encoder import HIDDEN, ActionEncoder
@@ -213,6 +214,9 @@ def test_poses_steer_a_front_view(made, world_model_options, tmp_path: Path) -> 
 
     assert np.abs(told(0.7) - told(1.5)).mean() > 0.02
     assert options["frames"] == model.frames
+    (rollouts,) = asked(model, [plan_of(5, 0.3), plan_of(5, 0.7)]).rollouts
+    assert [rollout.frames.shape for rollout in rollouts] == [(5, 48, 48, 3)] * 2
+    assert np.abs(rollouts[0].frames.astype(int) - rollouts[1].frames).mean() > 0.02
 
 
 def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_path: Path) -> None:
