@@ -35,6 +35,7 @@ __all__ = [
     "ActionSpace",
     "GripperTextTemplate",
     "GripperVocabulary",
+    "PoseGrid",
     "TextTemplate",
     "chunk",
     "frames_of_actions",
@@ -61,6 +62,55 @@ class GripperVocabulary:
 
     rotation: RotationCode = "euler"
     bounds: tuple[Sequence[float], Sequence[float]] | None = None
+
+
+@dataclass(frozen=True)
+class PoseGrid:
+    """Gripper poses as whole numbers [X, Y, Z, roll, pitch, yaw, gripper], as language models write them.
+
+    With bins of size r = (high - low) / bins, X stands for the middle of bin X, low + r (X + 1/2); R for the angle
+    R 2 pi / turns - pi, extrinsic x, y, z; the gripper is 0 closed or 1 open. Prompts name 0 to `bins` and 0 to `turns`
+    as the range, so that 100 and 120 do come: the last bin stands for 100, and 120 is 0 again.
+
+    Source: the paper, appendix "Robotic Manipulation", after EmbodiedBench; its workspace of 1 m a side is the default.
+    """
+
+    low: tuple[float, float, float] = (-0.3, -0.5, 0.6)
+    high: tuple[float, float, float] = (0.7, 0.5, 1.6)
+    bins: int = 100
+    turns: int = 120
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)) or min(self.bins, self.turns) < 1:
+            raise ArgumentError(f"PoseGrid: expected low < high, 3 metres each, and at least one bin, got {self}")
+
+    def encode(self, poses: ArrayLike) -> NDArray[np.int64]:
+        """Int64 [..., 7] of float [..., 7]: positions out of bounds go to the outermost bins, angles to the nearest.
+
+        Raises:
+            ArgumentError: not finite, or of another shape.
+        """
+        given = np.asarray(poses, np.float64)
+        if given.ndim < 1 or given.shape[-1] != 7 or not np.isfinite(given).all():
+            raise ArgumentError(f"PoseGrid.encode: expected finite poses [..., 7], got {given.tolist()}")
+        low, high = np.array(self.low), np.array(self.high)
+        position = np.floor((given[..., :3] - low) / (high - low) * self.bins).clip(0, self.bins - 1)
+        rotation = np.rint((given[..., 3:6] / (2 * np.pi) + 0.5) * self.turns) % self.turns
+        return np.concatenate([position, rotation, given[..., 6:] >= 0.5], axis=-1).astype(np.int64)
+
+    def decode(self, numbers: ArrayLike) -> NDArray[np.float64]:
+        """Float64 [..., 7] of whole numbers: positions are clamped to the bins, angles wrapped, the gripper 0 or 1.
+
+        Raises:
+            ArgumentError: fractions, or another shape.
+        """
+        given = np.asarray(numbers)
+        if given.ndim < 1 or given.shape[-1] != 7 or not np.issubdtype(given.dtype, np.integer):
+            raise ArgumentError(f"PoseGrid.decode: expected whole numbers [..., 7], got {given.dtype} {given.tolist()}")
+        low, high = np.array(self.low), np.array(self.high)
+        position = low + (given[..., :3].clip(0, self.bins - 1) + 0.5) * (high - low) / self.bins
+        rotation = (given[..., 3:6] % self.turns) * (2 * np.pi / self.turns) - np.pi
+        return np.concatenate([position, rotation, given[..., 6:].clip(0, 1)], axis=-1)
 
 
 def to_text(

@@ -210,3 +210,50 @@ def test_resampled_frames_show_the_plan_evenly(count, frames):
     assert found[-1] == frames - 1
     moments = np.arange(1, count + 1) * (frames - 1) / count
     assert np.abs(found - moments).max() <= 0.5
+
+
+# -- poses as whole numbers --------------------------------------------------------------------------------------------
+
+GRID = action.PoseGrid()
+WHOLE = st.tuples(*[st.integers(0, 99)] * 3, *[st.integers(0, 119)] * 3, st.integers(0, 1))
+
+
+@given(WHOLE)
+def test_numbers_stand_for_the_middle_of_their_bins(numbers) -> None:
+    x, y, z, roll, pitch, yaw, gripper = GRID.decode(numbers)
+    by_hand = [low + 0.01 * n + 0.005 for low, n in zip((-0.3, -0.5, 0.6), numbers[:3], strict=True)]
+    assert (x, y, z, gripper) == pytest.approx((*by_hand, numbers[6]))
+    assert np.degrees([roll, pitch, yaw]) == pytest.approx([3 * k - 180 for k in numbers[3:6]])
+    assert GRID.encode(GRID.decode(numbers)).tolist() == list(numbers)
+
+
+@given(
+    st.tuples(st.floats(-0.3, 0.7), st.floats(-0.5, 0.5), st.floats(0.6, 1.6), *[st.floats(-7, 7)] * 3, st.floats(0, 1))
+)
+def test_poses_come_back_to_within_half_a_bin(pose) -> None:
+    back = GRID.decode(GRID.encode(pose))
+    assert np.abs(back[:3] - pose[:3]).max() <= 0.005 + 1e-9
+    turned = np.angle(np.exp(1j * (back[3:6] - np.array(pose[3:6]))))
+    assert np.degrees(np.abs(turned)).max() <= 1.5 + 1e-9
+    assert back[6] == (pose[6] >= 0.5)
+
+
+def test_numbers_off_the_grid_are_clamped_or_wrapped() -> None:
+    np.testing.assert_allclose(GRID.decode([100, -1, 250, 120, -1, 240, 7]), GRID.decode([99, 0, 99, 0, 119, 0, 1]))
+    assert GRID.encode([9, -9, 9, np.pi, -np.pi, 0, 0.4]).tolist() == [99, 0, 99, 0, 0, 60, 0]
+    assert GRID.decode(np.zeros((2, 5, 7), int)).shape == (2, 5, 7)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: GRID.encode([np.nan] * 7),
+        lambda: GRID.encode([0.0] * 6),
+        lambda: GRID.decode([0.5] * 7),
+        lambda: GRID.decode(3),
+        lambda: action.PoseGrid(low=(0, 0, 0), high=(1, 0, 1)),
+    ],
+)
+def test_what_the_grid_cannot_take_is_named(call) -> None:
+    with pytest.raises(ArgumentError, match="PoseGrid"):
+        call()
