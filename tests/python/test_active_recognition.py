@@ -15,10 +15,10 @@ from fakes import SizeReader
 from gymnasium.utils.env_checker import check_env
 
 import wiw
+from recognition_file import CHOICES, a_file
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.cli import main
 from wiw.datasets import ar
-from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, ContractError
@@ -26,20 +26,7 @@ from wiw.evaluation.report.episodes import Attempt
 from wiw.evaluation.rows import decode_jpeg
 from wiw.loop.scheduler import run_episodes
 from wiw.tasks.ar import AR
-from wiw.types import Answer, Episode, Observation
-
-CHOICES = ("chest", "picture", "shelf", "table")
-
-
-def a_file(folder: Path, scene: str, start: Any = (-1.2, 0.0, -1.2), yaw: float = 0.0, target: str = "table") -> Path:
-    """One episode: a thing of the two rooms, seen from a place in the western one."""
-    things = {thing["name"]: thing for thing in world(scene, "cpu").scene.instances}
-    centre = tuple(float(x) for x in np.asarray(things[target]["bounds"]).mean(axis=0))
-    info = {"target": int(things[target]["id"]), "category": target}
-    episode = Episode("one", scene, start, yaw, centre, 0.0, 1.0, info)
-    path = folder / "ar.json"
-    episode_file.save(path, [episode], "ar", categories=list(CHOICES))
-    return path
+from wiw.types import Answer, Observation
 
 
 def answer(label: str, confidence: float) -> Answer:

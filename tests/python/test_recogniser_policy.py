@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_active_recognition import CHOICES, Sink, a_file
+from test_active_recognition import Sink
 
 import wiw
+from recognition_file import CHOICES, a_file
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.visibility import visible_share

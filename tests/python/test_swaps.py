@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 from blame_parts import AHEAD, FAN, SPIN, Noise, Spinner, Writer
-from test_active_recognition import a_file
 
 import wiw
+from recognition_file import a_file
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.datasets import ar
 from wiw.datasets.visibility import seen, visible_share

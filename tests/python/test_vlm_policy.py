@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_active_recognition import a_file
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
 from wiw.evaluation.evaluate import evaluate

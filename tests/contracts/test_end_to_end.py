@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Both tasks from end to end, with every registered world model: a vision-language model behind a server writes plans,
+looks at what the world model imagines of them, answers and decides."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pydantic")
+pytest.importorskip("openai")
+pytest.importorskip("json_repair")
+
+import wiw
+from recognition_file import CHOICES, a_file
+from wiw import panorama
+from wiw.policies.vlm import VLM
+from wiw.policies.vlm.looks import VIEW
+from wiw.serving.background import served
+from wiw.serving.vlm_server import VlmServer
+from wiw.vlm.base import Call
+from wiw.vlm.mock import MockClient
+
+NAMES = wiw.registry.list_world_models()
+TASKS = ("imagenav", "ar")
+PLANS = (["forward", "turn_left"], ["turn_left", "forward"])
+
+
+def script(call: Call) -> Any:
+    """The same two plans at every decision, and a doubtful liking for whatever comes first."""
+    if call.schema is None:
+        return {label: 0.5 / 2**k for k, label in enumerate(call.labels)}
+    plans = [{"reason": "free floor", "actions": plan} for plan in PLANS]
+    return json.dumps({"plans": plans} if "plans" in call.schema["properties"] else plans[0])
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[VlmServer]:
+    with VlmServer(MockClient(script, model="scripted")) as server:
+        yield server
+
+
+@pytest.fixture
+def options(two_rooms: str, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
+    """What a task is made with: two decisions in the two rooms."""
+    return lambda task: {
+        "decisions": 2,
+        **({"episode_file": a_file(tmp_path, two_rooms)} if task == "ar" else {"scenes": two_rooms}),
+    }
+
+
+@pytest.fixture
+def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any], Any]:
+    """One episode of a task with a world model."""
+
+    def run(task: str, model: Any) -> Any:
+        server.client.asked.clear()
+        policy = VLM(server.url, "scripted", dialect="vllm", proposals="listed", cache="off")
+        labels = {"semantics": "simulator"} if model is not None and "semantic" in model.accepts.needs else {}
+        agent = wiw.Agent(policy, model, candidates=2, horizon=2, cache="off", **labels)
+        return wiw.evaluate(task, agent, 1, 0, tmp_path / "run", progress=False, keep_images=0, **options(task))
+
+    return run
+
+
+@pytest.fixture
+def made(world_model_options: Any) -> Iterator[Callable[[str], Any]]:
+    """A world model by its registered name; one that is elsewhere is served."""
+    with ExitStack() as stack:
+
+        def make(name: str) -> Any:
+            if name == "remote:":
+                return wiw.world_model(name + stack.enter_context(served("copy")).address)
+            return wiw.world_model(name, **({} if name == "none" else world_model_options(name)))
+
+        yield make
+
+
+def pictures(call: Call) -> list[tuple[str, Any]]:
+    """What a question shows, each picture with the words before it."""
+    parts = [part for message in call.messages for part in message.content]
+    return [(before, part) for before, part in pairwise(parts) if not isinstance(part, str)]
+
+
+def strips(call: Call) -> list[Any]:
+    """The pictures under the plans' names."""
+    return [picture for caption, picture in pictures(call) if str(caption).startswith("Plan ")]
+
+
+def views(strip: Any) -> list[Any]:
+    """The pictures side by side in a strip, below their titles."""
+    count = strip.shape[1] // VIEW
+    left = [k * (strip.shape[1] - VIEW) // max(1, count - 1) for k in range(count)]
+    return [strip[-VIEW:, x : x + VIEW] for x in left]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", NAMES)
+def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made: Any, server: VlmServer) -> None:
+    log = run(task, made(name))
+    (episode,) = log.episodes
+    assert episode["status"] == "done", episode["error"]
+    decisions = list(log.store.decisions(episode["arm"]))
+    assert len(decisions) == 2 and all(row["exchanges"] for row in decisions)
+    shown = [strips(call) for call in server.client.asked if strips(call)]
+    if name == "none":
+        assert not shown
+        return
+    assert all(row["calls"]["rows"] >= 2 for row in decisions), "two plans with a step ahead each"
+    assert [len(call) for call in shown] == [2] * len(decisions)
+    for strip in (strip for call in shown for strip in call):
+        assert [np.ptp(view) > 0 for view in views(strip)] == [True, True]
+
+
+def colours(rays: Any) -> Any:
+    """Directions as colours: right, up and back from dark to bright."""
+    return np.rint(127.5 + 127.5 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.uint8)
+
+
+def front_rays(size: tuple[int, int]) -> Any:
+    """Of the pixels of a front view, 90 degrees wide."""
+    (height, width), focal = size, size[1] / 2
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
+    return np.stack([x, y, np.full_like(x, -focal)], -1)
+
+
+class Compass(wiw.WorldModel):
+    """Remembers what it is handed; in all its frames colours tell where the camera looks."""
+
+    accepts = wiw.accepts("trajectory")
+
+    def __init__(self, view: str, size: tuple[int, int] | None, needs: tuple[str, ...]) -> None:
+        self.accepts = wiw.accepts("trajectory", view, size, needs=needs)  # type: ignore[arg-type]
+        self.handed: list[tuple[Any, Any, Any]] = []
+        """Of each row the control, the image and the depth."""
+
+    def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
+        depths = [None] * len(controls) if observations.depth is None else observations.depth
+        self.handed += zip(controls, observations.image, depths, strict=True)
+        size = self.accepts.size
+        picture = colours(front_rays(size) if self.accepts.view == "perspective" else panorama.directions(size))
+        return np.broadcast_to(picture, (len(controls), len(controls[0].actions) + 1, *picture.shape))
+
+
+KINDS = [
+    ("perspective", None, ()),
+    ("perspective", None, ("depth",)),
+    ("perspective", (272, 480), ()),
+    ("panorama", None, ()),
+    ("panorama", None, ("depth",)),
+]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_every_kind_is_handed_its_views_and_its_own_become_the_tasks(
+    kind: Any, task: str, run: Any, options: Any, server: VlmServer
+) -> None:
+    model = Compass(*kind)
+    (episode,) = run(task, model).episodes
+    assert episode["status"] == "done", episode["error"]
+    made = wiw.registry.TASKS.make(task, **options(task))
+    real = made.environment(depth=True).begin(made.episode(0))
+    rows = {row[0].length: row for row in model.handed[:2]}
+    assert rows.keys() == {2, 1}, "the turn that the second plan begins with is real"
+    for row, turn in ((rows[2], 0), (rows[1], 22.5)):
+        check_handed(row, turn, real, model.accepts)
+    for call in filter(strips, server.client.asked):
+        ahead, turned = map(views, strips(call))
+        for view in (*ahead, turned[1]):
+            check_front(view, model.accepts)
+    if task == "ar" and kind[0] == "panorama":
+        answering = next(call for call in server.client.asked if len(call.labels) == len(CHOICES))
+        check_target(views(pictures(answering)[1][1]), rows[2][0], made.episode(0))
+
+
+def check_handed(row: Any, turn: float, real: Any, accepts: Any) -> None:
+    """The real view after a turn, and depth where it is declared."""
+    size = accepts.size
+    if accepts.view == "panorama":
+        assert size == (576, 1024)
+        image, depth = panorama.rotate(real.panorama, turn), panorama.rotate(real.depth, turn, "nearest")
+    else:
+        image = panorama.to_perspective(real.panorama, 90, size, turn)
+        depth = panorama.distance_to_planar(panorama.to_perspective(real.depth, 90, size, turn, 0, "nearest"), 90)
+        if size == (480, 480) and not turn:
+            assert np.abs(image.astype(int) - real.front).mean() < 3, "what the agent sees, but for sharpness"
+    np.testing.assert_array_equal(row[1], image)
+    assert (row[2] is None) == ("depth" not in accepts.needs)
+    if row[2] is not None:
+        np.testing.assert_allclose(row[2], depth, rtol=1e-5)
+
+
+def check_front(view: Any, accepts: Any) -> None:
+    """The directions of the front view, as far as the model's frames reach; the target's box hides some."""
+    rays = front_rays((VIEW, VIEW))
+    wanted = colours(rays).astype(int)
+    if accepts.view == "perspective":
+        up = np.abs(rays[..., 1] / rays[..., 2]) * accepts.size[1] / accepts.size[0]
+        wanted[up > 1] = 0
+        edge = np.abs(up - 1) < 0.02
+    else:
+        edge = np.zeros(view.shape[:2], bool)
+    wrong = (np.abs(view - wanted).max(-1) > 3) & ~edge
+    assert wrong.mean() < 0.03
+
+
+def check_target(shown: Any, control: Any, episode: Any) -> None:
+    """Views of imagined panoramas that look at the target, seen 1 m above the floor from the start of the episode."""
+    there = np.array([*(np.array(episode.goal_position) - episode.start_position - [0, 1, 0]), 1])
+    assert episode.start_yaw == 0 and len(shown) == control.length == 2
+    for view, pose in zip(shown, control.viewpoints, strict=False):
+        direction = (np.linalg.inv(pose) @ there)[:3]
+        looked = view[VIEW // 2 - 1 : VIEW // 2 + 1, VIEW // 2 - 1 : VIEW // 2 + 1].mean((0, 1)) - 127.5
+        cosine = direction @ looked / np.linalg.norm(direction) / np.linalg.norm(looked)
+        assert np.degrees(np.arccos(cosine)) < 6
