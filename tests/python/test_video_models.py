@@ -405,15 +405,24 @@ def test_nan_is_no_picture(made):
     assert breach.value.kind == "nan"
 
 
-def test_list_says_what_each_model_takes_and_lacks(capsys, monkeypatch, tmp_path):
-    monkeypatch.setenv("COLUMNS", "200")
+@pytest.mark.parametrize("columns", [80, 120])
+def test_list_says_what_each_model_takes_and_lacks(columns, capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("COLUMNS", str(columns))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     monkeypatch.delenv("RUNWAYML_API_SECRET", raising=False)
     assert main(["list", "world-models"]) == 0
-    rows = {line.split()[0]: line for line in capsys.readouterr().out.splitlines() if line}
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= columns
+    rows, name = {}, ""
+    for line in lines:
+        name = line.split()[0] if line[:1].strip() else name
+        rows[name] = " ".join([rows.get(name, ""), *line.split()]).strip()
+    assert set(wiw.registry.list_world_models()) <= set(rows)
     for name in NAMES:
-        control_kind = {"svd": "image", "sana-wm": "trajectory"}.get(name, "text")
-        assert control_kind in rows[name] and "perspective" in rows[name] and "lacks weights" in rows[name]
+        control = {"svd": "image", "sana-wm": "trajectory"}.get(name, "text")
+        assert rows[name].startswith(f"{name} {control} perspective perspective") and "needs weights" in rows[name]
     assert "RUNWAYML_API_SECRET" in rows["runway-gen4"]
-    assert "576x1024 + depth" in rows["warp"] and "ready" in rows["warp"]
-    assert "Wan-AI/Wan2.2-I2V-A14B-Diffusers" in rows["wan2.2-a14b"] and "480x480" in rows["wan2.2-a14b"]
+    depth = "panorama + panorama 576x1024 any depth" if columns == 80 else "panorama + depth panorama 576x1024 any"
+    assert rows["warp"] == f"warp trajectory {depth} ready"
+    assert "480x480 25 Wan-AI/Wan2.2-I2V-A14B-Diffusers needs" in rows["wan2.2-a14b"]
+    assert rows["wan2.1-action"].endswith("checkpoint=...")

@@ -23,7 +23,10 @@ def list_names(what: Positional[Literal["all", "world-models"]] = "all", /) -> i
     """
     from rich.console import Console
 
-    Console().print(_world_models() if what == "world-models" else _everything())
+    from wiw.cli.world_models import world_models
+
+    console = Console()
+    console.print(world_models(console.width) if what == "world-models" else _everything())
     return 0
 
 
@@ -52,48 +55,6 @@ def _everything() -> Any:
     for name in vlms.names():
         table.add_row(f"  {name}", escape(vlms.about(name)))
     return table
-
-
-def _world_models() -> Any:
-    from rich.table import Table
-
-    from wiw.registry import WORLD_MODELS
-
-    table = Table(box=None, pad_edge=False)
-    for column in ("name", "control", "input", "output", "frames", "weights", "on this machine"):
-        table.add_column(column, overflow="fold", no_wrap=column in ("name", "control"))
-    for name in WORLD_MODELS.names():
-        try:
-            table.add_row(name, *_cells(WORLD_MODELS.find(name)))
-        except Exception as error:  # a broken plugin must not hide the others
-            table.add_row(name, *[""] * 5, f"[red]{escape(str(error))}[/]")
-    table.caption = escape(
-        "Weights are downloaded at first use, into the Hugging Face cache; --world-model-option weights=FOLDER takes "
-        "others. Packages: pip install 'wiw[diffusers,runway]'."
-    )
-    table.caption_justify = "left"
-    return table
-
-
-def _cells(model: Any) -> list[str]:
-    """Of one row, from a class of world models; dashes for `none` and for a server, which tells when it is asked."""
-    from wiw.world_models.base import Accepts
-    from wiw.world_models.status import lacks
-
-    declared = getattr(model, "accepts", None)
-    if not isinstance(declared, Accepts):
-        return ["-", "-", "-", "-", "-", "[green]ready[/]"]
-    height, width = declared.size
-    shown = f"{declared.view} {height}x{width}"
-    requires, lacking = model.requires, lacks(model.requires)
-    return [
-        declared.control,
-        " + ".join((shown, *declared.needs)),
-        shown,
-        str(declared.frames or "any"),
-        escape(requires.weights or "-"),
-        f"[yellow]lacks {escape(', '.join(lacking))}[/]" if lacking else "[green]ready[/]",
-    ]
 
 
 def _first_line(registry: Any, name: str) -> str:

@@ -129,6 +129,8 @@ class Requirements:
     """Whether it is of no practical use without one."""
     variables: tuple[str, ...] = ()
     """Of the environment, such as the key of a service."""
+    options: tuple[str, ...] = ()
+    """Without which it cannot be made."""
 
     def missing(self) -> list[str]:
         """Packages that are not installed; nothing is imported."""

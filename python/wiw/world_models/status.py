@@ -10,13 +10,15 @@ from wiw.world_models.base import Requirements
 
 
 def lacks(requires: Requirements) -> list[str]:
-    """What is missing, in a word or two each; empty where the model is ready."""
-    found = list(requires.missing())
+    """What is missing, in a few words each; empty where the model is ready."""
+    packages = requires.missing()
+    found = [f"{', '.join(packages)} (pip install 'wiw[{requires.extra}]')"] if packages else []
     if requires.weights and not in_hub_cache(requires.weights):
         found.append("weights")
     if requires.gpu and not has_gpu():
         found.append("a GPU")
-    return found + [name for name in requires.variables if not os.environ.get(name)]
+    found += [f"{name} in the environment" for name in requires.variables if not os.environ.get(name)]
+    return found + [f"{name}=..." for name in requires.options]
 
 
 def in_hub_cache(repository: str) -> bool:

@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from wiw.world_models.actions.model import FollowsActions
-from wiw.world_models.base import accepts
+from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.cosmos_predict2 import CosmosPredict2
 from wiw.world_models.ltx import LTX
 from wiw.world_models.svd import SVD
@@ -15,11 +15,17 @@ from wiw.world_models.wan2_2_5b import Wan22Small
 from wiw.world_models.wan2_2_a14b import Wan22
 
 
+def with_checkpoint(base: type[WorldModel]) -> Requirements:
+    """What the model that was trained requires, and the folder with what was trained."""
+    return replace(base.requires, options=("checkpoint", *base.requires.options))
+
+
 @dataclass(kw_only=True, eq=False)
 class SVDAction(FollowsActions, SVD):
     """Stable Video Diffusion, trained to follow actions (SVD† in the paper)."""
 
     accepts = accepts(control="action", frames=14, null_first=True, cacheable=True)
+    requires = with_checkpoint(SVD)
     base = "svd"
     denoisers = ("unet",)
 
@@ -31,6 +37,7 @@ class LTXAction(FollowsActions, LTX):
     """LTX-Video 2B, trained to follow actions (LTX-Video† in the paper)."""
 
     accepts = accepts(control="action", frames=17, null_first=True, cacheable=True)
+    requires = with_checkpoint(LTX)
     base = "ltx"
 
     size: tuple[int, int] = (576, 1024)
@@ -43,6 +50,7 @@ class Wan21Action(FollowsActions, Wan21):
     """Wan 2.1 I2V 14B, trained to follow actions (Wan2.1† in the paper)."""
 
     accepts = accepts(control="action", frames=13, null_first=True, cacheable=True)
+    requires = with_checkpoint(Wan21)
     base = "wan2.1"
 
     size: tuple[int, int] = (576, 1024)
@@ -55,6 +63,7 @@ class Wan22SmallAction(FollowsActions, Wan22Small):
     """Wan 2.2 TI2V 5B, trained to follow actions (Wan2.2 5B† in the paper)."""
 
     accepts = accepts(control="action", frames=13, null_first=True, cacheable=True)
+    requires = with_checkpoint(Wan22Small)
     base = "wan2.2-5b"
 
     size: tuple[int, int] = (576, 1024)
@@ -67,6 +76,7 @@ class Wan22Action(FollowsActions, Wan22):
     """Wan 2.2 I2V A14B, both experts trained to follow actions (Wan2.2 A14B† in the paper)."""
 
     accepts = accepts(control="action", frames=13, null_first=True, cacheable=True)
+    requires = with_checkpoint(Wan22)
     base = "wan2.2-a14b"
     denoisers = ("transformer", "transformer_2")
 
@@ -80,6 +90,7 @@ class CosmosPredict2Action(FollowsActions, CosmosPredict2):
     """Cosmos-Predict2 2B, trained to follow actions (Cosmos-Predict2† in the paper)."""
 
     accepts = accepts(control="action", frames=13, null_first=True, cacheable=True)
+    requires = with_checkpoint(CosmosPredict2)
     base = "cosmos-predict2"
 
     size: tuple[int, int] = (576, 1024)

@@ -29,7 +29,7 @@ class CosmosPredict2(VideoModel):
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
-    requires = Requirements(PACKAGES, "diffusers", HUB, gpu=True)
+    requires = Requirements(PACKAGES, "diffusers", HUB, gpu=True, options=("guardrail",))
     pipeline = "Cosmos2VideoToWorldPipeline"
     stride = 4
     most_rows = 16

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `wiw list world-models` says of each: what it takes and gives, its weights, what it lacks on this machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from wiw.registry import WORLD_MODELS
+
+GAP = 2
+"""Spaces between columns, and before what is said below a row."""
+INPUT = 2
+"""The column that is folded where the terminal is narrow."""
+HEADS = ("name", "control", "input", "output", "size", "frames")
+CAPTION = (
+    "Control is what tells a model of the plan. NAME-action is the paper's NAME†; what remote: takes its server says. "
+    "Weights are downloaded at first use, into the Hugging Face cache; --world-model-option weights=FOLDER takes those "
+    "of a folder."
+)
+
+
+@dataclass(frozen=True)
+class _Row:
+    cells: tuple[str, ...]
+    weights: str = ""
+    status: str = ""
+    style: str = ""
+
+
+def world_models(width: int) -> Any:
+    """All registered models for a terminal of so many columns: a row of cells each, and below it weights and status."""
+    from rich.console import Group
+    from rich.text import Text
+
+    rows = [_row(name) for name in WORLD_MODELS.names()]
+    widths = [max(map(len, column)) for column in zip(HEADS, *(row.cells for row in rows), strict=True)]
+    spare = width - sum(widths) - GAP * (len(widths) - 1)
+    widths[INPUT] = max(widths[INPUT] + min(spare, 0), len("perspective"))
+    lines = [_line(HEADS, widths, "bold"), _below(Text("weights, and what is missing on this machine", "bold"))]
+    for row in rows:
+        said = Text.assemble((row.weights, "dim"), "  " if row.weights and row.status else "", (row.status, row.style))
+        lines += [_line(row.cells, widths), _below(said)]
+    return Group(*lines, Text(), Text(CAPTION, "dim"))
+
+
+def _line(cells: tuple[str, ...], widths: list[int], style: str = "") -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    line = Table.grid(padding=(0, GAP, 0, 0))
+    for width in widths:
+        line.add_column(width=width)
+    line.add_row(*(Text(cell, style) for cell in cells))
+    return line
+
+
+def _below(text: Any) -> Any:
+    from rich.padding import Padding
+
+    return Padding(text, (0, 0, 0, GAP), expand=False)
+
+
+def _row(name: str) -> _Row:
+    """Of a registered model. Those that tell when they are made, such as a server's, have dashes."""
+    from wiw.world_models.base import Accepts
+    from wiw.world_models.status import lacks
+
+    dashes = (name, *"-" * (len(HEADS) - 1))
+    try:
+        model = WORLD_MODELS.find(name)
+    except Exception as error:  # a broken plugin must not hide the others
+        return _Row(dashes, status=str(error), style="red")
+    declared, requires = getattr(model, "accepts", None), getattr(model, "requires", None)
+    lacking = lacks(requires) if requires else []
+    status = f"needs {', '.join(lacking)}" if lacking else "ready"
+    style = "yellow" if lacking else "green"
+    if not isinstance(declared, Accepts):
+        return _Row(dashes, status=status, style=style)
+    height, width = declared.size
+    takes = " + ".join((declared.view, *declared.needs))
+    cells = (name, declared.control, takes, declared.view, f"{height}x{width}", str(declared.frames or "any"))
+    return _Row(cells, requires.weights if requires else "", status, style)
