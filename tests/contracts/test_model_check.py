@@ -83,8 +83,17 @@ def raising(frames, *_):
     raise RuntimeError("CUDA error: no kernel image")
 
 
+def raising_elsewhere(frames, *_):
+    return np.stack([])
+
+
 BROKEN = {
     "raised": (raising, {}, r"`rollout` raised RuntimeError: CUDA error: no kernel image \(test_model_check\.py, line"),
+    "raised, in a library": (
+        raising_elsewhere,
+        {},
+        r"ValueError: .*\(test_model_check\.py, line \d+: return np\.stack",
+    ),
     "shape": (
         lambda frames, *_: frames[:, :, :40],
         {},

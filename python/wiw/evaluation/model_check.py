@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import sysconfig
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,8 @@ NOISE = 8
 """Levels of 255 up to which a difference may come of the order in which a GPU adds up."""
 ROWS_OF_A_RUN = 100 * 20 * 3
 """Episodes, decisions and plans of the paper's ImageNav, roughly."""
+LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+"""Folders of code that is nobody's own model."""
 LONG_RUN = 24.0
 """Hours from which such a run is called slow."""
 
@@ -255,6 +258,7 @@ def _differing(kind: str, text: str, off: NDArray[np.int16]) -> Finding:
 
 
 def _told(error: Exception) -> str:
-    """What was raised, and where."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
+    """What was raised, and where: the last line before libraries were entered, which is the model's own."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
     return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno}: {place.line})"
