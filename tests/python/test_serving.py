@@ -250,6 +250,78 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
     assert not any(90 in rows for rows in model.rows)
 
 
+def test_a_row_that_is_asked_for_again_while_it_is_computed_gets_its_answer_and_disturbs_nobody():
+    gate = threading.Event()
+    model = Plain(lambda observations: gate.wait(20) and None)
+    with remote(model) as (client, _), ThreadPoolExecutor(2) as pool:
+        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+            ask(client, 4)
+        again, other = pool.submit(ask, client, 4), pool.submit(ask, client, 2, 90)
+        time.sleep(0.3)
+        gate.set()
+        np.testing.assert_array_equal(again.result(20)[:, 5], seen(4).image)
+        np.testing.assert_array_equal(other.result(20)[:, 5], seen(2, start=90).image)
+    assert sorted(chain(*model.rows)) == [0, 1, 2, 3, 90, 91]
+
+
+def test_a_row_whose_first_asker_waited_too_short_is_asked_for_again():
+    gate = threading.Event()
+    model = Plain(lambda observations: gate.wait(20) and None)
+    with remote(model) as (client, server), ThreadPoolExecutor(2) as pool:
+        busy = pool.submit(ask, client, 4, 90)
+        wait_for(lambda: model.rows)
+        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+            ask(client, 2)
+        again = pool.submit(ask, client, 2)
+        wait_for(lambda: len(server.queue) == 2)
+        time.sleep(0.5)  # the first question's deadline at the server passes meanwhile
+        gate.set()
+        np.testing.assert_array_equal(again.result(20)[:, 5], seen(2).image)
+        busy.result(20)
+
+
+def test_the_callers_deadline_counts_however_long_it_is(monkeypatch):
+    with remote(Plain()) as (client, _):
+        given = []
+        rows = client._link.ask
+        monkeypatch.setattr(client._link, "ask", lambda *a: given.append(a[1] - time.monotonic()) or rows(*a))
+        ask(client)
+        with patience(1000.0):
+            ask(client)
+    assert given == [pytest.approx(300.0, abs=30), pytest.approx(950.0, abs=30)]
+
+
+def test_announced_rows_that_are_known_are_not_waited_for():
+    with remote(Plain()) as (client, server):
+        ask(client, 1)
+        rows = seen(2)
+        rows.image[1] = 77
+        swapped = Conditioning(rows.image[::-1].copy())
+        client.rollout(swapped, plans(2), np.zeros(2, np.uint64))  # the second one is known
+        assert not any(server.queue._coming.values())
+
+
+def test_a_model_may_use_its_memory_again():
+    size = (256, 512)
+
+    class Reusing(wiw.WorldModel):
+        accepts = wiw.accepts("image", size=size, best_batch=8)
+        memory = np.zeros((8, 3, *size, 3), np.uint8)
+
+        def rollout(self, observations, controls, seeds):
+            self.memory[: len(seeds)] = seeds.astype(np.uint8)[:, None, None, None, None]
+            return self.memory[: len(seeds)]
+
+        def fingerprint(self):
+            return "reusing"
+
+    with remote(Reusing()) as (client, _):
+        frames = client.rollout(
+            Conditioning(np.zeros((64, *size, 3), np.uint8)), plans(64, 2), np.arange(64, dtype=np.uint64)
+        )
+    assert (frames[:, 1:] == np.arange(64)[:, None, None, None, None]).all()
+
+
 def wait_for(condition, seconds=20):
     end = time.monotonic() + seconds
     while not condition():
@@ -281,6 +353,25 @@ def test_a_lost_connection_is_mended_and_no_row_is_computed_twice():
             time.sleep(0.05)
         np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
     assert sorted(chain(*model.rows)) == list(range(8))
+
+
+def test_a_server_that_comes_back_is_not_asked_for_what_was_answered():
+    gate = threading.Event()
+    with served(first := Plain()) as server, ThreadPoolExecutor(1) as pool:
+        port = int(server.address.rpartition(":")[2])
+        client = Remote(server.address)
+        first.act = lambda observations: None if len(first.rows) == 1 else gate.wait(20) and None
+        answer = pool.submit(ask, client, 8)
+        wait_for(lambda: len(first.rows) == 2 and len(client._link._open) == 8)
+        wait_for(lambda: sum(question.answer.done() for question in client._link._open.values()) == 4)
+        object.__setattr__(server.settings, "grace", 0.0)
+        server._loop.call_soon_threadsafe(server.end)
+        wait_for(lambda: not server.clients)
+        with served(second := Plain(), port=port):
+            np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
+        gate.set()
+    client.close()
+    assert sorted(chain(*second.rows)) == [4, 5, 6, 7]
 
 
 def test_a_server_that_comes_back_with_another_model_is_refused():

@@ -87,6 +87,12 @@ class Queue:
             self._changed.notify()
             return not full
 
+    def announce(self, client: Hashable, rest: int) -> None:
+        """A client announces `rest` more rows, whatever became of its latest."""
+        with self._changed:
+            self._coming[client] = rest
+            self._changed.notify()
+
     def share(self, client: Hashable) -> None:
         """A client asks what another one has asked already."""
         with self._changed:

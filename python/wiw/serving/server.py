@@ -236,10 +236,12 @@ class Server:
             raise RemoteError(f"expected an ask, got {type(said).__name__}", "message")
         if said.id != row_id(said.row):
             raise RemoteError("ask.id is not the digest of ask.row", "message")
-        answer = self._known.get(said.id)
+        answer, reason = self._known.get(said.id), self._cannot(client)
+        taken = answer is None and not reason and self._take(client, said)
+        self.queue.announce(client, said.rest)
         if answer is not None:
             await client.send(answer)
-        elif (reason := self._cannot(client)) or not self._take(client, said):
+        elif not taken:
             await client.send(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
 
     def _cannot(self, client: ServerConnection) -> str:

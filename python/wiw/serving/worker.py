@@ -60,6 +60,7 @@ class Worker(threading.Thread):
                 return [Refusal(b"", "raised", f"{type(error).__name__}: {' '.join(str(error).split())}")]
             half = len(rows) // 2
             return [*self._answers(rows[:half]), *self._answers(rows[half:])]
-        return [
-            answer[1 + row.control.shared : 1 + row.control.length] for row, answer in zip(rows, frames, strict=True)
+        return [  # copies: they are encoded while the model goes on, and it may use its memory again
+            answer[1 + row.control.shared : 1 + row.control.length].copy()
+            for row, answer in zip(rows, frames, strict=True)
         ]

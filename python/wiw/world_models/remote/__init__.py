@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import time
 import weakref
@@ -73,8 +74,8 @@ class Remote(WorldModel):
             RemoteError: no answer in time; see its `kind`.
             ContractError: the served model broke its contract.
         """
-        limit = min(DEADLINE, (1 - MARGIN) * seconds_left())
-        give_up = time.monotonic() + limit
+        left = seconds_left()
+        give_up = time.monotonic() + (DEADLINE if math.isinf(left) else (1 - MARGIN) * left)
         rows = [
             pack_row(observations, row, control, int(seed))
             for row, (control, seed) in enumerate(zip(controls, seeds, strict=True))

@@ -184,12 +184,15 @@ class Link:
         """Asks and hears until the connection ends."""
         outbox: asyncio.Queue[_Question] = asyncio.Queue()
         room = asyncio.Semaphore(self._welcome.result().in_flight)
-        for question in self._open.values():
+        asked: set[bytes] = set()
+        again = [question for question in self._open.values() if not question.answer.done()]
+        for place, question in enumerate(again, start=1):
+            question.rest = len(again) - place
             outbox.put_nowait(question)
         self._outbox = outbox
         tasks = [
-            asyncio.ensure_future(self._send(connection, outbox, room)),
-            asyncio.ensure_future(self._hear(connection, outbox, room)),
+            asyncio.ensure_future(self._send(connection, outbox, room, asked)),
+            asyncio.ensure_future(self._hear(connection, outbox, room, asked)),
         ]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -202,19 +205,29 @@ class Link:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     async def _send(
-        self, connection: ClientConnection, outbox: asyncio.Queue[_Question], room: asyncio.Semaphore
+        self,
+        connection: ClientConnection,
+        outbox: asyncio.Queue[_Question],
+        room: asyncio.Semaphore,
+        asked: set[bytes],
     ) -> None:
+        """Asks what is in the outbox; a row that was asked on this connection and has no answer yet is not repeated."""
         while True:
             question = await outbox.get()
             await room.acquire()
             left = question.give_up - time.monotonic()
-            if left <= 0 or self._open.get(question.id) is not question:
+            if left <= 0 or question.id in asked or self._open.get(question.id) is not question:
                 room.release()
                 continue
+            asked.add(question.id)
             await connection.send(encode(Ask(question.id, question.row, left, question.rest)))
 
     async def _hear(
-        self, connection: ClientConnection, outbox: asyncio.Queue[_Question], room: asyncio.Semaphore
+        self,
+        connection: ClientConnection,
+        outbox: asyncio.Queue[_Question],
+        room: asyncio.Semaphore,
+        asked: set[bytes],
     ) -> None:
         while True:
             try:
@@ -226,10 +239,13 @@ class Link:
             if not isinstance(said, Answer | Wait | Refusal):
                 raise RemoteError(f"{self.address}: did not expect a {type(said).__name__}", "message")
             room.release()
+            asked.discard(said.id)
             question = self._open.get(said.id)
             if question is None or question.answer.done():
                 continue
-            if isinstance(said, Wait):
+            if isinstance(said, Refusal) and said.kind == "deadline" and question.give_up > time.monotonic():
+                outbox.put_nowait(question)  # that was the deadline of one who asked before and has gone
+            elif isinstance(said, Wait):
                 question.rest = 0  # those that followed it have gone on
                 self._loop.call_later(said.seconds, outbox.put_nowait, question)
             elif isinstance(said, Answer):
