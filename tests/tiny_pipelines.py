@@ -165,7 +165,7 @@ def svd() -> Any:
     return StableVideoDiffusionPipeline(vae, _vision(True, 224, 32), unet, scheduler, _image_processor(224))
 
 
-def ltx() -> Any:
+def ltx(timestep_conditioning: bool = False) -> Any:
     transformer = LTXVideoTransformer3DModel(
         in_channels=8,
         out_channels=8,
@@ -188,6 +188,7 @@ def ltx() -> Any:
         upsample_factor=(1,) * 4,
         patch_size=4,
         patch_size_t=1,
+        timestep_conditioning=timestep_conditioning,
     )
     return LTXImageToVideoPipeline(FlowMatchEulerDiscreteScheduler(), vae, _t5(), _t5_tokenizer(), transformer)
 

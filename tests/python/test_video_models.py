@@ -147,6 +147,35 @@ def test_hunyuan_keeps_the_frames_of_both_kinds_of_checkpoint(made, tmp_path):
     assert rollout(made("hunyuan", weights=str(tmp_path))).shape == (1, 5, *concatenating.size, 3)
 
 
+def test_ltx_runs_with_the_decoders_that_take_away_noise(made, tmp_path):
+    import tiny_pipelines
+
+    tiny_pipelines.ltx(timestep_conditioning=True).save_pretrained(tmp_path)
+    model = made("ltx", weights=tmp_path)
+    first, again, other = (rollout(model, seeds=[seed]) for seed in (2**64 - 1, 2**64 - 1, 5))
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == (1, 9, *model.size, 3) and (first != other).any()
+    with pytest.raises(ArgumentError, match=r"one row at a time .* got batch=2"):
+        made("ltx", weights=tmp_path, batch=2)
+
+
+def test_hunyuan_shows_the_end_of_a_clip_whose_beginning_is_dropped(made):
+    from types import SimpleNamespace
+
+    model = made("hunyuan", frames=9)
+    shades = np.linspace(0, 1, 9 + 4, dtype=np.float32)  # of the clip with its beginning
+    transformer = model._pipeline.transformer
+
+    def dropping(**given):
+        assert given["num_frames"] == len(shades)
+        return SimpleNamespace(frames=np.broadcast_to(shades[None, 4:, None, None, None], (1, 9, *model.size, 3)))
+
+    model._pipeline = dropping
+    dropping.transformer = transformer
+    found = rollout(model, [(FORWARD,) * 8])[0, 1:, 0, 0, 0]
+    np.testing.assert_array_equal(found, np.rint(shades[[4, 4, 4, 6, 8, 9, 10, 12]] * 255))
+
+
 @pytest.mark.parametrize(("name", "kin"), [("ltx", "LTXPipeline"), ("wan2.2-5b", "WanPipeline")])
 def test_folders_of_kindred_pipelines_serve(name, kin, made, world_model_options, tmp_path):
     folder = shutil.copytree(world_model_options(name)["weights"], tmp_path / "kin")

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from wiw.errors import ArgumentError
 from wiw.types import Control
 from wiw.world_models.base import Requirements, accepts
-from wiw.world_models.video import PACKAGES, VideoModel
+from wiw.world_models.video import PACKAGES, Clips, VideoModel
 
 HUB = "Lightricks/LTX-Video"
 
@@ -17,6 +18,9 @@ HUB = "Lightricks/LTX-Video"
 @dataclass(kw_only=True, eq=False)
 class LTX(VideoModel):
     """LTX-Video 2B: the front view and the plan in words become a clip (HaCohen et al. 2024).
+
+    Decoders since 0.9.1 take away the last bit of noise themselves. The pipeline draws it from one generator, where the
+    decoder is, so it takes one row at a time with them.
 
     Args:
         negative: what the clip is steered away from, in words.
@@ -36,8 +40,17 @@ class LTX(VideoModel):
     frames: int = 33
     negative: str = "worst quality, inconsistent motion, blurry, jittery, distorted"
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._draws_to_decode = bool(self._pipeline.vae.config.timestep_conditioning)
+        if self._draws_to_decode and self.batch > 1:
+            raise ArgumentError(
+                f"{type(self).__name__}: {self.pipeline} takes one row at a time with the decoders of LTX-Video 0.9.1 "
+                f"and later, got batch={self.batch}"
+            )
+
     def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
-        """A picture and a prompt a row; decoders since 0.9.1 are told of their last bit of noise."""
+        """A picture and a prompt a row, and how much noise is left to the decoders that take it away."""
         return {
             "image": list(images),
             "prompt": [control.text for control in controls],
@@ -46,3 +59,11 @@ class LTX(VideoModel):
             "decode_noise_scale": 0.025,
             "max_sequence_length": 256,
         }
+
+    def generate(self, images: Sequence[Any], controls: Sequence[Control], generators: Sequence[Any]) -> Clips:
+        """Clips; with a generator on the decoder's device where the decoder's noise is drawn too."""
+        if self._draws_to_decode:
+            import torch
+
+            generators = [torch.Generator(self.device).manual_seed(each.initial_seed()) for each in generators]
+        return super().generate(images, controls, generators)

@@ -126,7 +126,7 @@ class VideoModel(WorldModel):
             "num_frames": self.frames,
             "num_inference_steps": self.steps,
             self.guided_by: self.guidance,
-            "generator": list(generators),
+            "generator": generators[0] if len(generators) == 1 else list(generators),
             "output_type": "np",
         }
         return np.asarray(self._pipeline(**{**common, **self.arguments(images, controls)}).frames)
