@@ -23,8 +23,8 @@ class Hunyuan(VideoModel):
     """HunyuanVideo I2V 13B: the front view and the plan in words become a clip (Kong et al. 2024).
 
     Both kinds of checkpoint run: those that replace the first token by the observation, and those that concatenate it
-    (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the
-    observation stands in for them.
+    (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the clip is
+    sampled evenly from the observation to its end.
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
@@ -44,12 +44,14 @@ class Hunyuan(VideoModel):
         return {"image": images[0], "prompt": controls[0].text, "num_frames": asked}
 
     def generate(self, images: Sequence[Any], controls: Sequence[Control], generators: Sequence[Any]) -> Clips:
-        """The clip, with the observation in front where the pipeline has dropped its beginning."""
+        """The clip; where its beginning was dropped, the frame nearest to each moment from start to end."""
         clip = super().generate(images, controls, generators)
         if not self._concatenates:
             return clip
         observation = np.asarray(images[0], np.float32)[None, None] / 255
-        return np.concatenate([observation, clip[:, :-1]], axis=1)
+        moments = np.rint(np.linspace(0, self.frames - 1 + DROPPED, self.frames)).astype(int)
+        kept = np.maximum(moments[1:] - DROPPED, 0)
+        return np.concatenate([observation, clip[:, kept]], axis=1)
 
     @property
     def _concatenates(self) -> bool:
