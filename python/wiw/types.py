@@ -204,6 +204,7 @@ class Conditioning:
     depth: NDArray[np.float32] | None = None
     """float32 [B, H, W], in the model's view and size: planar z in a perspective view, distance in a panorama."""
     semantic: NDArray[np.uint32] | None = None
+    """uint32 [B, H, W]: ids of `wiw.perception.semantics.CATEGORIES`."""
     history: Sequence[NDArray[np.uint8]] | None = None
     simulators: Sequence[Any] | None = None
     """Forks of the environment, one a row; given to `oracle` alone."""

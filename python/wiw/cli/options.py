@@ -59,6 +59,19 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
     return parsed(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
 
 
+def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
+    """What `--semantics-option` gives a source of semantics.
+
+    Raises:
+        ArgumentError: options without a source to take them.
+    """
+    from wiw.registry import SEMANTICS
+
+    if pairs and source in (None, "simulator"):
+        raise ArgumentError("--semantics-option: name the source that takes it with --semantics, such as rednet")
+    return parsed(pairs, SEMANTICS.find(str(source)), "--semantics-option") if pairs else {}
+
+
 def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
     """What a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
 

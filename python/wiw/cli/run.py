@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, default_policy, model_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, semantics_options, task_options
 from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
@@ -56,6 +56,8 @@ def run(
     vlm_model: MaybeName = None,
     vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None,
     prompts: Folder = None,
+    semantics: MaybeName = None,
+    semantics_option: Options = (),
     report: bool = True,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
@@ -109,6 +111,8 @@ def run(
             http://localhost:8000/v1 if not given.
         vlm_model: Its name at the server, or a preset of `wiw list`; not needed where the server has one model.
         vlm_prices: YAML file of `model: [read, written]`, dollars per million tokens, for the costs.
+        semantics: Tells world models that need it what each pixel is: simulator, rednet, or path.py:Class.
+        semantics_option: An option of --semantics, such as weights=FILE; may be given again.
         prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
     """
@@ -126,7 +130,8 @@ def run(
     given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
-        model_options=model_options(model, world_model_option),
+        model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
+        semantics_options=semantics_options(semantics, semantics_option),
         policy_options=vlm_options(given, [policy, revision or "", *(name.partition("+")[0] for name in names or [])]),
     )  # fmt: skip
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"

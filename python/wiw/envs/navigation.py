@@ -26,6 +26,8 @@ from wiw.envs.trip import (
     start,
 )
 from wiw.errors import ArgumentError
+from wiw.perception.semantics import TrueSemantics
+from wiw.perception.simulator import categories_of
 from wiw.types import Answer, Episode, Goal, Key, Observation, Truth
 
 
@@ -161,6 +163,15 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
         """The simulator as it stands, to be run ahead by the oracle; this environment does not move."""
         self._require_episode()
         return self._core.fork()
+
+    def semantic(self) -> NDArray[np.uint32]:
+        """What each pixel of the panorama truly is, uint32 [576, 1024]: ids of `wiw.perception.semantics.CATEGORIES`.
+
+        For agents that are granted the simulator's semantics, as others are granted depth.
+        """
+        source = TrueSemantics(categories_of(self.trip.world.scene))
+        ids = self._core.observe(["panorama_ids"])["panorama_ids"]
+        return source.panoramas(self.observation.panorama[None], ids=ids[None])[0]
 
     # -- privileged ----------------------------------------------------------------------------------------------------
 

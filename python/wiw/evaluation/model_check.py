@@ -89,7 +89,7 @@ def check_model(
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
-        check_needs(made, len(PLANS[0]))
+        check_needs(made, len(PLANS[0]), semantics=True)
     except ArgumentError as error:
         return [Finding("needs", f"{error}.")]
     return list(_Check(made, str(scenes), deadline).findings())

@@ -30,6 +30,7 @@ class Row:
 
     image: Frames
     depth: Any
+    semantic: Any
     simulator: Any
     control: Control
     seed: np.uint64
@@ -65,6 +66,7 @@ class Questions:
             Row(
                 observations.image[place],
                 None if observations.depth is None else observations.depth[place],
+                None if observations.semantic is None else observations.semantic[place],
                 None if observations.simulators is None else observations.simulators[place],
                 replace(control, shared=0),
                 seeds[place],
@@ -93,12 +95,14 @@ class Questions:
         observations = Conditioning(
             np.stack([row.image for row in rows]),
             depth=None if rows[0].depth is None else np.stack([row.depth for row in rows]),
+            semantic=None if rows[0].semantic is None else np.stack([row.semantic for row in rows]),
             simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
         )
         controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
         given: dict[str, NDArray[Any]] = {"observations.image": observations.image, "seeds": seeds}
-        if observations.depth is not None:
-            given["observations.depth"] = observations.depth
+        for name in ("depth", "semantic"):
+            if (array := getattr(observations, name)) is not None:
+                given[f"observations.{name}"] = array
         kept = {name: array.copy() for name, array in given.items()}
         frames = self._attempts.once(observations, controls, seeds)
         self.changed |= {name for name, array in given.items() if not np.array_equal(array, kept[name])}
@@ -126,5 +130,5 @@ def _queries(scenes: str) -> list[Query]:
     for index in range(EPISODES):
         env = task.environment(depth=True)
         observation = env.begin(task.episode(index))
-        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork(), semantic=env.semantic()))
     return queries

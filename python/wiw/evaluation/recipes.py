@@ -65,6 +65,9 @@ class AgentRecipe:
     policy_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
     swaps: Sequence[str] | None = None
+    semantics: str | None = None
+    semantics_options: Mapping[str, Any] = field(default_factory=dict)
+    """What the source of semantics is made with."""
 
     def __post_init__(self) -> None:
         for name in (name for name in NUMBERS if name != "execute"):
@@ -78,12 +81,15 @@ class AgentRecipe:
         `limits` are what a run gives every agent beyond its identity: deadline, cache, fidelity and the like.
         """
         from wiw.loop.agent import Agent
-        from wiw.registry import POLICIES, WORLD_MODELS
+        from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
         options = given.pop("model_options")
         if options:
             given["model"] = WORLD_MODELS.make(self.model, **options)
+        semantics = given.pop("semantics_options")
+        if semantics:
+            given["semantics"] = SEMANTICS.make(self.semantics, **semantics)
         made = {name: POLICIES.make(name, **own) for name, own in given.pop("policy_options").items()}
         for part in ("policy", "revision"):
             given |= {part: made[given[part]]} if given.get(part) in made else {}
@@ -109,9 +115,10 @@ class AgentRecipe:
         Raises:
             RegistryError: a part is not known.
         """
-        from wiw.registry import POLICIES, WORLD_MODELS
+        from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 
-        for registry, name in ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision)):
+        parts = ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision))
+        for registry, name in (*parts, (SEMANTICS, self.semantics)):
             if name is not None:
                 registry.find(name)
         said = {name: value for name, value in asdict(self).items() if value not in (None, {})}

@@ -29,6 +29,7 @@ from wiw.loop.contract import (
 from wiw.loop.fidelity import remembered, replay
 from wiw.loop.imagine import Imagination, model_spec
 from wiw.loop.imagine_poses import IMAGINE, PoseImagination
+from wiw.loop.labels import SIMULATOR, labelled, semantics_source
 from wiw.loop.placebo import PLACEBOS, Placebo, shuffled
 from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
@@ -55,6 +56,8 @@ class Query:
     """First moment of another episode; only looked at by an agent with placebo="swapped"."""
     guide: Any = None
     """What plans are truly worth; only looked at by an agent with swaps."""
+    semantic: NDArray[np.uint32] | None = None
+    """uint32 [H, W]: what the panorama's pixels truly are; only looked at by an agent with semantics="simulator"."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,8 @@ class Agent:
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
         placebo: "shuffled" or "swapped" lets the model imagine something else than the plans (`wiw.loop.placebo`).
         swaps: stages that are told the truth, of "imagination", "scoring" and "proposals" (`wiw.loop.swaps`).
+        semantics: what tells world models that need it what each pixel is: "simulator", "rednet" or another source
+            (`wiw.perception.semantics`); left alone where the model needs none.
 
     Raises:
         WeightsError: those of LPIPS are not there.
@@ -136,6 +141,7 @@ class Agent:
         pool: int | None = None,
         imagine_fraction: float = 1.0,
         swaps: Collection[str] = (),
+        semantics: Any = None,
     ) -> None:
         self.swaps = checked_swaps(swaps)
         if "imagination" in self.swaps:
@@ -180,18 +186,21 @@ class Agent:
         self._lpips = None if lpips is None or not self.fidelity else Lpips(lpips)
         if placebo == "shuffled" and self.policy.space == "pose7":
             raise ArgumentError("Agent: placebo='shuffled' deals primitives anew, and poses are none; use 'swapped'")
+        self.semantics = semantics_source(semantics)
         self._ask: Asking | None = None
         if self.model is not None:
             self._ask = remember(Attempts(self.model, deadline), cache, cache_gb)
-            check_model(self.model, self.horizon * self.depth, self.policy.space)
+            check_model(self.model, self.horizon * self.depth, self.policy.space, self.semantics is not None)
             if self.depth > 1:
                 self._check_depth(self.model)
         self._lives: dict[tuple[int, int], _Life] = {}
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What queries must carry beyond images: "depth", "simulator", "guide"."""
-        model = () if self.model is None else self.model.accepts.needs
+        """What queries must carry beyond images: "depth", "semantic", "simulator", "guide"."""
+        model = set() if self.model is None else set(self.model.accepts.needs)
+        if "semantic" in model and self.semantics != SIMULATOR:
+            model = (model - {"semantic"}) | set(getattr(self.semantics, "needs", ()))
         replays = ("simulator",) if self.fidelity else ()
         truth = ("guide",) if GUIDED & set(self.swaps) else ()
         return tuple(sorted({*self.policy.needs, *self.revision.needs, *model, *replays, *truth}))
@@ -240,7 +249,7 @@ class Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
         parts |= {"placebo": self.placebo, "pool": self._given_pool, "imagine_fraction": self.imagine_fraction}
-        parts |= {"swaps": self.swaps}
+        parts |= {"swaps": self.swaps, "semantics": self.semantics}
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, Any]) -> Agent:
@@ -269,6 +278,7 @@ class Agent:
             **({} if self._given_pool is None else {"pool": self.pool}),
             **({} if self.imagine_fraction == 1 else {"imagine_fraction": self.imagine_fraction}),
             **({} if not self.swaps else {"swaps": list(self.swaps)}),
+            **({} if self.semantics is None else {"semantics": _described(self.semantics)}),
         }
 
     @property
@@ -359,6 +369,9 @@ class Agent:
             spec = model_spec(ask.model.accepts)
             plans = [shuffled(own, query.key, spec) for own, query in zip(plans, queries, strict=True)]
         seen = [_stranger(query) for query in queries] if self.placebo == "swapped" else None
+        if "semantic" in ask.model.accepts.needs:
+            with clock("platform"):
+                seen = labelled(self.semantics, queries if seen is None else seen)
         imagined = IMAGINE[self.policy.space](ask, queries, plans, beams.origins, self.revision.frames, clock, seen)
         beams.spend(imagined.calls)
         with clock("revise"):
@@ -456,6 +469,10 @@ class Agent:
 def consults(key: Key, fraction: float) -> bool:
     """Whether a world model that is consulted for a share of all decisions is consulted for this one."""
     return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _CONSULT]), 1)[0] < fraction)
+
+
+def _described(semantics: Any) -> Any:
+    return semantics if isinstance(semantics, str) else semantics.describe()
 
 
 def _stranger(query: Query) -> Query:

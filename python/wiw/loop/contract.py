@@ -18,13 +18,15 @@ from wiw.world_models.oracle import Oracle
 
 PRIMITIVES = frozenset(map(int, (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)))
 GIVEN = ("depth", "simulator")
-"""What the loop can give a world model beyond the image."""
+"""What the loop can give a world model beyond the image; semantics too where the agent has a source of them."""
 PLANS = {"discrete": "discrete primitives", "pose7": "poses of a gripper"}
 """By space, in words."""
 
 
-def check_model(model: WorldModel, longest: int, space: Space = "discrete") -> None:
+def check_model(model: WorldModel, longest: int, space: Space = "discrete", semantics: bool = False) -> None:
     """Refuses a world model that asks for what it would not be given; plans have up to `longest` actions of a space.
+
+    `semantics` is whether the agent has a source of them.
 
     Raises:
         ArgumentError: poses instead of primitives or the other way round, panoramas where there are none, needs that
@@ -37,8 +39,14 @@ def check_model(model: WorldModel, longest: int, space: Space = "discrete") -> N
         raise ArgumentError(f"{name} takes space='{accepts.space}', but this agent plans in {PLANS[space]}")
     if space == "pose7":
         _check_front(accepts, name)
-    if missing := [need for need in accepts.needs if need not in GIVEN]:
-        raise ArgumentError(f"{name} needs {', '.join(missing)}, but a model can be given {', '.join(GIVEN)}")
+    if "semantic" in accepts.needs and not semantics and space == "discrete":
+        raise ArgumentError(
+            f"{name} needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
+            "(wiw.Agent(semantics=...)); see docs/perception.md"
+        )
+    given = (*GIVEN, "semantic") if space == "discrete" else GIVEN
+    if missing := [need for need in accepts.needs if need not in given]:
+        raise ArgumentError(f"{name} needs {', '.join(missing)}, but a model can be given {', '.join(given)}")
     if "simulator" in accepts.needs and not isinstance(model, Oracle):
         raise ArgumentError(
             f"{name} needs the simulator, which is handed to the oracle alone: it knows where the agent truly is. "

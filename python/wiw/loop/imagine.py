@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import action
+from wiw import action, panorama
 from wiw._core import core, planner
 from wiw.errors import ArgumentError
 from wiw.loop.clock import Clock
@@ -119,12 +119,28 @@ def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> Condi
         if any(value is None for value in depths):
             raise ArgumentError("the world model needs depth: make the environment with depth=True")
         depth = batch.depths(np.stack(depths), maker)
+    semantic = _labels(accepts, batch, queries) if "semantic" in accepts.needs else None
     if "simulator" in accepts.needs:
         simulators = [
             _turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
         ]
     panoramas = np.stack([query.observation.panorama for query in queries])
-    return Conditioning(batch.observations(panoramas, maker), depth=depth, simulators=simulators)
+    return Conditioning(batch.observations(panoramas, maker), depth=depth, semantic=semantic, simulators=simulators)
+
+
+def _labels(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> NDArray[np.uint32]:
+    """The same of the panoramas' labels, of which none are blended."""
+    if any(query.semantic is None for query in queries):
+        raise ArgumentError(
+            "the world model needs semantics: pass decide_batch([Query(..., semantic=env.semantic())]), or give the "
+            "agent another source than the simulator"
+        )
+    labels = np.stack([query.semantic for query in queries])
+    if accepts.view == "panorama":  # small numbers survive as floats, and distances are turned by the nearest pixel
+        turned = batch.depths(labels.astype(np.float32), _maker("panorama", accepts.size))
+        return np.asarray(turned, np.uint32)
+    rows = zip(batch.row_episode, np.degrees(action.ActionSpace().turn_rad) * batch.row_turns, strict=True)
+    return np.stack([panorama.to_perspective(labels[e], 90.0, accepts.size, yaw, 0.0, "nearest") for e, yaw in rows])
 
 
 def _turned(simulator: Any, turns: int) -> Any:
@@ -142,9 +158,10 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
     if part.first == 0:
         rows = _slice_of(part.rows)
         depth = None if whole.depth is None else whole.depth[rows]
+        semantic = None if whole.semantic is None else whole.semantic[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
-        return Conditioning(whole.image[rows], depth=depth, simulators=simulators)
-    assert not accepts.needs  # check_model: an imagined frame has neither depth nor a simulator
+        return Conditioning(whole.image[rows], depth=depth, semantic=semantic, simulators=simulators)
+    assert not accepts.needs  # check_model: an imagined frame has neither depth nor labels nor a simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 

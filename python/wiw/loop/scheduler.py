@@ -53,7 +53,9 @@ class Trial:
         """
         simulator = self.env.fork() if "simulator" in agent.needs else None
         guide = self.env.guide() if "guide" in agent.needs else None
-        return Query(self.observation, self.env.goal, self.key.at(self.decisions), simulator, self.stranger, guide)
+        semantic = self.env.semantic() if "semantic" in agent.needs else None
+        key = self.key.at(self.decisions)
+        return Query(self.observation, self.env.goal, key, simulator, self.stranger, guide, semantic)
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Executes the decision's first segment and observes."""
@@ -132,7 +134,9 @@ def _start(
 
 def _first_moment(agent: Agent, env: Any, episode: Episode, key: Key) -> Query:
     observation = env.begin(episode)
-    return Query(observation, env.goal, key, env.fork() if "simulator" in agent.needs else None)
+    simulator = env.fork() if "simulator" in agent.needs else None
+    semantic = env.semantic() if "semantic" in agent.needs else None
+    return Query(observation, env.goal, key, simulator, semantic=semantic)
 
 
 def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, Episode]]:

@@ -57,7 +57,12 @@ class RedNet(Semantics):
             raise ArgumentError(f"metres: expected a range such as (0, 10), got {metres}")
         self.face, self.metres, self.batch = face, metres, batch
         path = Path(weights).expanduser()
-        self._model, self.device = _loaded(path / FILE if path.is_dir() else path, device)
+        self.weights = path / FILE if path.is_dir() else path
+        self._model, self.device = _loaded(self.weights, device)
+
+    def describe(self) -> dict[str, Any]:
+        """What the labels depend on."""
+        return {**super().describe(), "weights": self.weights.name, "face": self.face, "metres": list(self.metres)}
 
     def panoramas(
         self,

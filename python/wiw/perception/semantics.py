@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +76,10 @@ class Semantics(ABC):
         Raises:
             ArgumentError: arrays of other shapes, or without what is needed.
         """
+
+    def describe(self) -> dict[str, Any]:
+        """JSON-able identity for the run's manifest."""
+        return {"name": type(self).__name__}
 
 
 class TrueSemantics(Semantics):
