@@ -80,6 +80,8 @@ def world_model_options(
             pytest.skip(f"no {', '.join(missing)}: pip install 'wiw[{requires.extra}]'")
         if name == "runway-gen4":
             return runway()
+        if requires.served:
+            return {"address": served(name)}
         if not requires.weights:  # none, or those that come with it
             return {}
         import tiny_pipelines
@@ -97,6 +99,13 @@ def world_model_options(
         stack.enter_context(pytest.MonkeyPatch.context()).setenv("RUNWAYML_API_SECRET", "a key")
         server = stack.enter_context(fake_runway.serving())
         return {"url": server.url, "poll": 0.0, "size": (64, 64)}
+
+    @cache
+    def served(name: str) -> str:
+        import fake_panoramic
+
+        fake_panoramic.install(folder / "official")
+        return stack.enter_context(fake_panoramic.serving(folder / "official", name))
 
     with stack:
         yield options

@@ -170,6 +170,8 @@ WORLD_MODELS = Registry(
         "sana-wm": "wiw.world_models.sana_wm:SanaWM",
         "runway-gen4": "wiw.world_models.runway_gen4:RunwayGen4",
         "nwm": "wiw.world_models.nwm:NWM",
+        "pathdreamer": "wiw.world_models.pathdreamer:PathDreamer",
+        "se3ds": "wiw.world_models.se3ds:SE3DS",
         "svd-action": "wiw.world_models.actions.variants:SVDAction",
         "ltx-action": "wiw.world_models.actions.variants:LTXAction",
         "wan2.1-action": "wiw.world_models.actions.variants:Wan21Action",

@@ -124,13 +124,17 @@ class Requirements:
     extra: str = ""
     """Of wiw, which installs them: `pip install 'wiw[EXTRA]'`."""
     weights: str = ""
-    """Name on the Hugging Face hub of what is loaded by default."""
+    """Name on the Hugging Face hub of what is loaded by default; of a served model, where its weights are published."""
     gpu: bool = False
     """Whether it is of no practical use without one."""
     variables: tuple[str, ...] = ()
     """Of the environment, such as the key of a service."""
     options: tuple[str, ...] = ()
     """Without which it cannot be made."""
+    served: str = ""
+    """Name of the model that a server has to compute, with weights of its own."""
+    server: str = ""
+    """Where it is looked for by default."""
 
     def missing(self) -> list[str]:
         """Packages that are not installed; nothing is imported."""

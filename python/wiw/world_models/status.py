@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+import socket
 from pathlib import Path
+from urllib.parse import urlsplit
 
 from wiw.world_models.base import Requirements
 
@@ -13,12 +15,30 @@ def lacks(requires: Requirements) -> list[str]:
     """What is missing, in a few words each; empty where the model is ready."""
     packages = requires.missing()
     found = [f"{', '.join(packages)} (pip install 'wiw[{requires.extra}]')"] if packages else []
-    if requires.weights and not in_hub_cache(requires.weights):
+    if requires.served and not is_served(requires.served, requires.server):
+        found.append(f"a server at {requires.server}")
+    if requires.weights and not requires.served and not in_hub_cache(requires.weights):
         found.append("weights")
     if requires.gpu and not has_gpu():
         found.append("a GPU")
     found += [f"{name} in the environment" for name in requires.variables if not os.environ.get(name)]
     return found + [f"{name}=..." for name in requires.options]
+
+
+def is_served(name: str, address: str) -> bool:
+    """Whether a server answers at an address and serves the model of that name; takes a second at most."""
+    from wiw.errors import RemoteError
+    from wiw.world_models.remote import Remote
+
+    uri = urlsplit(address)
+    try:
+        socket.create_connection((uri.hostname or "", uri.port or 80), 0.2).close()
+        remote = Remote(address, patience=0.8)
+    except (OSError, RemoteError):
+        return False
+    served = remote.describe()["model"]
+    remote.close()
+    return bool(served.get("name") == name)
 
 
 def in_hub_cache(repository: str) -> bool:

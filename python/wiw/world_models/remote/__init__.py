@@ -56,7 +56,7 @@ class Remote(WorldModel):
         self._accepts = dataclasses.replace(served, best_batch=max(served.best_batch, self._welcome.in_flight))
 
     def __reduce__(self) -> Any:
-        return Remote, self._given
+        return type(self), self._given
 
     @property
     def accepts(self) -> Accepts:  # type: ignore[override]
