@@ -411,6 +411,7 @@ def test_addresses_that_are_none(address):
 
 
 def test_clients_threads_end_with_them():
+    gc.collect()  # those of other tests
     with served(Plain()) as server:
         before = threading.active_count()
         clients = [Remote(server.address) for _ in range(3)]
