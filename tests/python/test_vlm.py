@@ -317,6 +317,39 @@ def test_a_local_model_writes_text_and_objects(tiny: Path) -> None:
     assert client.spent["vlm_input_tokens"] > 4 * 49 and client.spent["vlm_output_tokens"] > 20
 
 
+def test_a_local_model_weighs_the_ways_to_go_on(tiny: Path) -> None:
+    """As the product of its tokens' probabilities among those with which the texts go on, one text after the other."""
+    import torch
+
+    client = connect(f"transformers:{tiny}", device="cpu")
+    messages, texts = (user("Plan!", IMAGE),), ['"forward"', '"turn_left"', '"turn_right"']
+
+    def after(begun: str) -> Any:
+        with torch.inference_mode():
+            return torch.softmax(client._network(**client._inputs(messages, begun)).logits[0, -1].double(), -1)
+
+    words = client._tokenizer.get_vocab()
+    first, second = after('["'), after('["turn_')
+    turn = float(first[words["t"]] / (first[words["t"]] + first[words["f"]]))
+    left = float(second[words["l"]] / (second[words["l"]] + second[words["r"]]))
+    found = client._chances(messages, "[", texts).exp().numpy()
+    np.testing.assert_allclose(found, [1 - turn, turn * left, turn * (1 - left)], rtol=1e-4)
+    numbers = client._chances(messages, "[", [str(number) for number in range(12)])
+    assert float(numbers.exp().sum()) == pytest.approx(1, abs=1e-5)
+
+
+def test_answers_of_folders_of_one_name_are_kept_apart(tmp_path: Path) -> None:
+    pytest.importorskip("transformers")
+    from wiw.vlm.tiny import make_tiny
+
+    said = []
+    for seed in (0, 1, 0):
+        folder = make_tiny(tmp_path / f"run{len(said)}/checkpoint", seed)
+        client = connect(f"transformers:{folder}", device="cpu", cache=ReplyCache(tmp_path))
+        said.append(ask(client, "Which?", IMAGE, choices=("a", "b")).probabilities.tolist())
+    assert said[0] == said[2] != said[1] and client.spent["vlm_calls"] == 0
+
+
 def test_weights_that_are_not_there(tmp_path: Path) -> None:
     pytest.importorskip("transformers")
     with pytest.raises(WeightsError, match=r"config\.json"):

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import json
+import math
 import string
 from collections.abc import Iterator
 from typing import Any, get_args
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("pydantic")
@@ -179,6 +180,8 @@ def test_any_slip_of_the_pen(slips: list[tuple[int, int, str]]) -> None:
 
 
 @settings(max_examples=100)
+@example([("A", math.inf), ("B", -1.0)])
+@example([("A", 1000.0), ("B", -1.0)])
 @given(st.lists(st.tuples(st.text(max_size=3), st.floats(allow_nan=True, allow_infinity=True)), max_size=20))
 def test_any_list_of_tokens(listed: list[tuple[str, float]]) -> None:
     client = MockClient(lambda call: Completion("?", "length", tuple(listed) or None))

@@ -8,7 +8,8 @@ import pickle
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ from wiw.errors import ArgumentError, VlmError  # noqa: E402
 from wiw.serving.misbehaviour import FAULTS, Misbehaviour  # noqa: E402
 from wiw.serving.vlm_server import VlmServer  # noqa: E402
 from wiw.vlm import Request, connect, user  # noqa: E402
+from wiw.vlm.cache import ReplyCache  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 
 IMAGE = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
@@ -164,7 +166,12 @@ GOOD = json.dumps({"choices": [{"message": {"content": "fine \ud800"}}]}).encode
 @pytest.mark.parametrize(
     "body",
     [b"", b"<html>", b"[]", b"null", b'{"choices": []}', b'{"choices": [{"message": null}]}', b"\xff\xfe", b"[" * 99999,
-     b'{"choices": [{"message": {"content": "x"}, "logprobs": {"content": [{"top_logprobs": [{"token": 1}]}]}}]}'],
+     b'{"choices": [{"message": {"content": "x"}, "logprobs": {"content": [{"top_logprobs": [{"token": 1}]}]}}]}',
+     b'{"choices": [{"message": {"content": "x"}}], "usage": {"prompt_tokens": Infinity}}',
+     b'{"choices": [{"message": {"content": "x"}}], "usage": {"prompt_tokens": -5}}',
+     b'{"choices": [{"message": {"content": "x"}}], "usage": {"completion_tokens": 1e300}}',
+     b'{"choices": [{"message": {"content": "x"}, "logprobs": {"content": [{"top_logprobs": [{"token": "A", '
+     b'"logprob": 1' + b"0" * 400 + b'}]}]}}]}'],
 )  # fmt: skip
 def test_bodies_that_are_no_completions_are_asked_for_again(body: bytes) -> None:
     with speaking([body, GOOD]) as url:
@@ -187,6 +194,93 @@ def test_content_in_odd_shapes_is_no_answer() -> None:
         with speaking([json.dumps({"choices": [{"message": message}]}).encode()]) as url:
             (reply,) = connect(url, model="m").ask([Request((user("Say"),), tries=1)])
             assert reply.problem is not None and reply.problem.kind == "empty"
+
+
+@pytest.mark.parametrize("wait", ["nan", "-1", "soon", "Mon, 01 Jan 99999 00:00:00 GMT"])
+def test_odd_wishes_to_wait_do_no_harm(wait: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wiw.vlm.openai._Retries.pause", lambda self: 0.0)
+    send_header = BaseHTTPRequestHandler.send_header
+
+    def odd(self: Any, name: str, value: str) -> None:
+        send_header(self, name, wait if name == "Retry-After" else value)
+
+    monkeypatch.setattr(BaseHTTPRequestHandler, "send_header", odd)
+    with VlmServer(MockClient(), misbehaviour=failing({"429": 1.0})) as server, pytest.raises(VlmError) as error:
+        connect(server.url, attempts=2).ask(REQUESTS[2:3])
+    assert error.value.kind == "status"
+
+
+def test_what_was_paid_for_is_counted_though_another_question_fails(tmp_path: Path) -> None:
+    def script(call: Any) -> str:
+        if parts_of(call)[0] == "Bad":
+            raise ValueError("never")
+        return "fine"
+
+    with VlmServer(MockClient(script)) as server:
+        client = connect(server.url, concurrency=1, cache=ReplyCache(tmp_path))
+        with pytest.raises(VlmError, match="never"):
+            client.ask([Request((user("Say"),)), Request((user("Bad"),))])
+        assert client.spent["vlm_calls"] == 1 and client.spent["vlm_input_tokens"] > 0
+
+
+def test_what_was_answered_before_a_failure_is_kept(tmp_path: Path) -> None:
+    texts = iter(["fine", "", VlmError("gone")])
+
+    def script(call: Any) -> Any:
+        said = next(texts)
+        if isinstance(said, VlmError):
+            raise said
+        return said
+
+    client = MockClient(script, cache=ReplyCache(tmp_path))
+    with pytest.raises(VlmError, match="gone"):
+        client.ask([Request((user("Say"),)), Request((user("More"),))])
+    (reply,) = MockClient(lambda call: "asked again", cache=ReplyCache(tmp_path)).ask([Request((user("Say"),))])
+    assert reply.text == "fine"
+
+
+def test_a_server_that_refuses_to_list_tokens_is_asked_for_votes() -> None:
+    def script(call: Any) -> str:
+        if call.logprobs:
+            raise ValueError("logprobs are not supported")
+        return "B"
+
+    with VlmServer(MockClient(script)) as server:
+        with pytest.raises(VlmError, match="0 has choices voted on"):
+            connect(server.url).ask(REQUESTS[:1])
+        client = connect(server.url, top_logprobs=0)
+        few, many = client.ask([REQUESTS[0], REQUESTS[3]])
+    assert few.by == many.by == "votes" and few.probabilities.tolist() == [0, 1, 0]
+    assert len(many.probabilities) == 27 and client.spent["vlm_calls"] == 5 + 2 * 5 + 5
+
+
+def test_answers_are_kept_by_how_they_were_asked_for(tmp_path: Path) -> None:
+    with VlmServer(MockClient()) as server:
+        for options in ({}, {"image_format": "jpeg"}, {"dialect": "vllm"}):
+            client = connect(server.url, cache=ReplyCache(tmp_path), **options)
+            for calls in (1, 1):
+                client.ask(REQUESTS[:1])
+                assert client.spent["vlm_calls"] == calls
+
+
+def test_a_script_that_fails_is_told_of() -> None:
+    def script(call: Any) -> str:
+        raise ZeroDivisionError("in the script")
+
+    with VlmServer(MockClient(script)) as server, pytest.raises(VlmError, match="ZeroDivisionError: in the script"):
+        connect(server.url, attempts=1).ask(REQUESTS[:1])
+
+
+@pytest.mark.parametrize("length", ["-5", "x", ""])
+def test_a_body_without_a_length_is_refused(length: str) -> None:
+    with (
+        VlmServer(MockClient()) as server,
+        closing(HTTPConnection("127.0.0.1", int(server.url.split(":")[2][:-3]), timeout=10)) as http,
+    ):
+        http.putrequest("POST", "/v1/chat/completions")
+        http.putheader("Content-Length", length)
+        http.endheaders()
+        assert http.getresponse().status == 411
 
 
 def test_wrong_requests_are_told_so() -> None:

@@ -21,6 +21,8 @@ from wiw.vlm.images import from_data_uri
 
 MOST_BYTES = 256 << 20
 """Of a request's body."""
+UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
+"""What a request that makes no sense raises; anything else is a fault of the model or script behind the server."""
 
 
 class VlmServer:
@@ -112,7 +114,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
-        length = int(self.headers.get("content-length") or 0)
+        told = self.headers.get("content-length", "")
+        if not told.isdecimal():
+            self.close_connection = True
+            self._send(411, _error("expected a body with its content-length"))
+            return
+        length = int(told)
         if self.path.rstrip("/") != "/v1/chat/completions" or length > MOST_BYTES:
             self.close_connection = True
             self._send(404 if length <= MOST_BYTES else 413, _error(f"{self.path}: {length} bytes"))
@@ -131,8 +138,8 @@ class _Handler(BaseHTTPRequestHandler):
             if fault == "slow":
                 time.sleep(server.misbehaviour.slow_seconds)
             self._send(200, server.answer(body, number, fault))
-        except (Error, ValueError, KeyError, TypeError, AttributeError) as error:
-            self._send(400, _error(f"{type(error).__name__}: {error}"))
+        except Exception as error:
+            self._send(400 if isinstance(error, UNCLEAR) else 500, _error(f"{type(error).__name__}: {error}"))
 
     def _send(self, status: int, body: Mapping[str, Any], headers: Mapping[str, str] | None = None) -> None:
         data = json.dumps(body).encode()

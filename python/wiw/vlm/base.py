@@ -172,6 +172,7 @@ class Client(ABC):
         cache: keeps what was answered, so that no question is paid for twice; None keeps nothing.
         prices: US dollars per million tokens; a model that is not in the table has an unknown price.
         top_logprobs: first tokens that the server lists at most; as many choices are asked at once, more in rounds.
+            0 for a server that refuses to list any: choices are voted on.
         votes: samples that are counted where a server tells no log-probabilities.
     """
 
@@ -183,8 +184,10 @@ class Client(ABC):
         top_logprobs: int = 20,
         votes: int = 5,
     ) -> None:
-        if not 2 <= top_logprobs <= 26 or votes < 1:
-            raise ArgumentError(f"vlm: expected top_logprobs from 2 to 26 and votes >= 1, got {top_logprobs}, {votes}")
+        if not (top_logprobs == 0 or 2 <= top_logprobs <= 26) or votes < 1:
+            raise ArgumentError(
+                f"vlm: expected top_logprobs from 2 to 26, or 0, and votes >= 1, got {top_logprobs}, {votes}"
+            )
         self.cache, self.prices, self.top_logprobs, self.votes = cache, prices or Prices(), top_logprobs, votes
         self.spent: Counter[str] = Counter()
         """vlm_calls, vlm_cached, vlm_retries, vlm_input_tokens, vlm_output_tokens and their sum vlm_tokens; vlm_usd
@@ -194,6 +197,11 @@ class Client(ABC):
     @abstractmethod
     def model(self) -> str:
         """The name under which the model is asked for."""
+
+    @property
+    def manner(self) -> str:
+        """What answers depend on beside the model's name and the call; those that are kept are named by it, too."""
+        return ""
 
     @abstractmethod
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
@@ -216,15 +224,16 @@ class Client(ABC):
         from wiw.vlm.conversation import Conversation
 
         talks = [Conversation(request, self.top_logprobs, self.votes) for request in requests]
-        while waiting := [talk for talk in talks if talk.calls]:
-            calls = [call for talk in waiting for call in talk.calls]
-            names = [self.name_of(call) for call in calls]
-            answers = iter(zip(names, self._complete(calls, names), strict=True))
-            for talk in waiting:
-                talk.hear([next(answers) for _ in talk.calls])
-        replies = [talk.reply for talk in talks]
-        self._keep(replies)
-        return replies
+        try:
+            while waiting := [talk for talk in talks if talk.calls]:
+                calls = [call for talk in waiting for call in talk.calls]
+                names = [self.name_of(call) for call in calls]
+                answers = iter(zip(names, self._complete(calls, names), strict=True))
+                for talk in waiting:
+                    talk.hear([next(answers) for _ in talk.calls])
+        finally:
+            self._keep([talk.reply for talk in talks])
+        return [talk.reply for talk in talks]
 
     def name_of(self, call: Call) -> str:
         """Digest of the model and of everything in a call; images by their pixels."""
@@ -242,7 +251,7 @@ class Client(ABC):
         return digest.hexdigest()
 
     def _complete(self, calls: Sequence[Call], names: Sequence[str]) -> list[Completion]:
-        found = [None if self.cache is None else self.cache.get(name) for name in names]
+        found = [None if self.cache is None else self.cache.get(self._kept_as(name)) for name in names]
         missing = [place for place, completion in enumerate(found) if completion is None]
         fresh = self.complete([calls[place] for place in missing]) if missing else []
         for place, completion in zip(missing, fresh, strict=True):
@@ -262,4 +271,8 @@ class Client(ABC):
     def _keep(self, replies: Sequence[Reply]) -> None:
         """Keeps what was of use; what was not is asked for anew the next time."""
         if self.cache is not None:
-            self.cache.put({said.call: said.completion for reply in replies for said in reply.said if said.used})
+            said = [each for reply in replies for each in reply.said if each.used]
+            self.cache.put({self._kept_as(each.call): each.completion for each in said})
+
+    def _kept_as(self, name: str) -> str:
+        return f"{self.manner} {name}"

@@ -51,13 +51,13 @@ def from_logprobs(
     Variants of a label ("A", " A", "(A") are one. A label that is not listed counts as much as it may at most: as the
     least likely token that is listed, or as what all of these leave over.
     """
-    listed = [(token, value) for token, value in listed if not math.isnan(value)]
+    listed = [(token, min(value, 0.0)) for token, value in listed if not math.isnan(value)]
     found = [
         [value for token, value in listed if token.strip(AROUND) == label and value > -math.inf] for label in labels
     ]
     if not any(found):
         return None
-    left = 1.0 - float(sum(np.exp(min(value, 0.0)) for _, value in listed))
+    left = 1.0 - float(sum(np.exp(value) for _, value in listed))
     least = min(*(value for _, value in listed), float(np.log(max(left, 1e-300))))
     scores = np.array([np.logaddexp.reduce(values) if values else least for values in found], np.float64)
     mass = float(sum(np.exp(score) for score, values in zip(scores, found, strict=True) if values))

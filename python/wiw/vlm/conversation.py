@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from hashlib import blake2b
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -77,9 +78,9 @@ def _seed(seed: int, attempt: int) -> int:
     return int.from_bytes(blake2b(f"{seed} {attempt}".encode(), digest_size=4).digest(), "little") >> 1
 
 
-def _chosen(request: Request, most: int, votes: int) -> Talk:
+def _chosen(request: Request, listed: int, votes: int) -> Talk:
     """Multiple choice: text and mass of the last round, where the best choices meet; "votes" if any round took them."""
-    found = yield from _elected(request, range(len(request.choices)), most, votes)
+    found = yield from _elected(request, range(len(request.choices)), listed, votes)
     if isinstance(found, Reply):
         return found
     probabilities, rounds = found
@@ -88,21 +89,22 @@ def _chosen(request: Request, most: int, votes: int) -> Talk:
 
 
 def _elected(
-    request: Request, options: Sequence[int], most: int, votes: int
+    request: Request, options: Sequence[int], listed: int, votes: int
 ) -> Generator[list[Call], list[Completion], tuple[NDArray[np.float64], list[Any]] | Reply]:
     """Probabilities of some of the choices, and all that was asked for them; or an unusable reply.
 
     More of them than a server lists tokens are asked about in groups, and the best of each group in a final.
     """
+    most = listed or len(ascii_uppercase)
     groups = choices.chunks(len(options), most)
-    first = yield from _ballots(request, [[options[i] for i in group] for group in groups], most, votes)
+    first = yield from _ballots(request, [[options[i] for i in group] for group in groups], listed, votes)
     if isinstance(first, Reply):
         return first
     if len(groups) == 1:
         return first[0].probabilities, first
     best = [np.argsort(-reply.probabilities, kind="stable")[: max(1, most // len(groups))] for reply in first]
     finalists = sorted(group[i] for group, order in zip(groups, best, strict=True) for i in order)
-    final = yield from _elected(request, [options[i] for i in finalists], most, votes)
+    final = yield from _elected(request, [options[i] for i in finalists], listed, votes)
     if isinstance(final, Reply):
         return final
     together = choices.united(groups, [reply.probabilities for reply in first], finalists, final[0])
@@ -110,19 +112,21 @@ def _elected(
 
 
 def _ballots(
-    request: Request, groups: Sequence[Sequence[int]], most: int, votes: int
+    request: Request, groups: Sequence[Sequence[int]], listed: int, votes: int
 ) -> Generator[list[Call], list[Completion], list[Any] | Reply]:
     """What a model chooses in each group of options, or the unusable reply of the first group that has one."""
     options = [[request.choices[i] for i in group] for group in groups]
     messages = [choices.asked(request.messages, names) for names in options]
     labels = [choices.labels_of(len(names)) for names in options]
     seed = _seed(request.seed, 0)
-    calls = [Call(said, 0.0, seed, 1, own, most) for said, own in zip(messages, labels, strict=True)]
-    completions = yield calls
-    found: list[Any] = [
-        _counted(choices.from_logprobs(completion.logprobs or (), own), completion, "logprobs")
-        for completion, own in zip(completions, labels, strict=True)
-    ]
+    calls = [Call(said, 0.0, seed, 1, own, listed) for said, own in zip(messages, labels, strict=True)]
+    found: list[Any] = [None for _ in calls]
+    if listed:
+        completions = yield calls
+        found = [
+            _counted(choices.from_logprobs(completion.logprobs or (), own), completion, "logprobs")
+            for completion, own in zip(completions, labels, strict=True)
+        ]
     open_ = [place for place, reply in enumerate(found) if reply is None]
     samples = [
         replace(calls[place], temperature=1.0, seed=_seed(request.seed, 1 + vote), max_tokens=VOTE_TOKENS, logprobs=0)

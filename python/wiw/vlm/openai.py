@@ -8,7 +8,7 @@ import json
 import random
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -23,6 +23,7 @@ MOST_BYTES = 4 << 20
 """Of a reply's body; what goes beyond is not read."""
 LONGEST_WAIT = 60.0
 """Seconds that are waited before a request is sent again, however long the server asks for."""
+REFUSED_LOGPROBS = "; top_logprobs= says how many first tokens the server lists, 0 has choices voted on instead"
 _PASSING = (408, 409, 425, 429)
 """Client errors that may pass; so may all of the server's, 500 and above."""
 
@@ -92,6 +93,11 @@ class OpenAIClient(Client):
             self._model = names[0]
         return self._model
 
+    @property
+    def manner(self) -> str:
+        """The images' format, and what constrains the answer."""
+        return f"{self.image_format} {self.dialect}"
+
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """All calls, at most `concurrency` at a time."""
         images: dict[int, str] = {}
@@ -102,7 +108,14 @@ class OpenAIClient(Client):
                         images[id(part)] = to_data_uri(part, self.image_format)
         bodies = [self._body(call, images) for call in calls]
         with ThreadPoolExecutor(min(self.concurrency, len(bodies))) as pool:
-            return list(pool.map(self._sent, bodies))
+            sent = [pool.submit(self._sent, body) for body in bodies]
+            try:
+                return [each.result() for each in sent]
+            except BaseException:
+                for each in wait([each for each in sent if not each.cancel()]).done:
+                    if each.exception() is None:  # it has its price, too
+                        self._count(each.result())
+                raise
 
     @cached_property
     def _sdk(self) -> Any:
@@ -188,7 +201,8 @@ class OpenAIClient(Client):
                 passing, said, kind, wait = True, f"{type(error).__name__}: {_short(error)}", "unreachable", None
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
-                raise VlmError(f"{self.base_url}: {said} ({times})", kind)
+                hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
+                raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
             time.sleep(min(LONGEST_WAIT, retries.pause() if wait is None else wait))
             retries.count += 1
 
@@ -237,7 +251,10 @@ def _asked_wait(error: Any) -> float | None:
         return max(0.0, float(value))
     except ValueError:
         when = email.utils.parsedate_tz(value)
+    try:
         return None if when is None else max(0.0, email.utils.mktime_tz(when) - time.time())
+    except (ValueError, OverflowError):  # no such date
+        return None
 
 
 def _message(message: Message, images: dict[int, str]) -> dict[str, Any]:
@@ -263,12 +280,19 @@ def _completion(data: bytes) -> Completion:
             _clean(str(refusal) if refusal else text),
             finish,
             _first_token(choice.get("logprobs")),
-            int(usage.get("prompt_tokens") or 0),
-            int(usage.get("completion_tokens") or 0),
+            _tokens(usage.get("prompt_tokens")),
+            _tokens(usage.get("completion_tokens")),
         )
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, OverflowError, KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
         begin = data[:80].decode("utf-8", "replace")
         raise _NoCompletionError(f"expected a chat completion, got '{begin}' ({type(error).__name__})") from None
+
+
+def _tokens(count: Any) -> int:
+    """Nothing where the server does not say."""
+    if not 0 <= int(count or 0) < 2**31:
+        raise ValueError(f"{count} tokens")
+    return int(count or 0)
 
 
 def _clean(text: str) -> str:

@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
+from hashlib import blake2b
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -63,6 +66,17 @@ class TransformersClient(Client):
         """The folder's name, or the hub's."""
         return Path(self.path).name if Path(self.path).exists() else self.path
 
+    @cached_property
+    def manner(self) -> str:
+        """Weights, by content, and where they compute: folders of one name may hold different ones."""
+        import torch
+
+        digest = blake2b(str(getattr(self._processor, "chat_template", "")).encode(), digest_size=16)
+        for name, values in sorted(self._network.state_dict().items()):
+            digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+            digest.update(values.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
+        return f"{digest.hexdigest()} {torch.device(self.device).type}"
+
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
         """One after the other."""
         return [self._one(call) for call in calls]
@@ -106,7 +120,9 @@ class TransformersClient(Client):
                     images.append(Image.fromarray(part))
             turns.append({"role": message.role, "content": parts})
         text = self._processor.apply_chat_template(turns, add_generation_prompt=True, tokenize=False) + begun
-        return self._processor(text=[text], images=images or None, return_tensors="pt").to(self.device)
+        first = self._tokenizer.bos_token
+        once = {"add_special_tokens": False} if first and text.startswith(first) else {}  # the template has it already
+        return self._processor(text=[text], images=images or None, return_tensors="pt", **once).to(self.device)
 
     def _first_tokens(self, inputs: Any) -> list[tuple[str, float]]:
         import torch
@@ -130,7 +146,7 @@ class TransformersClient(Client):
         return list(whole[0, inputs["input_ids"].shape[1] :].tolist())
 
     def _instance(self, call: Call) -> str:
-        """An object that fits the schema; each choice is drawn by the scores of the tokens that options begin with."""
+        """An object that fits the schema; each choice is drawn by how probable the model finds the ways to go on."""
         import torch
 
         assert call.schema is not None
@@ -139,14 +155,48 @@ class TransformersClient(Client):
         def choose(before: str, options: Sequence[str]) -> int:
             if len(options) == 1:
                 return 0
-            firsts = [self._tokenizer(option, add_special_tokens=False)["input_ids"][-1] for option in options]
-            with torch.inference_mode():
-                scores = self._network(**self._inputs(call.messages, before)).logits[0, -1, firsts].float().cpu()
+            scores = self._chances(call.messages, before, options)
             if call.temperature == 0:
                 return int(scores.argmax())
             return int(torch.multinomial(torch.softmax(scores / call.temperature, -1), 1, generator=random))
 
         return instance(call.schema, choose)
+
+    def _chances(self, messages: Sequence[Message], before: str, options: Sequence[str]) -> Any:
+        """Log-probability of each text after `before`, where the model writes one of them."""
+        import torch
+
+        ways = [self._inputs(messages, before + option) for option in options]
+        tokens = [way["input_ids"][0].tolist() for way in ways]
+        begin = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, zip(*tokens, strict=False)))
+        chances = []
+        for way, own in zip(ways, tokens, strict=True):
+            with torch.inference_mode():
+                told = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
+            chances.append(_chance(told, own, tokens, begin))
+        return torch.tensor(chances)
+
+
+def _chance(told: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:
+    """Of one of several texts: at each token among those with which any that began alike goes on, or has ended.
+
+    Args:
+        told: log-probabilities [len(own) - begin + 1, V] of the tokens behind the first `begin`.
+        own: the text's tokens.
+        tokens: those of all texts.
+        begin: how many the texts begin with alike.
+    """
+    chance = 0.0
+    for place, following in enumerate(told, start=begin):
+        alike = [each for each in tokens if each[:place] == own[:place]]
+        ways = following[sorted({each[place] for each in alike if len(each) > place})].logsumexp(0)
+        if place == len(own):
+            chance += float((1 - ways.exp()).clamp(min=1e-30).log())
+        elif min(map(len, alike)) > place:
+            chance += float(following[own[place]] - ways)
+        else:
+            chance += float(following[own[place]])
+    return chance
 
 
 def _remade(path: str, options: dict[str, Any]) -> TransformersClient:
