@@ -138,12 +138,14 @@ class Compass(wiw.WorldModel):
 
     def __init__(self, view: str, size: tuple[int, int] | None, needs: tuple[str, ...]) -> None:
         self.accepts = wiw.accepts("trajectory", view, size, needs=needs)  # type: ignore[arg-type]
-        self.handed: list[tuple[Any, Any, Any]] = []
-        """Of each row the control, the image and the depth."""
+        self.handed: list[tuple[Any, ...]] = []
+        """Of each row the control, the image, and depth and labels or None."""
 
     def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
-        depths = [None] * len(controls) if observations.depth is None else observations.depth
-        self.handed += zip(controls, observations.image, depths, strict=True)
+        nothing = [None] * len(controls)
+        depth = nothing if observations.depth is None else observations.depth
+        labels = nothing if observations.semantic is None else observations.semantic
+        self.handed += zip(controls, observations.image, depth, labels, strict=True)
         size = self.accepts.size
         picture = colours(front_rays(size) if self.accepts.view == "perspective" else panorama.directions(size))
         return np.broadcast_to(picture, (len(controls), len(controls[0].actions) + 1, *picture.shape))
@@ -155,6 +157,7 @@ KINDS = [
     ("perspective", (272, 480), ()),
     ("panorama", None, ()),
     ("panorama", None, ("depth",)),
+    ("panorama", None, ("depth", "semantic")),
 ]
 
 
@@ -167,11 +170,12 @@ def test_every_kind_is_handed_its_views_and_its_own_become_the_tasks(
     (episode,) = run(task, model).episodes
     assert episode["status"] == "done", episode["error"]
     made = wiw.registry.TASKS.make(task, **options(task))
-    real = made.environment(depth=True).begin(made.episode(0))
+    env = made.environment(depth=True)
+    env.begin(made.episode(0))
     rows = {row[0].length: row for row in model.handed[:2]}
     assert rows.keys() == {2, 1}, "the turn that the second plan begins with is real"
     for row, turn in ((rows[2], 0), (rows[1], 22.5)):
-        check_handed(row, turn, real, model.accepts)
+        check_handed(row, turn, env, model.accepts)
     for call in filter(strips, server.client.asked):
         ahead, turned = map(views, strips(call))
         for view in (*ahead, turned[1]):
@@ -181,9 +185,9 @@ def test_every_kind_is_handed_its_views_and_its_own_become_the_tasks(
         check_target(views(pictures(answering)[1][1]), rows[2][0], made.episode(0))
 
 
-def check_handed(row: Any, turn: float, real: Any, accepts: Any) -> None:
-    """The real view after a turn, and depth where it is declared."""
-    size = accepts.size
+def check_handed(row: Any, turn: float, env: Any, accepts: Any) -> None:
+    """The real view after a turn, and depth and labels where they are declared."""
+    size, real = accepts.size, env.observation
     if accepts.view == "panorama":
         assert size == (576, 1024)
         image, depth = panorama.rotate(real.panorama, turn), panorama.rotate(real.depth, turn, "nearest")
@@ -196,6 +200,10 @@ def check_handed(row: Any, turn: float, real: Any, accepts: Any) -> None:
     assert (row[2] is None) == ("depth" not in accepts.needs)
     if row[2] is not None:
         np.testing.assert_allclose(row[2], depth, rtol=1e-5)
+    assert (row[3] is None) == ("semantic" not in accepts.needs)
+    if row[3] is not None:
+        np.testing.assert_array_equal(row[3], panorama.rotate(env.semantic(), turn, "nearest"))
+        assert len(np.unique(row[3])) > 1
 
 
 def check_front(view: Any, accepts: Any) -> None:
