@@ -189,3 +189,16 @@ def test_a_run_keeps_its_source_and_can_be_resumed_and_verified(
 def test_options_need_their_source(reader: str) -> None:
     for flags in (["--semantics-option", "weights=x"], ["--semantics", "simulator", "--semantics-option", "face=32"]):
         assert main(["run", "imagenav", "--world-model", reader, *flags]) == 2
+
+
+def test_an_arm_without_a_model_loads_no_network(tmp_path: Path) -> None:
+    options = {"weights": str(tmp_path / "not there")}
+    assert AgentRecipe("matcher", semantics="rednet", semantics_options=options).build({}).semantics is None
+    with pytest.raises(wiw.errors.WeightsError):
+        AgentRecipe("matcher", "copy", semantics="rednet", semantics_options=options).build({})
+
+
+def test_scaling_takes_a_source_too(two_rooms: str, reader: str, tmp_path: Path) -> None:
+    begin = ["scale", "imagenav", "--scenes", two_rooms, "--world-model", reader, "--episodes", "1"]
+    begin += ["--task-option", "decisions=1", "--candidates", "1,2", "--cache", str(tmp_path / "kept")]
+    assert main([*begin, "--semantics", "simulator", "--out", str(tmp_path / "run")]) == 0

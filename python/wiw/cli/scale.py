@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, default_policy, model_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, semantics_options, task_options
 
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -41,6 +41,8 @@ def scale(
     cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
     vlm: Annotated[str | None, arg(metavar="URL")] = None,
     vlm_model: Annotated[str | None, arg(metavar="NAME")] = None,
+    semantics: Annotated[str | None, arg(metavar="NAME")] = None,
+    semantics_option: Options = (),
 ) -> int:
     """Success against the number of futures that a world model imagines, all amounts on the same episodes.
 
@@ -75,6 +77,8 @@ def scale(
         cache_gb: Most gigabytes of that folder.
         vlm: For policy vlm, as in `wiw run`.
         vlm_model: Likewise.
+        semantics: Tells world models that need it what each pixel is, as in `wiw run`.
+        semantics_option: An option of --semantics; may be given again.
     """
     from wiw.cli.run import stoppable, vlm_options
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
@@ -84,7 +88,8 @@ def scale(
     model = None if world_model == "none" else absolute(world_model)
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), horizon=horizon,
-        model_options=model_options(model, world_model_option),
+        model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
+        semantics_options=semantics_options(semantics, semantics_option),
         policy_options=vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""]),
     )  # fmt: skip
     flags = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}

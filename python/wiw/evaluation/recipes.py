@@ -88,7 +88,9 @@ class AgentRecipe:
         if options:
             given["model"] = WORLD_MODELS.make(self.model, **options)
         semantics = given.pop("semantics_options")
-        if semantics:
+        if self.model is None:  # nobody would look at them
+            given.pop("semantics", None)
+        elif semantics:
             given["semantics"] = SEMANTICS.make(self.semantics, **semantics)
         made = {name: POLICIES.make(name, **own) for name, own in given.pop("policy_options").items()}
         for part in ("policy", "revision"):
