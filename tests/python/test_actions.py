@@ -14,7 +14,7 @@ import pytest
 import wiw
 from wiw import action
 from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, WeightsError
+from wiw.errors import ArgumentError, DeviceMemoryError, WeightsError
 from wiw.types import Conditioning, Control
 from wiw.world_models.actions.config import ActionConfig
 
@@ -255,6 +255,37 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
     refused("denoiser cannot be loaded")
     shutil.rmtree(folder / "unet")
     refused("no trained denoiser: expected unet/", kind="missing")
+
+
+@pytest.mark.parametrize("name", ["svd-action", "cosmos-predict2-action"])
+def test_a_lora_of_a_pipeline_that_takes_none_is_refused(name: str, made, tmp_path: Path) -> None:
+    model = made(name)
+    with pytest.raises(ArgumentError, match="takes no LoRA: write its denoiser whole"):
+        checkpoint.save(tmp_path / "lora", model._encoders, model._pipeline, lora=True)
+    folder = shutil.copytree(model.checkpoint, tmp_path / "checkpoint")
+    (folder / "pytorch_lora_weights.safetensors").write_bytes(b"of another trainer")
+    rollout(made(name, checkpoint=str(folder)), [FORWARD])  # its whole denoiser counts
+    shutil.rmtree(folder / model.denoisers[0])
+    with pytest.raises(WeightsError, match=r"as save_pretrained writes, since \w+ takes no LoRA"):
+        made(name, checkpoint=str(folder))
+
+
+def test_where_a_checkpoint_lies_does_not_count(made, tmp_path: Path) -> None:
+    model = made("svd-action")
+    elsewhere = shutil.copytree(model.checkpoint, tmp_path / "elsewhere")
+    assert made("svd-action", checkpoint=str(elsewhere)).fingerprint() == model.fingerprint()
+    said = json.loads((elsewhere / "config.json").read_text())
+    (elsewhere / "config.json").write_text(json.dumps({**said, "vocabulary": said["vocabulary"][::-1]}))
+    assert made("svd-action", checkpoint=str(elsewhere)).fingerprint() != model.fingerprint()
+
+
+def test_a_lora_that_does_not_fit_on_the_gpu_is_answered_with_what_needs_less(made, monkeypatch) -> None:
+    def full(*_):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+
+    monkeypatch.setattr(checkpoint, "load_lora", full)
+    with pytest.raises(DeviceMemoryError, match=r"2\.00 GiB.*offload='model'"):
+        made("wan2.1-action")
 
 
 def test_the_base_is_what_the_checkpoint_names(made, world_model_options) -> None:

@@ -42,8 +42,10 @@ def save(
         lora: write their LoRA (peft's adapter "actions") instead of all their weights.
 
     Raises:
-        ArgumentError: encoders of different configurations.
+        ArgumentError: encoders of different configurations, or a LoRA for a pipeline that takes none.
     """
+    if lora and not takes_lora(pipeline):
+        raise ArgumentError(f"{type(pipeline).__name__} takes no LoRA: write its denoiser whole (lora=False)")
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     configs = {encoder.config for encoder in encoders.values()}
@@ -81,18 +83,26 @@ def lora_file(place: str) -> str:
     return f"pytorch_lora_weights{'_2' if place.endswith('_2') else ''}.safetensors"
 
 
-def has_lora(folder: Path, places: Sequence[str]) -> bool:
+def takes_lora(pipeline: Any) -> bool:
+    """Whether a pipeline, or a class of them, loads and saves LoRA: those of SVD and Cosmos-Predict2 do not."""
+    return hasattr(pipeline, "load_lora_weights")
+
+
+def has_lora(folder: Path, places: Sequence[str], pipeline: type) -> bool:
     """Whether the denoisers' training is kept as LoRA; else it is kept whole.
 
     Raises:
-        WeightsError: neither is there for each denoiser.
+        WeightsError: neither is there for each denoiser, or a LoRA for a pipeline that takes none.
     """
-    for kept, names in ((True, list(map(lora_file, places))), (False, [f"{place}/config.json" for place in places])):
-        if all((folder / name).is_file() for name in names):
-            return kept
+    loras = list(map(lora_file, places))
+    if takes_lora(pipeline) and all((folder / name).is_file() for name in loras):
+        return True
+    if all((folder / place / "config.json").is_file() for place in places):
+        return False
+    other = f"or {' and '.join(loras)}" if takes_lora(pipeline) else f"since {pipeline.__name__} takes no LoRA"
     raise WeightsError(
         f"{folder} holds no trained denoiser: expected {' and '.join(f'{place}/' for place in places)}, as "
-        f"save_pretrained writes, or {' and '.join(map(lora_file, places))}"
+        f"save_pretrained writes, {other}"
     )
 
 

@@ -16,6 +16,7 @@ from wiw.types import Control
 from wiw.world_models import devices
 from wiw.world_models.actions.config import ActionConfig
 from wiw.world_models.video import Clips, VideoModel
+from wiw.world_models.video.loading import memory_guard
 from wiw.world_models.video.weights import digest
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ class FollowsActions(Base):
     denoisers: ClassVar[tuple[str, ...]] = ("transformer",)
     """Their places in the pipeline."""
     every_frame: ClassVar[bool] = True
+    immaterial = (*VideoModel.immaterial, "checkpoint")
 
     checkpoint: str
     weights: str = ""
@@ -49,16 +51,19 @@ class FollowsActions(Base):
         if not self.weights:
             self.weights, self.revision = self._actions.weights, self.revision or self._actions.revision
         devices.require(self.requires)
+        import diffusers
+
         from wiw.world_models.actions import checkpoint
 
-        self._lora = checkpoint.has_lora(self._folder, self.denoisers)
+        self._lora = checkpoint.has_lora(self._folder, self.denoisers, getattr(diffusers, self.pipeline))
         super().__post_init__()
         discrete = self._actions.kind == "discrete"
         declared = {"vocabulary": self._actions.ids} if discrete else {"space": "pose7", "null_first": False}
         self.accepts = replace(self.accepts, **declared, view=self.accepts.view if discrete else "perspective")
-        if self._lora:
-            checkpoint.load_lora(self._folder, self.denoisers, self._pipeline)
-        self._attach()
+        with memory_guard(self):
+            if self._lora:
+                checkpoint.load_lora(self._folder, self.denoisers, self._pipeline)
+            self._attach()
 
     def _config(self) -> ActionConfig:
         config = ActionConfig.load(self._folder)

@@ -78,6 +78,8 @@ class VideoModel(WorldModel):
     """Rows that one call of the pipeline can take."""
     every_frame: ClassVar[bool] = False
     """Whether frame k of a clip follows action k, however long the plan: for models that know nothing of it."""
+    immaterial: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
+    """Options that frames do not depend on: where the weights lie, which tell themselves, and how they are run."""
 
     weights: str
     revision: str | None = None
@@ -172,8 +174,7 @@ class VideoModel(WorldModel):
 
     def fingerprint(self) -> str:
         """Digest of code, options, weights and versions; where the weights lie and how they are kept does not count."""
-        apart = {"weights", "revision", "offload", "batch"}
-        said = {name: value for name, value in self.describe().items() if name not in apart}
+        said = {name: value for name, value in self.describe().items() if name not in self.immaterial}
         said["device"] = str(self.device).partition(":")[0]
         return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 
