@@ -27,6 +27,7 @@ import time
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import blake2b
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +141,8 @@ class Server:
         if not self._token or (len(shown) == 1 and _same(shown[0], f"Bearer {self._token}")):
             return None
         text = "the token is missing or wrong\n"
-        return connection.respond(401, text) if hasattr(connection, "respond") else (401, [], text.encode())
+        status = HTTPStatus.UNAUTHORIZED
+        return connection.respond(status, text) if hasattr(connection, "respond") else (status, [], text.encode())
 
     async def _meet(self, client: Any) -> None:
         """One client, from its first message to its last."""
