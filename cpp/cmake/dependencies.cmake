@@ -23,6 +23,24 @@ add_library(wiw_recast INTERFACE)
 target_include_directories(wiw_recast SYSTEM INTERFACE ${WIW_RECAST_INCLUDE})
 target_link_libraries(wiw_recast INTERFACE ${WIW_RECAST} ${WIW_DETOUR})
 
+# Bullet's own CMake file names no double precision; pkg-config knows the libraries and the define that goes with them.
+find_package(PkgConfig REQUIRED)
+pkg_check_modules(WIW_BULLET REQUIRED bullet-float64)
+add_library(wiw_bullet INTERFACE)
+target_include_directories(wiw_bullet SYSTEM INTERFACE ${WIW_BULLET_INCLUDE_DIRS})
+target_compile_options(wiw_bullet INTERFACE ${WIW_BULLET_CFLAGS_OTHER})
+foreach(library BulletDynamics BulletCollision LinearMath)
+  find_library(WIW_${library} ${library}-float64 HINTS ${WIW_BULLET_LIBRARY_DIRS} REQUIRED)
+  target_link_libraries(wiw_bullet INTERFACE ${WIW_${library}})
+endforeach()
+
+find_path(WIW_URDFDOM_INCLUDE urdf_parser/urdf_parser.h PATH_SUFFIXES urdfdom REQUIRED)
+find_library(WIW_URDFDOM urdfdom_model REQUIRED)
+find_library(WIW_CONSOLE_BRIDGE console_bridge REQUIRED)
+add_library(wiw_urdfdom INTERFACE)
+target_include_directories(wiw_urdfdom SYSTEM INTERFACE ${WIW_URDFDOM_INCLUDE})
+target_link_libraries(wiw_urdfdom INTERFACE ${WIW_URDFDOM} ${WIW_CONSOLE_BRIDGE})
+
 # Headers only: stb_image decodes PNG and JPEG; EGL is opened at run time, so nothing links it.
 find_path(WIW_STB_INCLUDE stb/stb_image.h REQUIRED)
 find_path(WIW_EGL_INCLUDE EGL/egl.h REQUIRED)

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 CPP_ROWS = [
     {"core"},
     {"panorama", "scene", "action", "metrics"},
-    {"render", "nav", "planner", "reproject", "annotate"},
+    {"render", "nav", "physics", "planner", "reproject", "annotate"},
     {"env"},
 ]
 FACES = {
@@ -25,6 +25,7 @@ FACES = {
     "scenes",
     "render",
     "nav",
+    "physics",
     "action",
     "annotate",
     "reproject",

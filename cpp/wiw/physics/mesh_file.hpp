@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <Eigen/Core>
+#include <filesystem>
+#include <string>
+#include <vector>
+
+namespace wiw::physics {
+
+/// Vertices of the convex hull of a mesh file (STL, OBJ, DAE, ...) in the file's axes, node transforms applied.
+/// Throws FileError, which names file and `link`, for a file that is missing, damaged or flat.
+std::vector<Eigen::Vector3d> hull_of_file(const std::filesystem::path& path, const Eigen::Vector3d& scale,
+                                          const std::string& link);
+
+/// Where a URDF's mesh file lies: `package://NAME/REST` is searched upwards from the description's folder, as
+/// NAME/REST and as REST inside a folder of that name; other names are relative to it.
+std::filesystem::path find_mesh(const std::string& name, const std::filesystem::path& folder);
+
+}  // namespace wiw::physics

@@ -1,0 +1,215 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <console_bridge/console.h>
+#include <urdf_parser/urdf_parser.h>
+
+#include <cmath>
+#include <fstream>
+#include <limits>
+#include <mutex>
+#include <sstream>
+
+#include "wiw/core/error.hpp"
+#include "wiw/physics/articulation.hpp"
+#include "wiw/physics/mesh_file.hpp"
+
+namespace wiw::physics {
+
+namespace fs = std::filesystem;
+
+namespace {
+
+/// urdfdom tells what is wrong by logging it; the first error becomes the exception's message.
+class ErrorLog final : public console_bridge::OutputHandler {
+ public:
+  ErrorLog() { console_bridge::useOutputHandler(this); }
+  ~ErrorLog() override { console_bridge::restorePreviousOutputHandler(); }
+  ErrorLog(const ErrorLog&) = delete;
+  ErrorLog& operator=(const ErrorLog&) = delete;
+  void log(const std::string& text, console_bridge::LogLevel level, const char*, int) override {
+    if (level == console_bridge::CONSOLE_BRIDGE_LOG_ERROR && first_.empty()) first_ = text;
+  }
+  [[nodiscard]] const std::string& first() const { return first_; }
+
+ private:
+  std::string first_;
+};
+
+urdf::ModelInterfaceSharedPtr parse_xml(const std::string& text, const std::string& source) {
+  static std::mutex one_at_a_time;  // the handler is the process's
+  const std::scoped_lock lock(one_at_a_time);
+  const ErrorLog errors;
+  urdf::ModelInterfaceSharedPtr model;
+  std::string cause;
+  try {
+    model = urdf::parseURDF(text);
+    cause = errors.first();
+  } catch (const std::exception& error) {
+    cause = error.what();
+  }
+  if (!model) throw FileError(source, "not a robot description (URDF): " + (cause.empty() ? "no robot in it" : cause));
+  return model;
+}
+
+Eigen::Vector3d to_eigen(const urdf::Vector3& v) { return {v.x, v.y, v.z}; }
+
+Pose to_pose(const urdf::Pose& from, const std::string& what) {
+  Pose pose = Pose::Identity();
+  const urdf::Rotation& r = from.rotation;
+  pose.linear() = Eigen::Quaterniond(r.w, r.x, r.y, r.z).normalized().toRotationMatrix();
+  pose.translation() = to_eigen(from.position);
+  check_pose(pose, what);
+  return pose;
+}
+
+class Reader {
+ public:
+  Reader(const urdf::ModelInterface& model, std::string source, fs::path folder)
+      : model_(model), source_(std::move(source)), folder_(std::move(folder)) {}
+
+  ArticulationPtr read() {
+    add(*model_.getRoot());
+    JointLimits limits;
+    const auto vector = [&](double Range::* field) {
+      Eigen::VectorXd values(static_cast<Eigen::Index>(ranges_.size()));
+      for (std::size_t i = 0; i < ranges_.size(); ++i) values[static_cast<Eigen::Index>(i)] = ranges_[i].*field;
+      return values;
+    };
+    limits = {vector(&Range::lower), vector(&Range::upper), vector(&Range::velocity), vector(&Range::effort)};
+    return std::make_shared<Articulation>(model_.getName(), std::move(links_), std::move(joints_), std::move(limits));
+  }
+
+ private:
+  struct Range {
+    double lower, upper, velocity, effort;
+  };
+
+  void add(const urdf::Link& from) {
+    const int index = static_cast<int>(links_.size());
+    links_.push_back(to_link(from));
+    for (const urdf::JointSharedPtr& joint : from.child_joints) {
+      add_joint(*joint, index);
+      add(*model_.getLink(joint->child_link_name));
+    }
+  }
+
+  void add_joint(const urdf::Joint& from, int parent) {
+    Joint joint{.name = from.name, .parent = parent};
+    joint.origin = to_pose(from.parent_to_joint_origin_transform, "origin of joint '" + from.name + "'");
+    if (from.type != urdf::Joint::FIXED) {
+      joint.type = type_of(from);
+      joint.index = static_cast<int>(ranges_.size());
+      joint.axis = to_eigen(from.axis);
+      if (!joint.axis.allFinite() || joint.axis.norm() < 1e-9) {
+        throw ArgumentError(source_ + ": the axis of joint '" + from.name + "' has no direction");
+      }
+      joint.axis.normalize();
+      ranges_.push_back(range_of(from));
+    }
+    joints_.push_back(std::move(joint));
+  }
+
+  [[nodiscard]] JointType type_of(const urdf::Joint& joint) const {
+    if (joint.type == urdf::Joint::REVOLUTE || joint.type == urdf::Joint::CONTINUOUS) return JointType::kRevolute;
+    if (joint.type == urdf::Joint::PRISMATIC) return JointType::kPrismatic;
+    throw ArgumentError(source_ + ": joint '" + joint.name +
+                        "' is of a type that is not supported; expected fixed, revolute, continuous or prismatic");
+  }
+
+  [[nodiscard]] Range range_of(const urdf::Joint& joint) const {
+    const double inf = std::numeric_limits<double>::infinity();
+    Range range{-inf, inf, inf, inf};
+    if (joint.limits) {
+      if (joint.type != urdf::Joint::CONTINUOUS) range.lower = joint.limits->lower, range.upper = joint.limits->upper;
+      range.velocity = joint.limits->velocity;
+      range.effort = joint.limits->effort;
+    }
+    if (!(range.lower <= range.upper) || !(range.velocity > 0) || !(range.effort > 0)) {
+      throw ArgumentError(source_ + ": the limits of joint '" + joint.name +
+                          "' are impossible; expected lower <= upper, positive velocity and effort");
+    }
+    return range;
+  }
+
+  [[nodiscard]] Link to_link(const urdf::Link& from) const {
+    Link link{.name = from.name};
+    if (from.inertial) link.inertial = to_inertial(*from.inertial, from.name);
+    for (const urdf::CollisionSharedPtr& each : from.collision_array) {
+      if (!each || !each->geometry) continue;
+      link.collision.push_back(
+          {to_shape(*each->geometry, from.name), to_pose(each->origin, "collision of link '" + from.name + "'")});
+      check_part(link.collision.back(), source_ + ": link '" + from.name + "'");
+    }
+    for (const urdf::VisualSharedPtr& each : from.visual_array) {
+      if (each && each->geometry) link.visual.push_back(to_visual(*each, from.name));
+    }
+    return link;
+  }
+
+  [[nodiscard]] MassProperties to_inertial(const urdf::Inertial& from, const std::string& name) const {
+    Eigen::Matrix3d inertia;
+    inertia << from.ixx, from.ixy, from.ixz, from.ixy, from.iyy, from.iyz, from.ixz, from.iyz, from.izz;
+    if (!(from.mass >= 0) || !std::isfinite(from.mass) || !inertia.allFinite()) {
+      throw ArgumentError(source_ + ": link '" + name +
+                          "': expected a mass of zero or more, and finite inertia, got mass " +
+                          std::to_string(from.mass));
+    }
+    const MassProperties properties{.mass = from.mass, .inertia = inertia};
+    if (principal_frame(properties).moments.minCoeff() < -1e-9) {
+      throw ArgumentError(source_ + ": link '" + name + "': the inertia has a negative principal moment");
+    }
+    return moved(properties, to_pose(from.origin, "inertial of link '" + name + "'"));
+  }
+
+  [[nodiscard]] Shape to_shape(const urdf::Geometry& from, const std::string& link) const {
+    if (const auto* mesh = dynamic_cast<const urdf::Mesh*>(&from)) {
+      return ConvexHull{hull_of_file(find_mesh(mesh->filename, folder_), to_eigen(mesh->scale), link)};
+    }
+    return primitive(from);
+  }
+
+  [[nodiscard]] static Shape primitive(const urdf::Geometry& from) {
+    if (const auto* box = dynamic_cast<const urdf::Box*>(&from)) return Box{to_eigen(box->dim)};
+    if (const auto* sphere = dynamic_cast<const urdf::Sphere*>(&from)) return Sphere{sphere->radius};
+    const auto& cylinder = dynamic_cast<const urdf::Cylinder&>(from);
+    return Cylinder{cylinder.radius, cylinder.length};
+  }
+
+  [[nodiscard]] Visual to_visual(const urdf::Visual& from, const std::string& link) const {
+    Visual visual{.pose = to_pose(from.origin, "visual of link '" + link + "'")};
+    if (const auto* mesh = dynamic_cast<const urdf::Mesh*>(from.geometry.get())) {
+      visual.mesh = find_mesh(mesh->filename, folder_);
+      visual.scale = to_eigen(mesh->scale);
+    } else {
+      visual.shape = primitive(*from.geometry);
+    }
+    if (from.material) {
+      const urdf::Color& color = from.material->color;
+      visual.color = {color.r, color.g, color.b, color.a};
+    }
+    return visual;
+  }
+
+  const urdf::ModelInterface& model_;
+  const std::string source_;
+  const fs::path folder_;
+  std::vector<Link> links_;
+  std::vector<Joint> joints_;
+  std::vector<Range> ranges_;
+};
+
+}  // namespace
+
+ArticulationPtr Articulation::load(const fs::path& urdf) {
+  std::ifstream file(urdf);
+  std::stringstream text;
+  if (!file || !(text << file.rdbuf())) throw FileError(urdf.string(), "cannot be read");
+  const auto model = parse_xml(text.str(), urdf.string());
+  return Reader(*model, urdf.string(), urdf.parent_path()).read();
+}
+
+ArticulationPtr Articulation::parse(const std::string& urdf, const fs::path& folder) {
+  const auto model = parse_xml(urdf, "robot description");
+  return Reader(*model, "robot description", folder).read();
+}
+
+}  // namespace wiw::physics
