@@ -108,7 +108,7 @@ bool is_flat(const HullMesh& mesh) {
     volume +=
         (mesh.vertices[t.x()] - origin).dot((mesh.vertices[t.y()] - origin).cross(mesh.vertices[t.z()] - origin)) / 6;
   }
-  return mesh.vertices.empty() || std::abs(volume) < 1e-6 * std::pow(bounds.diagonal().norm(), 3);
+  return mesh.vertices.empty() || std::abs(volume) <= 1e-6 * std::pow(bounds.diagonal().norm(), 3);
 }
 
 }  // namespace

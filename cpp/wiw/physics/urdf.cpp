@@ -46,7 +46,9 @@ urdf::ModelInterfaceSharedPtr parse_xml(const std::string& text, const std::stri
   } catch (const std::exception& error) {
     cause = error.what();
   }
-  if (!model) throw FileError(source, "not a robot description (URDF): " + (cause.empty() ? "no robot in it" : cause));
+  if (!model || !cause.empty()) {
+    throw FileError(source, "not a robot description (URDF): " + (cause.empty() ? "no robot in it" : cause));
+  }
   return model;
 }
 

@@ -240,7 +240,8 @@ std::vector<Pose> World::simulated_link_poses(int articulation) const {
   std::vector<Pose> poses;
   for (std::size_t link = 0; link < model.group_of_link.size(); ++link) {
     const int group = model.group_of_link[link];
-    const Pose first = arm.frame_pose(group) * model.groups[static_cast<std::size_t>(group)].frame.pose.inverse();
+    const Pose first =
+        arm.simulated_frame_pose(group) * model.groups[static_cast<std::size_t>(group)].frame.pose.inverse();
     poses.push_back(first * model.T_group_link[link]);
   }
   return poses;

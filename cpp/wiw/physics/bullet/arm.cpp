@@ -24,6 +24,14 @@ btQuaternion rotation(const Eigen::Matrix3d& matrix) {
   return q;
 }
 
+/// Bullet integrates even a fixed base, which normalises its rotation at every step: it has to be one that stays.
+void place_base(btMultiBody& body, const Pose& pose) {
+  body.setBaseWorldTransform(to_bullet(pose));
+  btQuaternion rotation = body.getWorldToBaseRot();
+  for (int i = 0; i < 16; ++i) rotation.normalize();
+  body.setWorldToBaseRot(rotation);
+}
+
 }  // namespace
 
 ArmModel::ArmModel(ArticulationPtr source) : articulation(std::move(source)) {
@@ -86,7 +94,7 @@ void Arm::make_links() {
   const std::vector<LinkGroup>& groups = model_->groups;
   const int links = static_cast<int>(groups.size()) - 1;
   body_ = std::make_unique<btMultiBody>(links, groups[0].mass, to_bullet(groups[0].frame.moments), true, false);
-  body_->setBaseWorldTransform(to_bullet(Pose(T_world_base_ * groups[0].frame.pose)));
+  place_base(*body_, T_world_base_ * groups[0].frame.pose);
   link_of_joint_.resize(static_cast<std::size_t>(articulation().dof()));
   for (int i = 0; i < links; ++i) {
     const LinkGroup& group = groups[static_cast<std::size_t>(i) + 1];
@@ -202,6 +210,15 @@ void Arm::set_forces(const Eigen::VectorXd& forces) {
 }
 
 Pose Arm::frame_pose(int group) const {
+  const LinkGroup& of = model_->groups[static_cast<std::size_t>(group)];
+  return T_world_base_ * articulation().forward_kinematics(positions())[static_cast<std::size_t>(of.joint + 1)] *
+         of.frame.pose;
+}
+
+Pose Arm::simulated_frame_pose(int group) const {
+  btAlignedObjectArray<btQuaternion> rotations;
+  btAlignedObjectArray<btVector3> origins;
+  body_->forwardKinematics(rotations, origins);
   return to_eigen(group == 0 ? body_->getBaseWorldTransform() : body_->getLink(group - 1).m_cachedWorldTransform);
 }
 

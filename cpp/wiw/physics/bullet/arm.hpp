@@ -59,8 +59,10 @@ class Arm {
   void set_targets(const Eigen::VectorXd& targets);
   void set_forces(const Eigen::VectorXd& forces);
 
-  /// T_world_frame of a group's principal frame, as Bullet holds it.
+  /// T_world_frame of a group's principal frame, by forward kinematics.
   [[nodiscard]] Pose frame_pose(int group) const;
+  /// The same by Bullet's.
+  [[nodiscard]] Pose simulated_frame_pose(int group) const;
 
  private:
   void make_links();

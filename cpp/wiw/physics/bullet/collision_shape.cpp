@@ -12,7 +12,7 @@ namespace wiw::physics {
 namespace {
 
 /// Bullet rounds hulls off outwards by this much (its default, 4 cm, is the size of the things we grasp).
-constexpr double kMargin = 0.001;
+constexpr double kMargin = 1e-4;
 /// Cylinders are prisms to Bullet: flat faces stand firmly, where smooth ones touch in one wandering point.
 constexpr int kCylinderSides = 32;
 constexpr double kPi = 3.14159265358979323846;

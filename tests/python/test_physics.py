@@ -1,0 +1,380 @@
+# SPDX-License-Identifier: Apache-2.0
+"""wiw.physics: the Panda's kinematics against NumPy, solving, paths, grasping, forks, and refusals."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from concurrent.futures import ThreadPoolExecutor
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import wiw
+from wiw.errors import ArgumentError, FileError
+from wiw.physics import (
+    PANDA_READY,
+    PANDA_TCP,
+    Articulation,
+    Box,
+    ConvexHull,
+    Cylinder,
+    Gripper,
+    InverseKinematics,
+    Sphere,
+    World,
+    panda,
+    place,
+)
+
+URDF = Path(wiw.__file__).parent / "configs/robots/panda.urdf"
+DOWN = (np.pi, 0, 0)
+LIMITS = panda().limits
+TCP = panda().link_index(PANDA_TCP)
+
+shares = st.lists(st.floats(0, 1), min_size=9, max_size=9).map(np.array)
+
+
+def within_limits(share: np.ndarray) -> np.ndarray:
+    return LIMITS["lower"] + share * (LIMITS["upper"] - LIMITS["lower"])
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    skew = (a[:3, :3].T @ b[:3, :3] - b[:3, :3].T @ a[:3, :3]) / 2
+    return float(np.arctan2(np.linalg.norm(skew[[2, 0, 1], [1, 2, 0]]), (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2))
+
+
+def forward_twin(q: np.ndarray) -> dict[str, np.ndarray]:
+    """Every link's pose from the numbers in the URDF, by Rodrigues' formula."""
+    root = ET.parse(URDF).getroot()
+    index = {name: i for i, name in enumerate(panda().joints)}
+    joints = {joint.find("child").get("link"): joint for joint in root.iter("joint")}
+
+    def numbers(element: ET.Element | None, key: str) -> list[float]:
+        text = "" if element is None else element.get(key, "")
+        return [float(x) for x in text.split()] or [0.0] * 3
+
+    def pose(link: str) -> np.ndarray:
+        if link not in joints:
+            return np.eye(4)
+        joint = joints[link]
+        origin = place(*numbers(joint.find("origin"), "xyz"), rpy=numbers(joint.find("origin"), "rpy"))
+        moved = np.eye(4)
+        if joint.get("type") != "fixed":
+            axis, value = np.array(numbers(joint.find("axis"), "xyz")), q[index[joint.get("name")]]
+            cross = np.cross(np.eye(3), axis)
+            if joint.get("type") == "prismatic":
+                moved[:3, 3] = value * axis
+            else:
+                moved[:3, :3] = np.eye(3) + np.sin(value) * cross + (1 - np.cos(value)) * cross @ cross
+        return pose(joint.find("parent").get("link")) @ origin @ moved
+
+    return {link.get("name"): pose(link.get("name")) for link in root.iter("link")}
+
+
+def table_and_arm(cubes: int = 0) -> World:
+    world = World()
+    world.add_body(Box([1.5, 1.5, 0.1]), T_world_body=place(0.4, z=-0.05), name="table", friction=0.8)
+    world.add_articulation(panda())
+    world.set_joint_positions(PANDA_READY)
+    for i in range(cubes):
+        at = place(0.4 + 0.12 * (i % 2), 0.14 * (i // 2) - 0.14, 0.02, rpy=(0, 0, 0.2 * i))
+        world.add_body(Box([0.04] * 3), mass=0.1, T_world_body=at, friction=0.8)
+    return world
+
+
+def go(world: World, target: np.ndarray, **options: object) -> None:
+    path = world.plan_linear(target, PANDA_TCP, **options)
+    assert path.reason == "free" and path.free == 1
+    assert world.follow(path)
+
+
+@given(share=shares)
+@settings(max_examples=40, deadline=None)
+def test_forward_kinematics_follows_the_description(share: np.ndarray) -> None:
+    q = within_limits(share)
+    expected = forward_twin(q)
+    for link, pose in zip(panda().links, panda().forward_kinematics(q), strict=True):
+        assert np.allclose(pose, expected[link], atol=1e-12)
+
+
+def test_bullet_agrees_on_every_link() -> None:
+    world, rng = World(), np.random.default_rng(0)
+    world.add_articulation(panda(), place(0.3, -0.2, 0.1, rpy=(0.1, 0.2, 0.3)))
+    for _ in range(30):
+        world.set_joint_positions(within_limits(rng.random(9)))
+        assert np.abs(world.link_poses() - world.simulated_link_poses()).max() < 1e-12
+
+
+@given(share=shares)
+@settings(max_examples=100, deadline=None)
+def test_inverse_kinematics_reaches_whatever_can_be_reached(share: np.ndarray) -> None:
+    target = panda().forward_kinematics(within_limits(share))[TCP]
+    result = InverseKinematics(panda(), PANDA_TCP)(target, PANDA_READY, restarts=200)
+    assert result.reached and result.reason == "reached"
+    reached = panda().forward_kinematics(result.joints)[TCP]
+    assert np.linalg.norm(reached[:3, 3] - target[:3, 3]) < 1e-4 and angle(reached, target) < 1e-3
+    assert (result.joints >= LIMITS["lower"]).all() and (result.joints <= LIMITS["upper"]).all()
+    assert np.array_equal(result.joints[7:], PANDA_READY[7:])
+
+
+def test_the_default_restarts_reach_nearly_every_pose_and_repeat_themselves() -> None:
+    rng, ik = np.random.default_rng(1), InverseKinematics(panda(), PANDA_TCP)
+    targets = [panda().forward_kinematics(within_limits(rng.random(9)))[TCP] for _ in range(1000)]
+    results = [ik(target, PANDA_READY) for target in targets]
+    assert np.mean([result.reached for result in results]) > 0.995
+    again = [ik(target, PANDA_READY) for target in targets]
+    assert all(np.array_equal(a.joints, b.joints) for a, b in zip(results, again, strict=True))
+
+
+def test_inverse_kinematics_says_why_not() -> None:
+    ik = InverseKinematics(panda(), PANDA_TCP)
+    assert ik(place(3, 0, 0), PANDA_READY).reason == "out of reach"
+    inside = ik(place(0, 0, 0.05, rpy=DOWN), PANDA_READY)
+    assert not inside.reached and inside.reason in {"joint limits", "not converged"} and inside.attempts == 31
+    for bad in (np.full((4, 4), np.nan), np.eye(3), 2 * np.eye(4), np.diag([1, 1, -1, 1])):
+        with pytest.raises(ArgumentError):
+            ik(bad, PANDA_READY)
+    with pytest.raises(ArgumentError, match="panda_hand_tcp"):
+        InverseKinematics(panda(), "panda_toe")
+
+
+def test_a_straight_path_is_straight() -> None:
+    world = table_and_arm()
+    start = world.link_poses()[TCP]
+    target = place(0.5, 0.25, 0.3, rpy=(np.pi, 0.3, 1.0))
+    path = world.plan_linear(target, PANDA_TCP)
+    assert path.reason == "free" and len(path.joints) == path.waypoints
+    poses = np.array([panda().forward_kinematics(q)[TCP] for q in path.joints])
+    share = np.linspace(0, 1, path.waypoints)
+    assert np.allclose(poses[:, :3, 3], start[:3, 3] + share[:, None] * (target - start)[:3, 3], atol=2e-4)
+    turned = np.array([angle(start, pose) for pose in poses])
+    assert np.allclose(turned, share * angle(start, target), atol=3e-3)
+    before = world.snapshot().numbers
+    assert world.follow(path) and not np.array_equal(world.snapshot().numbers, before)
+    reached = world.link_poses()[TCP]
+    assert np.linalg.norm(reached[:3, 3] - target[:3, 3]) < 2e-3 and angle(reached, target) < 5e-3
+
+
+def test_a_path_ends_where_the_arm_would_touch_something() -> None:
+    world = table_and_arm()
+    wall = world.add_body(Box([0.02, 0.6, 0.6]), T_world_body=place(0.45, 0, 0.4), name="wall")
+    before = world.snapshot().numbers
+    path = world.plan_linear(place(0.6, 0, 0.45, rpy=DOWN), PANDA_TCP)
+    assert path.reason == "collision" and 0 < path.free < 0.9
+    assert wall in (path.contact.a.body, path.contact.b.body) and world.body_name(wall) == "wall"
+    assert np.array_equal(world.snapshot().numbers, before)
+    assert world.plan_linear(place(0.6, 0, 0.45, rpy=DOWN), PANDA_TCP, allowed=[wall]).reason == "free"
+    under = table_and_arm().plan_linear(place(0.4, 0.1, -0.05, rpy=DOWN), PANDA_TCP)
+    assert under.reason == "collision" and 0 in (under.contact.a.body, under.contact.b.body)
+    assert table_and_arm().plan_linear(place(2, 0, 0.4, rpy=DOWN), PANDA_TCP).reason != "free"
+
+
+def test_a_cube_is_grasped_carried_and_let_go() -> None:
+    world = table_and_arm(cubes=4)
+    world.step(24)
+    gripper, cube = Gripper(world), 3
+    at = world.body_poses()[cube]
+    yaw = np.arctan2(at[1, 0], at[0, 0])
+    go(world, place(*at[:3, 3] + [0, 0, 0.12], rpy=(np.pi, 0, yaw)))
+    go(world, place(*at[:3, 3], rpy=(np.pi, 0, yaw)))
+    assert gripper.opening > 0.99 and gripper.held is None
+    assert gripper.close() == cube == gripper.held == gripper.between()
+    assert gripper.opening == pytest.approx(0.5, abs=0.01)
+    held = np.linalg.inv(world.link_poses()[TCP]) @ world.body_poses()[cube]
+    go(world, place(0.5, 0.1, 0.35, rpy=(np.pi, 0.3, yaw + 0.5)))
+    now = np.linalg.inv(world.link_poses()[TCP]) @ world.body_poses()[cube]
+    assert np.linalg.norm(now[:3, 3] - held[:3, 3]) < 2e-3 and angle(now, held) < np.radians(2)
+    assert gripper.between() == cube  # the fingers press on
+    others = [i for i in range(1, 5) if i != cube]
+    assert np.abs(world.body_velocities()[others]).max() < 0.02
+    gripper.open()
+    assert gripper.held is None and gripper.opening > 0.95
+    world.step(240)
+    assert world.body_poses()[cube][2, 3] < 0.1
+
+
+def test_what_is_held_is_checked_against_the_world_too() -> None:
+    world = table_and_arm()
+    pole = world.add_body(Box([0.02, 0.02, 0.3]), mass=0.05, T_world_body=place(0.4, 0, 0.15), friction=0.8)
+    go(world, place(0.4, 0, 0.28, rpy=DOWN))
+    assert Gripper(world).close() == pole
+    go(world, place(0.4, 0, 0.4, rpy=DOWN), allowed=[0])
+    lower = world.plan_linear(place(0.4, 0, 0.15, rpy=DOWN), PANDA_TCP)
+    assert lower.reason == "collision" and {lower.contact.a.body, lower.contact.b.body} == {0, pole}
+
+
+def test_closing_on_nothing_holds_nothing() -> None:
+    world = table_and_arm()
+    gripper = Gripper(world)
+    assert gripper.close() is None and gripper.opening < 0.02
+    gripper.open(0.5)
+    assert gripper.opening == pytest.approx(0.5, abs=0.01)
+    for bad in (-0.1, 1.1, np.nan):
+        with pytest.raises(ArgumentError, match="opening"):
+            gripper.open(bad)
+
+
+def episode(seed: int) -> np.ndarray:
+    rng, world = np.random.default_rng(seed), table_and_arm(cubes=4)
+    for _ in range(6):
+        world.set_joint_targets(within_limits(rng.random(9)))
+        world.step(80)
+    return world.snapshot().numbers
+
+
+def test_episodes_repeat_to_the_bit_over_runs_and_threads() -> None:
+    first = [episode(seed) for seed in range(3)]
+    assert not np.array_equal(first[0], first[1])
+    with ThreadPoolExecutor(3) as pool:
+        for again in ([episode(seed) for seed in range(3)], list(pool.map(episode, range(3)))):
+            assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+def test_a_fork_goes_on_as_the_original_grasping_included() -> None:
+    world, rng = table_and_arm(cubes=4), np.random.default_rng(0)
+    x, y, z = world.body_poses()[2][:3, 3]
+    go(world, place(x, y, z + 0.1, rpy=(np.pi, 0, 0.2)))
+    for height in (0.05, 0.0, 0.15):
+        fork = world.fork()
+        for each in (world, fork):
+            each.follow(each.plan_linear(place(x, y, z + height, rpy=(np.pi, 0, 0.2)), PANDA_TCP))
+            if height == 0:
+                assert Gripper(each).close() == 2
+        assert np.array_equal(world.snapshot().numbers, fork.snapshot().numbers)
+    state = world.snapshot()
+    target = within_limits(rng.random(9))
+    ends = []
+    for _ in range(2):
+        world.restore(state)
+        world.set_joint_targets(target)
+        world.step(120)
+        ends.append(world.snapshot().numbers)
+    assert np.array_equal(*ends)
+
+
+def test_thrown_at_random_targets_the_arm_stays_within_limits_and_out_of_the_table() -> None:
+    world, rng = table_and_arm(cubes=4), np.random.default_rng(3)
+    for _ in range(15):
+        world.set_joint_targets(within_limits(rng.random(9)))
+        for _ in range(8):
+            world.step(10)
+            q = world.joint_positions()
+            assert (q > LIMITS["lower"] - 0.05).all() and (q < LIMITS["upper"] + 0.05).all()
+            assert np.isfinite(world.snapshot().numbers).all()
+            assert (world.link_poses()[: TCP + 1, 2, 3] > -0.06).all()
+
+
+def test_bad_input_is_refused_and_changes_nothing() -> None:
+    world = table_and_arm(cubes=1)
+    before = world.snapshot().numbers
+    nan = np.full(9, np.nan)
+    calls = [
+        lambda: world.set_joint_targets(nan),
+        lambda: world.set_joint_targets(PANDA_READY[:7]),
+        lambda: world.set_joint_targets(PANDA_READY + 5),
+        lambda: world.set_joint_positions(nan),
+        lambda: world.set_joint_forces(np.full(9, -1.0)),
+        lambda: world.set_joint_targets(PANDA_READY, 3),
+        lambda: world.plan_linear(place(np.nan), PANDA_TCP),
+        lambda: world.plan_linear(place(0.5), "panda_toe"),
+        lambda: world.plan_linear(place(0.5), PANDA_TCP, allowed=[99]),
+        lambda: world.follow(world.plan_linear(place(0.4, 0, 0.4, rpy=DOWN), PANDA_TCP), speed=2),
+        lambda: world.attach("panda_hand", 0),
+        lambda: world.add_body(Sphere(-1)),
+        lambda: world.add_body([]),
+        lambda: world.add_body(Box([0.1, 0.1, 0.1]), mass=-1),
+        lambda: world.add_body(ConvexHull(np.zeros((5, 3)))),
+        lambda: world.add_body(Cylinder(0.1, 0.1), restitution=np.nan),
+        lambda: world.restore(World().snapshot()),
+        lambda: World(time_step=0),
+        lambda: Gripper(world, hand="paw"),
+    ]
+    for number, call in enumerate(calls):
+        with pytest.raises(ArgumentError):
+            call()
+            pytest.fail(f"call {number} was not refused")
+    assert np.array_equal(world.snapshot().numbers, before)
+
+
+def robot(link: str = "", joint: str = "") -> str:
+    return f"""<robot name="r"><link name="a"/><link name="b">{link}</link>
+      <joint name="j" type="revolute"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>
+      {joint or '<limit lower="-1" upper="1" velocity="1" effort="1"/>'}</joint></robot>"""
+
+
+MASS = '<inertial><mass value="{}"/><inertia ixx="{}" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+
+
+@pytest.mark.parametrize(
+    ("urdf", "error", "words"),
+    [
+        ("", FileError, "URDF"),
+        ("<robot", FileError, "URDF"),
+        ("<robot name='x'><link name='a'/><link name='b'/></robot>", FileError, "URDF"),
+        (robot(MASS.format(-1, 1)), ArgumentError, "mass"),
+        (robot(MASS.format("nan", 1)), FileError, "mass"),
+        (robot(MASS.format(1, -5)), ArgumentError, "negative principal moment"),
+        (robot(joint='<limit lower="2" upper="1" velocity="1" effort="1"/>'), ArgumentError, "limits of joint 'j'"),
+        (robot(joint='<limit lower="0" upper="1" velocity="0" effort="1"/>'), ArgumentError, "limits of joint 'j'"),
+        (robot('<collision><geometry><mesh filename="gone.stl"/></geometry></collision>'), FileError, r"gone.stl.*'b'"),
+        (robot('<collision><geometry><box size="1 0 1"/></geometry></collision>'), ArgumentError, "box size"),
+        (robot().replace("revolute", "planar"), ArgumentError, "not supported"),
+    ],
+)
+def test_descriptions_that_cannot_be_are_refused(urdf: str, error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        Articulation.from_text(urdf)
+
+
+def test_a_missing_description_is_named() -> None:
+    with pytest.raises(FileError, match=r"nowhere\.urdf"):
+        Articulation("nowhere.urdf")
+
+
+def test_meshes_are_read_as_their_hulls(tmp_path: Path) -> None:
+    corners = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+    faces = [(1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)]
+    text = "".join(f"v {x} {y} {z}\n" for x, y, z in corners) + "".join(f"f {' '.join(map(str, f))}\n" for f in faces)
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/cube.obj").write_text(text)
+    mesh = '<mesh filename="package://some_robot/meshes/cube.obj" scale="0.1 0.1 0.1"/>'
+    urdf = robot(f"<collision><geometry>{mesh}</geometry></collision>")
+    folder = tmp_path / "some_robot"
+    (folder / "urdf").mkdir(parents=True)
+    (tmp_path / "meshes").rename(folder / "meshes")
+    (folder / "urdf/r.urdf").write_text(urdf)
+    world = World()
+    world.add_articulation(Articulation(folder / "urdf/r.urdf"))
+    ball = world.add_body(Sphere(0.05), mass=0.1, T_world_body=place(0.05, 0.05, 0.149))
+    contacts = world.contacts()
+    assert contacts and contacts[0].distance == pytest.approx(-0.001, abs=2e-4)
+    assert {contacts[0].a.body, contacts[0].b.body} == {ball, -1}
+    (folder / "meshes/cube.obj").write_bytes(b"\0" * 64)
+    with pytest.raises(FileError, match=r"cube.obj.*'b'"):
+        Articulation(folder / "urdf/r.urdf")
+
+
+def test_the_real_description_is_the_same_arm() -> None:
+    try:
+        files = metadata.files("example-robot-data") or []
+    except metadata.PackageNotFoundError:
+        pytest.skip("needs example-robot-data")
+    path = next(file for file in files if str(file).endswith("panda_description/urdf/panda.urdf"))
+    real, rng = Articulation(path.locate()), np.random.default_rng(0)
+    assert real.joints == panda().joints
+    for _ in range(20):
+        q = within_limits(rng.random(9))
+        ours = dict(zip(panda().links, panda().forward_kinematics(q), strict=True))
+        for link, pose in zip(real.links, real.forward_kinematics(q), strict=True):
+            assert np.allclose(pose, ours[link], atol=1e-9)
+    for name, mass in zip(real.links, real.masses, strict=True):
+        assert mass == pytest.approx(panda().masses[panda().link_index(name)])
+    world = World()
+    world.add_articulation(real)
+    world.set_joint_positions(PANDA_READY)
+    world.step(240)
+    assert np.abs(world.joint_positions() - PANDA_READY).max() < 1e-3
