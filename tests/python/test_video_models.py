@@ -315,6 +315,17 @@ def test_a_missing_package_is_named_with_the_extra(monkeypatch):
         wiw.world_model("wan2.1", weights="/models/wan")
 
 
+def test_a_tokenizer_that_takes_protobuf_to_read_says_so(made, world_model_options, tmp_path, monkeypatch):
+    folder = shutil.copytree(world_model_options("ltx")["weights"], tmp_path / "copy")
+    (folder / "tokenizer/spiece.model").write_bytes(b"")
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "google.protobuf" else find(name))
+    made("ltx", weights=folder)  # has tokenizer.json too
+    (folder / "tokenizer/tokenizer.json").unlink()
+    with pytest.raises(DependencyError, match=r"google\.protobuf not installed; pip install 'wiw\[diffusers\]'"):
+        made("ltx", weights=folder)
+
+
 def test_weights_that_are_not_there_or_of_another_model(made, world_model_options, tmp_path):
     def refused(name: str, weights, kind: str, said: str) -> None:
         with pytest.raises(WeightsError, match=said) as refusal:

@@ -138,7 +138,14 @@ class Requirements:
 
     def missing(self) -> list[str]:
         """Packages that are not installed; nothing is imported."""
-        return [name for name in self.packages if importlib.util.find_spec(name) is None]
+        return [name for name in self.packages if not _is_installed(name)]
+
+
+def _is_installed(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:  # of the package that it would be in
+        return False
 
 
 class WorldModel(ABC):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from wiw.errors import ArgumentError, WeightsError
 from wiw.world_models import devices
+from wiw.world_models.base import Requirements
 
 if TYPE_CHECKING:
     from wiw.world_models.video.model import VideoModel
@@ -23,11 +24,13 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
     """The pipeline, ready to be called; `components` are parts of it that are not in the folder.
 
     Raises:
+        DependencyError: a tokenizer is kept in a form that takes another package to read.
         WeightsError: files are missing or damaged.
         DeviceMemoryError: it does not fit on the device.
     """
     import diffusers
 
+    _require_readers(folder)
     with memory_guard(model), _no_bars():
         try:
             pipeline = getattr(diffusers, model.pipeline).from_pretrained(
@@ -42,6 +45,13 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
         pipeline.set_progress_bar_config(disable=True)
         _place(pipeline, model)
     return pipeline
+
+
+def _require_readers(folder: Path) -> None:
+    """Raises DependencyError where a tokenizer is sentencepiece's model alone and what reads that is not installed."""
+    models = [*folder.glob("*/spiece.model"), *folder.glob("*/tokenizer.model")]
+    if any(not model.with_name("tokenizer.json").is_file() for model in models):
+        devices.require(Requirements(("sentencepiece", "google.protobuf"), "diffusers"))
 
 
 @contextmanager
