@@ -27,6 +27,7 @@ from test_loop_poses import asked, plan_of
 from wiw.world_models.actions import checkpoint
 from wiw.world_models.actions.encoder import HIDDEN, ActionEncoder
 from wiw.world_models.actions.injection import Injection
+from wiw.world_models.actions.model import PANORAMA
 
 NAMES = [
     "svd-action",
@@ -214,6 +215,8 @@ def test_poses_steer_a_front_view(made, world_model_options, tmp_path: Path) -> 
 
     assert np.abs(told(0.7) - told(1.5)).mean() > 0.02
     assert options["frames"] == model.frames
+    usual = made("svd-action", checkpoint=str(folder), size=PANORAMA)
+    assert usual.size == usual.accepts.size == (448, 448) and pickle.loads(pickle.dumps(usual)).size == (448, 448)
     (rollouts,) = asked(model, [plan_of(5, 0.3), plan_of(5, 0.7)]).rollouts
     assert [rollout.frames.shape for rollout in rollouts] == [(5, 48, 48, 3)] * 2
     assert np.abs(rollouts[0].frames.astype(int) - rollouts[1].frames).mean() > 0.02

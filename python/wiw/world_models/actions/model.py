@@ -25,9 +25,15 @@ else:
     Base = object
 
 
+PANORAMA = (576, 1024)
+
+
 @dataclass(kw_only=True, eq=False)
 class FollowsActions(Base):
     """Makes a `VideoModel` follow actions: put it in front of one as a base class.
+
+    Primitives lead through panoramas; poses of a gripper are seen in the front view, 480x480 (SVD: 448x448) as in the
+    paper unless `size` says otherwise.
 
     Args:
         checkpoint: folder with the action encoder and the trained denoiser; see `checkpoint.py`.
@@ -39,6 +45,8 @@ class FollowsActions(Base):
     denoisers: ClassVar[tuple[str, ...]] = ("transformer",)
     """Their places in the pipeline."""
     every_frame: ClassVar[bool] = True
+    front: ClassVar[tuple[int, int]] = (480, 480)
+    """Size of the views in which poses are seen."""
     immaterial = (*VideoModel.immaterial, "checkpoint")
 
     checkpoint: str
@@ -48,6 +56,8 @@ class FollowsActions(Base):
         self.checkpoint = str(self.checkpoint)
         self._folder = Path(self.checkpoint).expanduser()
         self._actions = self._config()
+        if self._actions.kind == "pose7" and self.size is PANORAMA:  # nobody has said another
+            self.size = self.front
         if not self.weights:
             self.weights, self.revision = self._actions.weights, self.revision or self._actions.revision
         devices.require(self.requires)

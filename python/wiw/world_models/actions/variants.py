@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from wiw.world_models.actions.model import FollowsActions
+from wiw.world_models.actions.model import PANORAMA, FollowsActions
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.cosmos_predict2 import CosmosPredict2
 from wiw.world_models.ltx import LTX
@@ -28,8 +28,9 @@ class SVDAction(FollowsActions, SVD):
     requires = with_checkpoint(SVD)
     base = "svd"
     denoisers = ("unet",)
+    front = (448, 448)
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
 
 
 @dataclass(kw_only=True, eq=False)
@@ -40,7 +41,7 @@ class LTXAction(FollowsActions, LTX):
     requires = with_checkpoint(LTX)
     base = "ltx"
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
     frames: int = 17
     guidance: float = 1.0
 
@@ -53,7 +54,7 @@ class Wan21Action(FollowsActions, Wan21):
     requires = with_checkpoint(Wan21)
     base = "wan2.1"
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
     frames: int = 13
     guidance: float = 1.0
 
@@ -66,7 +67,7 @@ class Wan22SmallAction(FollowsActions, Wan22Small):
     requires = with_checkpoint(Wan22Small)
     base = "wan2.2-5b"
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
     frames: int = 13
     guidance: float = 1.0
 
@@ -80,7 +81,7 @@ class Wan22Action(FollowsActions, Wan22):
     base = "wan2.2-a14b"
     denoisers = ("transformer", "transformer_2")
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
     frames: int = 13
     guidance: float = 1.0
 
@@ -93,6 +94,6 @@ class CosmosPredict2Action(FollowsActions, CosmosPredict2):
     requires = with_checkpoint(CosmosPredict2)
     base = "cosmos-predict2"
 
-    size: tuple[int, int] = (576, 1024)
+    size: tuple[int, int] = PANORAMA
     frames: int = 13
     guidance: float = 1.0
