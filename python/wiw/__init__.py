@@ -87,7 +87,21 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
-    from wiw import action, annotate, envs, errors, metrics, nav, panorama, physics, registry, render, reproject, scenes, types
+    from wiw import (
+        action,
+        annotate,
+        envs,
+        errors,
+        metrics,
+        nav,
+        panorama,
+        physics,
+        registry,
+        render,
+        reproject,
+        scenes,
+        types,
+    )
     from wiw.evaluation.attribute import attribute
     from wiw.evaluation.compare import compare
     from wiw.evaluation.evaluate import evaluate
