@@ -131,8 +131,10 @@ def test_a_busy_service_is_asked_again(service, made):
 
 
 def test_without_a_key_or_with_options_out_of_range(made, monkeypatch):
-    wrong = {"2 to 10": {"duration": 1}, "gen4": {"model": "gen3"}, "batch": {"batch": 0}, "square": {"size": (64, 96)}}
-    for said, options in wrong.items():
+    wrong = [("2 to 10", {"duration": 1}), ("whole seconds", {"duration": 5.5}), ("gen4", {"model": "gen3"})]
+    wrong += [("batch", {"batch": 0}), ("frames", {"frames": 1}), ("frames", {"frames": "many"})]
+    wrong += [("square", {"size": size}) for size in ((64, 96), 64, (0, 0), (1024, 1024))]
+    for said, options in wrong:
         with pytest.raises(ArgumentError, match=said):
             made(**options)
     with pytest.raises(ArgumentError, match="prompts of up to 1000"):

@@ -23,6 +23,8 @@ from wiw.world_models.runway_gen4.videos import data_uri, fetch
 
 LONGEST_PROMPT = 1000
 """UTF-16 code units that the service takes."""
+SIDE = 960
+"""Of the service's clips, in pixels."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -35,7 +37,7 @@ class RunwayGen4(WorldModel):
     Args:
         model: "gen4_turbo", or "gen4.5".
         duration: seconds of a clip, 2 to 10; each costs credits.
-        size: (height, width) of input and output, which are square; the service makes 960x960 of it.
+        size: (height, width) of input and output, square and at most 960x960, which the service makes of it.
         frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
         batch: rows that are begun at once.
         budget: credits after which nothing more is begun; None is without end.
@@ -62,9 +64,9 @@ class RunwayGen4(WorldModel):
     url: str | None = None
 
     def __post_init__(self) -> None:
-        if self.model not in ("gen4_turbo", "gen4.5") or not 2 <= self.duration <= 10:
+        if self.model not in ("gen4_turbo", "gen4.5") or self.duration not in range(2, 11):
             raise ArgumentError(
-                f"RunwayGen4: expected model gen4_turbo or gen4.5 and a duration of 2 to 10 seconds, got "
+                f"RunwayGen4: expected model gen4_turbo or gen4.5 and a duration of 2 to 10 whole seconds, got "
                 f"{self.model!r} and {self.duration!r}"
             )
         if self.batch < 1 or self.poll < 0 or not self.patience > 0:
@@ -72,9 +74,15 @@ class RunwayGen4(WorldModel):
                 f"RunwayGen4: expected a batch of at least 1, poll of at least 0 s and patience above 0 s, got "
                 f"{self.batch}, {self.poll} and {self.patience}"
             )
-        self.size = (int(self.size[0]), int(self.size[1]))
-        if self.size[0] != self.size[1]:
-            raise ArgumentError(f"RunwayGen4: clips are square, 960x960: expected such a size, got {self.size}")
+        if not isinstance(self.frames, int) or self.frames < 2:
+            raise ArgumentError(f"RunwayGen4: expected frames, a whole number of at least 2, got {self.frames!r}")
+        sides = tuple(self.size) if isinstance(self.size, list | tuple) else ()
+        if len(sides) != 2 or sides[0] != sides[1] or sides[0] not in range(1, SIDE + 1):
+            raise ArgumentError(
+                f"RunwayGen4: clips are square, {SIDE}x{SIDE}: expected size (side, side) of at most that, got "
+                f"{self.size!r}"
+            )
+        self.size = (int(sides[0]), int(sides[1]))
         self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
         devices.require(self.requires)
         self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)
@@ -114,7 +122,7 @@ class RunwayGen4(WorldModel):
             "model": self.model,
             "prompt_image": data_uri(image),
             "prompt_text": control.text,
-            "ratio": "960:960",
+            "ratio": f"{SIDE}:{SIDE}",
             "duration": self.duration,
             "seed": seed % 2**32,
         }
