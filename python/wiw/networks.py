@@ -34,18 +34,24 @@ def device(name: str | None) -> str:
     return name
 
 
+FULL = ("out of memory", "ALLOC_FAILED")
+"""What CUDA and its libraries say of a full GPU where they take memory themselves, past torch's allocator."""
+
+
 @contextmanager
 def memory_guard(what: str, cures: str) -> Iterator[None]:
-    """Turns torch's error of a full GPU into one that says what needs less.
+    """Turns the errors of a full GPU into one that says what needs less.
 
     Raises:
-        DeviceMemoryError: torch has no memory left.
+        DeviceMemoryError: there is no memory left.
     """
     import torch
 
     try:
         yield
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:
+        if not isinstance(error, torch.OutOfMemoryError) and not any(said in str(error) for said in FULL):
+            raise
         torch.cuda.empty_cache()
         raise DeviceMemoryError(f"{what} does not fit on the device ({str(error).splitlines()[0]}); {cures}") from error
 

@@ -10,6 +10,7 @@ import http.server
 import importlib.util
 import json
 import pickle
+import re
 import shutil
 import sys
 import threading
@@ -327,6 +328,8 @@ def test_a_tokenizer_that_takes_protobuf_to_read_says_so(made, world_model_optio
 
 
 def test_weights_that_are_not_there_or_of_another_model(made, world_model_options, tmp_path):
+    from safetensors.torch import load_file, save_file
+
     def refused(name: str, weights, kind: str, said: str) -> None:
         with pytest.raises(WeightsError, match=said) as refusal:
             made(name, weights=str(weights))
@@ -342,6 +345,15 @@ def test_weights_that_are_not_there_or_of_another_model(made, world_model_option
     file = copy / "transformer/diffusion_pytorch_model.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     refused("ltx", copy, "unfit", "damaged")
+    whole = load_file(Path(world_model_options("ltx")["weights"]) / "transformer" / file.name)
+    save_file({name: value for name, value in whole.items() if name != "proj_in.bias"}, file)
+    refused("ltx", copy, "unfit", r"lacks 1 parameters, such as transformer\.proj_in\.bias")
+    text = copy / "text_encoder/model.safetensors"
+    kept = text.read_bytes()
+    save_file({name: value[..., :3].contiguous() for name, value in load_file(text).items()}, text, {"format": "pt"})
+    save_file(whole, file)
+    refused("ltx", copy, "unfit", "cannot be loaded")
+    text.write_bytes(kept)
     file.unlink()
     refused("ltx", copy, "unfit", "missing")
     (copy / "model_index.json").write_text("{")
@@ -424,16 +436,36 @@ def test_weights_in_the_hubs_cache_need_no_network(hub, made, world_model_option
     assert in_hub_cache("some/model") and not in_hub_cache("some/other")
 
 
-def test_a_full_gpu_is_answered_with_the_options_that_need_less(made):
+@pytest.mark.parametrize(
+    "said",
+    [
+        "CUDA out of memory. Tried to allocate 2.00 GiB.\nmore",
+        "CUDA error: out of memory",
+        "CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`",
+    ],
+)
+def test_a_full_gpu_is_answered_with_the_options_that_need_less(said, made):
     import torch
 
     model = made("ltx", batch=4)
 
     def full(**_):
-        raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.\nmore")
+        raise (torch.OutOfMemoryError if "GiB" in said else RuntimeError)(said)
 
     model._pipeline = full
-    with pytest.raises(DeviceMemoryError, match=r"2\.00 GiB.*batch=1.*bfloat16.*offload='model'.*smaller size.*frames"):
+    first = re.escape(said.splitlines()[0])
+    with pytest.raises(DeviceMemoryError, match=rf"{first}.*batch=1.*bfloat16.*offload='model'.*smaller size.*frames"):
+        rollout(model)
+
+
+def test_other_errors_of_the_gpu_stay_what_they_are(made):
+    model = made("ltx")
+
+    def lost(**_):
+        raise RuntimeError("CUDA error: unspecified launch failure")
+
+    model._pipeline = lost
+    with pytest.raises(RuntimeError, match="launch failure"):
         rollout(model)
 
 

@@ -29,6 +29,7 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
         DeviceMemoryError: it does not fit on the device.
     """
     import diffusers
+    import torch
 
     _require_readers(folder)
     with memory_guard(model), _no_bars():
@@ -36,12 +37,15 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
             pipeline = getattr(diffusers, model.pipeline).from_pretrained(
                 folder, dtype=_dtypes(model), variant=model.variant, local_files_only=True, **components
             )
-        except (OSError, ValueError, KeyError, _safetensors_error()) as error:
+        except torch.OutOfMemoryError:
+            raise
+        except (OSError, ValueError, KeyError, RuntimeError, _safetensors_error()) as error:
             raise WeightsError(
                 f"{folder} cannot be loaded as a {model.pipeline}: {type(error).__name__}: {error}; files may be "
                 f"missing, damaged, or of another variant than {model.variant}",
                 "unfit",
             ) from error
+        _require_whole(pipeline, folder)
         pipeline.set_progress_bar_config(disable=True)
         _place(pipeline, model)
     return pipeline
@@ -52,6 +56,23 @@ def _require_readers(folder: Path) -> None:
     models = [*folder.glob("*/spiece.model"), *folder.glob("*/tokenizer.model")]
     if any(not model.with_name("tokenizer.json").is_file() for model in models):
         devices.require(Requirements(("sentencepiece", "google.protobuf"), "diffusers"))
+
+
+def _require_whole(pipeline: Any, folder: Path) -> None:
+    """Raises WeightsError where a network's files lack parameters, which diffusers leaves without values."""
+    import torch
+
+    lacking = [
+        f"{place}.{name}"
+        for place, network in pipeline.components.items()
+        if isinstance(network, torch.nn.Module)
+        for name, value in network.named_parameters()
+        if value.is_meta
+    ]
+    if lacking:
+        raise WeightsError(
+            f"{folder} lacks {len(lacking)} parameters, such as {lacking[0]}: fetch the weights again", "unfit"
+        )
 
 
 @contextmanager
