@@ -79,6 +79,21 @@ def overwriting(frames, observations, controls, seeds):
     observations.image[:] = 0
 
 
+def moving_the_plan(frames, observations, controls, seeds):
+    controls[0].viewpoints[:] = 0
+
+
+def reusing():
+    memory = np.zeros((4, 5, *DECLARED["size"], 3), np.uint8)
+
+    def spoil(frames, *_):
+        answer = memory[: len(frames), : frames.shape[1]]
+        answer[:] = frames
+        return answer
+
+    return spoil
+
+
 def raising(frames, *_):
     raise RuntimeError("CUDA error: no kernel image")
 
@@ -110,6 +125,8 @@ BROKEN = {
     "batch, seeds": (from_the_first_seed, {}, "its own seed, not the batch's from the first one"),
     "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),
     "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
+    "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
+    "memory": (reusing(), {}, "An answer lies in the memory of the one before"),
     "needs": (dark, {"needs": ("history",)}, "needs history, but a model can be given"),
     "needs, poses": (dark, {"space": "pose7"}, "plans in discrete primitives"),
 }

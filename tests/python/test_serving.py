@@ -13,6 +13,7 @@ import subprocess
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import chain
 
 import msgpack
@@ -408,6 +409,30 @@ def test_nobody_there():
 def test_addresses_that_are_none(address):
     with pytest.raises(ArgumentError, match="remote:"):
         wiw.world_model(f"remote:{address}")
+
+
+def test_a_client_that_was_closed_says_so_at_once():
+    gate = threading.Event()
+    with served(Plain(lambda observations: gate.wait(20) and None)) as server, ThreadPoolExecutor(1) as pool:
+        client = Remote(server.address)
+        waiting = pool.submit(ask, client)
+        wait_for(lambda: server.taken)
+        begin = time.monotonic()
+        client.close()
+        for question in (waiting.result, lambda: ask(client)):
+            with pytest.raises(RemoteError, match="closed on this side"):
+                question()
+        assert time.monotonic() - begin < 60
+        gate.set()
+
+
+def test_a_row_that_is_too_large_is_told_of_at_once():
+    with remote(Mixing()) as (client, _):
+        observations = seen(1, ("depth", "semantic"))
+        observations = replace(observations, history=[np.zeros((3000, *SIZE, 3), np.uint8)])
+        with pytest.raises(RemoteError, match="a history may have 64 frames") as caught:
+            client.rollout(observations, plans(1), np.zeros(1, np.uint64))
+        assert caught.value.kind == "row"
 
 
 def test_clients_threads_end_with_them():

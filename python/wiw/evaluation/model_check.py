@@ -63,9 +63,9 @@ def check_model(
         for finding in wiw.check_model(MyModel()):
             print(finding)
 
-    Looked at are type, dtype, shape, number of frames and NaN, frame 0, what it does to its inputs, whether the same
-    seeds give the same frames, whether a row depends on those beside it, whether `causal` is true, whether the plan
-    makes a difference, and how long it takes, if it answers at all.
+    Looked at are type, dtype, shape, number of frames and NaN, frame 0, what it does to its inputs and to earlier
+    answers, whether the same seeds give the same frames, whether a row depends on those beside it, whether `causal` is
+    true, whether the plan makes a difference, and how long it takes, if it answers at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
@@ -211,6 +211,12 @@ class _Check:
         if self.asking.changed:
             changed = ", ".join(sorted(self.asking.changed))
             yield Finding("inputs", f"It changes what it is given: {changed}. Work on a copy.")
+        if self.asking.reuses:
+            yield Finding(
+                "memory",
+                "An answer lies in the memory of the one before, which is still looked at when the next call is made. "
+                "Return an array of its own, as frames.copy().",
+            )
 
     def _identity(self) -> Iterator[Finding]:
         try:

@@ -21,6 +21,8 @@ from wiw.types import Conditioning, Control, Key, Proposal
 from wiw.world_models.base import WorldModel
 
 EPISODES = 2
+PLAN = ("actions", "trajectory", "viewpoints", "ids")
+"""Arrays of a control."""
 Frames = NDArray[np.uint8]
 
 
@@ -55,6 +57,9 @@ class Questions:
         """What a row took in the last call."""
         self.changed: set[str] = set()
         """What of its inputs the model has changed."""
+        self.reuses = False
+        """Whether an answer lay in the memory of the one before."""
+        self._latest: Frames | None = None
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
         """The rows of these plans of primitives, in each episode."""
@@ -99,13 +104,17 @@ class Questions:
             simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
         )
         controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
-        given: dict[str, NDArray[Any]] = {"observations.image": observations.image, "seeds": seeds}
-        for name in ("depth", "semantic"):
-            if (array := getattr(observations, name)) is not None:
-                given[f"observations.{name}"] = array
-        kept = {name: array.copy() for name, array in given.items()}
+        given = [("seeds", seeds)]
+        given += [(f"observations.{name}", getattr(observations, name)) for name in ("image", "depth", "semantic")]
+        given += [(f"control.{name}", getattr(control, name)) for control in controls for name in PLAN]
+        given = [(name, array) for name, array in given if array is not None]
+        kept = [array.copy() for _, array in given]
         frames = self._attempts.once(observations, controls, seeds)
-        self.changed |= {name for name, array in given.items() if not np.array_equal(array, kept[name])}
+        self.changed |= {
+            name for (name, array), before in zip(given, kept, strict=True) if not np.array_equal(array, before)
+        }
+        self.reuses |= self._latest is not None and np.may_share_memory(frames, self._latest)
+        self._latest = frames
         return np.array(frames)
 
 

@@ -171,7 +171,8 @@ class WorldModel(ABC):
             seeds: uint64 [B], one per row, so that results do not depend on how rows are batched.
 
         Returns:
-            uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation.
+            uint8 [B, T, H, W, 3] with T = actions + 1; frame 0 is the observation. In memory that later calls leave
+            alone: earlier answers are still looked at then.
         """
         raise NotImplementedError
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, RemoteError
+from wiw.serving.limits import HISTORY, most_bytes
 from wiw.types import Conditioning, Control
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
@@ -26,6 +27,8 @@ TOKEN = "WIW_TOKEN"
 """Environment variable with the server's token."""
 DEADLINE = 300.0
 """Seconds that a call may take where the caller sets no limit."""
+OVERHEAD = 1024
+"""Bytes of a message beside its row."""
 MARGIN = 0.05
 """Share of the caller's patience that is kept for telling it why there is no answer."""
 
@@ -80,6 +83,12 @@ class Remote(WorldModel):
             pack_row(observations, row, control, int(seed))
             for row, (control, seed) in enumerate(zip(controls, seeds, strict=True))
         ]
+        if (longest := max(map(len, rows))) > (most := most_bytes(self.accepts) - OVERHEAD):
+            raise RemoteError(
+                f"a row of {longest} bytes is more than the {most} that a server of this model takes; a history may "
+                f"have {HISTORY} frames",
+                "row",
+            )
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, 3), np.uint8)
         frames[:, 0] = observations.image
         for own, control, answer in zip(frames, controls, self._link.ask(rows, give_up), strict=True):

@@ -63,6 +63,7 @@ class Link:
         self._open: dict[bytes, _Question] = {}
         self._welcome: Future[Welcome] = Future()
         self._trouble = "not connected yet"
+        self._closed = False
         self._loop = asyncio.new_event_loop()
         self._wanted = asyncio.Event()
         self._outbox: asyncio.Queue[_Question] | None = None
@@ -90,6 +91,8 @@ class Link:
             RemoteError: not all are there at the time `give_up` (`time.monotonic()`), or the server refuses one.
             ContractError: the served model broke its contract.
         """
+        if self._closed:
+            raise self._gone()
         questions = [_Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
         asked: Future[list[_Question]] = Future()
         self._soon(lambda: asked.set_result([self._submit(question) for question in questions]))
@@ -102,10 +105,16 @@ class Link:
             self._soon(lambda: self._leave(questions))
 
     def close(self) -> None:
-        """Ends the connection and the thread."""
+        """Ends the connection and the thread, and tells those who still wait."""
+        self._closed = True
         if self._thread.is_alive():
             self._soon(self._loop.stop)
             self._thread.join(5)
+
+    def _gone(self) -> RemoteError:
+        return RemoteError(
+            f"the connection to {self.address} was closed on this side; make the model anew", "connection"
+        )
 
     def _late(self) -> RemoteError:
         if self._outbox is None:
@@ -125,6 +134,7 @@ class Link:
         main.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             self._loop.run_until_complete(main)
+        self._give_up(self._gone())
         self._loop.close()
 
     async def _keep(self) -> None:
