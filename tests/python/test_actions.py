@@ -273,6 +273,16 @@ def test_a_lora_of_a_pipeline_that_takes_none_is_refused(name: str, made, tmp_pa
         made(name, checkpoint=str(folder))
 
 
+def test_a_lora_of_another_network_is_not_passed_over(made, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    folder = shutil.copytree(made("wan2.2-a14b-action").checkpoint, tmp_path / "checkpoint")
+    file = folder / "pytorch_lora_weights_2.safetensors"
+    save_file({name.replace("transformer.", "unet."): value for name, value in load_file(file).items()}, file)
+    with pytest.raises(WeightsError, match=r"weights_2\.safetensors holds no LoRA of the denoiser: .*'transformer\.'"):
+        made("wan2.2-a14b-action", checkpoint=str(folder))
+
+
 def test_where_a_checkpoint_lies_does_not_count(made, tmp_path: Path) -> None:
     model = made("svd-action")
     elsewhere = shutil.copytree(model.checkpoint, tmp_path / "elsewhere")

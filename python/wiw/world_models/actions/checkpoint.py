@@ -162,14 +162,19 @@ def load_lora(folder: Path, places: Sequence[str], pipeline: Any) -> None:
 
     Raises:
         DependencyError: peft is not installed.
-        WeightsError: a LoRA of other layers.
+        WeightsError: a LoRA of other layers or of another network.
     """
     devices.require(Requirements(("peft",), "diffusers"))
     for place in places:
+        file = folder / lora_file(place)
         second = {"load_into_transformer_2": True} if place.endswith("_2") else {}
         try:
             pipeline.load_lora_weights(
-                folder, weight_name=lora_file(place), adapter_name=ADAPTER, local_files_only=True, **second
+                folder, weight_name=file.name, adapter_name=ADAPTER, local_files_only=True, **second
             )
         except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
-            raise WeightsError(f"{folder / lora_file(place)} cannot be loaded ({error})", "unfit") from error
+            raise WeightsError(f"{file} cannot be loaded ({error})", "unfit") from error
+        if ADAPTER not in getattr(getattr(pipeline, place), "peft_config", {}):
+            raise WeightsError(
+                f"{file} holds no LoRA of the denoiser: expected names that begin with 'transformer.'", "unfit"
+            )
