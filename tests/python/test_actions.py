@@ -293,10 +293,10 @@ def test_where_a_checkpoint_lies_does_not_count(made, tmp_path: Path) -> None:
 
 
 def test_a_lora_that_does_not_fit_on_the_gpu_is_answered_with_what_needs_less(made, monkeypatch) -> None:
-    def full(*_):
+    def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
-    monkeypatch.setattr(checkpoint, "load_lora", full)
+    monkeypatch.setattr("diffusers.WanImageToVideoPipeline.load_lora_weights", full)
     with pytest.raises(DeviceMemoryError, match=r"2\.00 GiB.*offload='model'"):
         made("wan2.1-action")
 

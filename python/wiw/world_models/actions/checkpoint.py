@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
@@ -172,6 +173,8 @@ def load_lora(folder: Path, places: Sequence[str], pipeline: Any) -> None:
             pipeline.load_lora_weights(
                 folder, weight_name=file.name, adapter_name=ADAPTER, local_files_only=True, **second
             )
+        except torch.OutOfMemoryError:
+            raise
         except (OSError, ValueError, KeyError, RuntimeError, SafetensorError) as error:
             raise WeightsError(f"{file} cannot be loaded ({error})", "unfit") from error
         if ADAPTER not in getattr(getattr(pipeline, place), "peft_config", {}):
