@@ -79,6 +79,15 @@ py::list rooms_to_list(const Scene& scene) {
   return result;
 }
 
+py::object sun_to_dict(const Scene& scene) {
+  if (!scene.sun) return py::none();
+  py::dict result;
+  result["direction"] = py::make_tuple(scene.sun->direction.x(), scene.sun->direction.y(), scene.sun->direction.z());
+  result["strength"] = scene.sun->strength;
+  result["ambient"] = scene.sun->ambient;
+  return result;
+}
+
 py::tuple triangles_to_arrays(const Scene& scene) {
   wiw::TriangleSoup soup;
   {
@@ -144,7 +153,7 @@ void bind_scene_class(py::module_& module) {
   py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", "A scene in memory: metres, Y up, immutable.")
       .def_static("from_arrays", &wiw::bindings::scene_from_arrays, py::arg("meshes"), py::kw_only(),
                   py::arg("name") = "arrays", py::arg("textures") = py::list(), py::arg("materials") = py::list(),
-                  wiw::bindings::kFromArraysDoc)
+                  py::arg("sun") = py::none(), wiw::bindings::kFromArraysDoc)
       .def_property_readonly("name", [](const Scene& scene) { return scene.name; })
       .def_property_readonly(
           "categories", [](const Scene& scene) { return scene.categories; }, "Unique, lower case.")
@@ -162,6 +171,9 @@ void bind_scene_class(py::module_& module) {
           "instances", &instances_to_list,
           "One dict a placed object: id (what the instance image holds), name, category, attributes, "
           "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world, triangle_count.")
+      .def_property_readonly(
+          "sun", &sun_to_dict,
+          "The light that casts shadows: dict with direction (towards it), strength and ambient, or None.")
       .def_property_readonly("rooms", &rooms_to_list,
                              "One dict a room: name, type, bounds float32 [2, 3]; empty where unknown.")
       .def_property_readonly(

@@ -102,10 +102,27 @@ void add_instances(const py::dict& dict, Scene& scene) {
   }
 }
 
+Sun sun_from(const py::dict& dict) {
+  check_keys(dict, {"direction", "strength", "ambient"}, "sun");
+  Sun sun;
+  if (dict.contains("direction")) {
+    const auto array = dict["direction"].cast<Array<double>>();
+    expect_shape(array, {3}, "the sun's direction [3]");
+    const Eigen::Vector3d direction(array.at(0), array.at(1), array.at(2));
+    if (!(direction.stableNorm() > 0.0) || !direction.allFinite()) {
+      throw ArgumentError("the sun's direction must be finite and not zero");
+    }
+    sun.direction = direction.stableNormalized().cast<float>();
+  }
+  sun.strength = value_or(dict, "strength", sun.strength);
+  sun.ambient = value_or(dict, "ambient", sun.ambient);
+  return sun;
+}
+
 }  // namespace
 
 std::shared_ptr<Scene> scene_from_arrays(const py::list& meshes, const std::string& name, const py::list& textures,
-                                         const py::list& materials) {
+                                         const py::list& materials, const std::optional<py::dict>& sun) {
   auto scene = std::make_shared<Scene>();
   scene->name = name;
   scene->attributes["up"] = "Y (given as arrays)";
@@ -116,6 +133,7 @@ std::shared_ptr<Scene> scene_from_arrays(const py::list& meshes, const std::stri
     scene->meshes.push_back(mesh_from(dict));
     add_instances(dict, *scene);
   }
+  if (sun) scene->sun = sun_from(*sun);
   scene->validate();
   return scene;
 }

@@ -4,6 +4,7 @@
 #include <pybind11/pybind11.h>
 
 #include <memory>
+#include <optional>
 #include <string>
 
 #include "wiw/scene/scene.hpp"
@@ -18,9 +19,14 @@ inline constexpr const char* kFromArraysDoc =
     "str),\n"
     "    T_world_instance float [4, 4], or [N, 4, 4] to place the mesh N times.\n\n"
     "`textures` are uint8 [H, W, 4] images, row 0 on top. `materials` are dicts: name, base_color (4 floats, "
-    "display-encoded), texture (index), alpha_cutoff, emissive. Raises ArgumentError for shapes that do not fit.";
+    "display-encoded), texture (index), alpha_cutoff, emissive.\n\n"
+    "`sun` is a light from one direction that casts shadows, for surfaces without a lightmap: a dict with direction "
+    "(towards the light, of any length but zero), strength of the direct light and ambient (what is left of the "
+    "ambient light), both in [0, 1]; keys left out keep their defaults. "
+    "Raises ArgumentError for shapes that do not fit and values out of range.";
 
 std::shared_ptr<Scene> scene_from_arrays(const pybind11::list& meshes, const std::string& name,
-                                         const pybind11::list& textures, const pybind11::list& materials);
+                                         const pybind11::list& textures, const pybind11::list& materials,
+                                         const std::optional<pybind11::dict>& sun);
 
 }  // namespace wiw::bindings

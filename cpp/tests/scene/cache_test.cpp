@@ -72,6 +72,7 @@ wiw::Scene full_scene() {
   scene.instances = {instance, {2, "none"}};
   scene.rooms = {{"kitchen 1", "kitchen", Eigen::AlignedBox3f(Eigen::Vector3f(0, 1, 2), Eigen::Vector3f(3, 4, 5))}};
   scene.sky.zenith = {1, 0, 0.5f};
+  scene.sun = {{0.6f, 0, 0.8f}, 0.25f, 0.75f};
   scene.attributes = {{"up", "Y"}, {"split", "val"}};
   scene.warnings = {"something is missing"};
   return scene;
@@ -133,9 +134,22 @@ TEST_CASE("a scene comes back from its cache as it was") {
   CHECK(mapped->rooms[0].type == "kitchen");
   CHECK(mapped->sky.zenith == scene.sky.zenith);
   CHECK(mapped->sky.horizon == scene.sky.horizon);
+  CHECK(mapped->sun.has_value());
+  const wiw::Sun sun = mapped->sun.value_or(wiw::Sun{});
+  CHECK(sun.direction == Eigen::Vector3f(0.6f, 0, 0.8f));
+  CHECK(sun.strength == 0.25f);
+  CHECK(sun.ambient == 0.75f);
   CHECK(mapped->categories == scene.categories);
   CHECK(mapped->attributes == scene.attributes);
   CHECK(mapped->warnings == scene.warnings);
+}
+
+TEST_CASE("a scene without a sun comes back without one") {
+  const Folder folder;
+  wiw::Scene scene = full_scene();
+  scene.sun.reset();
+  wiw::write_scene_cache(scene, folder.path() / "scene.wiwscene");
+  CHECK_FALSE(wiw::map_scene_cache(folder.path() / "scene.wiwscene")->sun.has_value());
 }
 
 TEST_CASE("arrays of a cache are aligned views of one mapping") {
@@ -164,7 +178,7 @@ TEST_CASE("damaged, cut and foreign caches are refused") {
   std::string older = whole;
   older[8] = 0;
   CHECK_THROWS_WITH_AS(wiw::map_scene_cache(folder.write("older", older)),
-                       doctest::Contains("has version 0, expected 2"), wiw::FileError);
+                       doctest::Contains("has version 0, expected 3"), wiw::FileError);
   for (std::size_t length = 1; length < whole.size(); length += 7) {
     CHECK_THROWS_AS(wiw::map_scene_cache(folder.write("cut", whole.substr(0, length))), wiw::FileError);
   }

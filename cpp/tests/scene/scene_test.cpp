@@ -38,3 +38,20 @@ TEST_CASE("a pose is finite") {
     CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("the pose of 'thing' is not finite"), wiw::ArgumentError);
   }
 }
+
+TEST_CASE("a sun has a direction of length 1, and strengths in [0, 1]") {
+  wiw::Scene scene = one_triangle();
+  scene.sun.emplace();
+  CHECK_NOTHROW(scene.validate());
+  constexpr float kNan = std::numeric_limits<float>::quiet_NaN();
+  for (const Eigen::Vector3f& direction : {Eigen::Vector3f(0, 0, 0), Eigen::Vector3f(0, 2, 0), {0, kNan, 0}}) {
+    scene.sun = {direction};
+    CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("direction must have length 1"), wiw::ArgumentError);
+  }
+  for (const float value : {-0.1f, 1.1f, kNan}) {
+    scene.sun = {Eigen::Vector3f::UnitY(), value, 0.5f};
+    CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("strength must be in [0, 1]"), wiw::ArgumentError);
+    scene.sun = {Eigen::Vector3f::UnitY(), 0.5f, value};
+    CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("ambient must be in [0, 1]"), wiw::ArgumentError);
+  }
+}

@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/scene.hpp"
 
+#include <cmath>
+#include <utility>
+
 #include "wiw/core/error.hpp"
 
 namespace wiw {
@@ -59,9 +62,20 @@ void check_mesh(const Scene& scene, const Mesh& mesh, const std::string& name) {
   }
 }
 
+void check_sun(const Sun& sun) {
+  if (!(std::abs(sun.direction.norm() - 1.f) < 1e-3f)) {
+    throw ArgumentError("Scene: the sun's direction must have length 1, got " + std::to_string(sun.direction.norm()));
+  }
+  for (const auto& [name, value] : {std::pair{"strength", sun.strength}, std::pair{"ambient", sun.ambient}}) {
+    if (value >= 0.f && value <= 1.f) continue;
+    throw ArgumentError("Scene: the sun's " + std::string(name) + " must be in [0, 1], got " + std::to_string(value));
+  }
+}
+
 }  // namespace
 
 void Scene::validate() const {
+  if (sun) check_sun(*sun);
   for (const Texture& texture : textures) {
     if (texture.size.height < 1 || texture.size.width < 1 || texture.rgba.size() != 4 * texture.size.pixels()) {
       throw ArgumentError("Scene: texture '" + texture.name + "' has a size that does not fit its data");

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -25,7 +26,8 @@ constexpr std::int32_t kNone = -1;
 /// Surface appearance. The displayed colour of a point is, per channel and in display-encoded space,
 ///   base_color x texture(uv) x vertex colour x light,
 /// where light is 2 x lightmap(lightmap_uv) if the mesh has one (128 is neutral, so light may brighten up to 2),
-/// 1 if `emissive`, and otherwise the renderer's analytic ambient light (a function of the normal alone).
+/// 1 if `emissive`, and otherwise the renderer's analytic ambient light (a function of the normal alone), to which a
+/// scene with a `Sun` adds its direct light.
 /// Multiplying encoded values is exact for a pure power-law display encoding, so no conversion is needed per pixel.
 struct Material {
   std::string name;
@@ -71,6 +73,16 @@ struct Sky {
   Eigen::Vector3f horizon{0.86f, 0.90f, 0.94f};
 };
 
+/// One directional light that casts shadows, for scenes whose instances move, where no lightmap can be baked. Surfaces
+/// with a lightmap have their light already and emissive ones need none: both ignore the sun, but everything casts
+/// shadows, on both sides. `light` of the other materials becomes
+///   min(1, ambient x analytic ambient light + strength x max(0, cosine to the normal) x visibility).
+struct Sun {
+  Eigen::Vector3f direction{0.36f, 0.80f, 0.48f};  // towards the light, unit length
+  float strength = 0.6f;                           // of the direct light, in [0, 1]
+  float ambient = 0.55f;                           // share of the ambient light that is left, in [0, 1]
+};
+
 /// A whole scene in memory: plain data, immutable once built, shared by renderers, navigation meshes and environments.
 /// World frame: metres, Y up, right-handed.
 struct Scene {
@@ -82,13 +94,14 @@ struct Scene {
   std::vector<std::string> categories;  // unique, lower case
   std::vector<Room> rooms;              // empty where unknown
   Sky sky;
+  std::optional<Sun> sun;
   std::map<std::string, std::string> attributes;  // "up": "Z (by file header)", "split": "val", ...
   std::vector<std::string> warnings;              // what the importer had to leave out, one sentence each
 
   [[nodiscard]] std::size_t triangle_count() const;  // over placements
   [[nodiscard]] Eigen::AlignedBox3f bounds() const;  // world
   /// Throws ArgumentError naming the first broken invariant (index out of range, array length, a position or pose that
-  /// is not finite).
+  /// is not finite, a sun out of its ranges).
   void validate() const;
 };
 

@@ -6,8 +6,8 @@
 namespace wiw::cache {
 
 // What is stored of each type, in order: written once, for the writer and the reader alike. An archive offers
-// value (plain data), text, texts, pairs, array (a Buffer, with a checksum), texels (a Buffer without) and list (of
-// what has fields itself).
+// value (plain data), text, texts, pairs, array (a Buffer, with a checksum), texels (a Buffer without), and of what has
+// fields itself: list, and option (a std::optional).
 
 template <class Archive, class T>
 void fields_of(Archive& archive, T& texture)
@@ -69,6 +69,15 @@ void fields_of(Archive& archive, T& room)
 }
 
 template <class Archive, class T>
+void fields_of(Archive& archive, T& sun)
+  requires std::is_same_v<std::remove_const_t<T>, Sun>
+{
+  for (int axis = 0; axis < 3; ++axis) archive.value(sun.direction[axis]);
+  archive.value(sun.strength);
+  archive.value(sun.ambient);
+}
+
+template <class Archive, class T>
 void fields_of(Archive& archive, T& scene)
   requires std::is_same_v<std::remove_const_t<T>, Scene>
 {
@@ -85,6 +94,7 @@ void fields_of(Archive& archive, T& scene)
     archive.value(scene.sky.zenith[channel]);
     archive.value(scene.sky.horizon[channel]);
   }
+  archive.option(scene.sun);
 }
 
 }  // namespace wiw::cache

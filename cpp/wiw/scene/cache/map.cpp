@@ -55,6 +55,12 @@ class Reader {
     for (T& item : items) fields_of(*this, item);
   }
   template <class T>
+  void option(std::optional<T>& item) {
+    bool present = false;
+    value(present);
+    if (present) fields_of(*this, item.emplace());
+  }
+  template <class T>
   void array(Buffer<T>& buffer) {
     std::uint64_t checksum = 0;
     value(checksum);

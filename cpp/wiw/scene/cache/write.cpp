@@ -55,6 +55,11 @@ class Writer {
     for (const T& item : items) fields_of(*this, item);
   }
   template <class T>
+  void option(const std::optional<T>& item) {
+    value(item.has_value());
+    if (item) fields_of(*this, *item);
+  }
+  template <class T>
   void array(const Buffer<T>& buffer) {
     value(cache::array_checksum(as_bytes(buffer.data(), buffer.size() * sizeof(T))));
     texels(buffer);
