@@ -71,4 +71,12 @@ ScenePtr make_furnished() {
   return builder.build();
 }
 
+ScenePtr make_sunny() {
+  Scene scene = *make_furnished();
+  scene.sun = {Eigen::Vector3f(0.48f, 0.8f, 0.36f), 0.7f, 0.5f};
+  // The floor's light is the sun's as well, or it would show no shadows.
+  scene.meshes[0].lightmap = kNone;
+  return std::make_shared<const Scene>(scene);
+}
+
 }  // namespace wiw::testing

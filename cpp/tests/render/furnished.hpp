@@ -11,4 +11,7 @@ ScenePtr make_furnished();
 
 constexpr std::uint32_t kFurnishedSphere = 6;
 
+/// The same under a sun that reaches the floor over the open ceiling.
+ScenePtr make_sunny();
+
 }  // namespace wiw::testing

@@ -143,6 +143,26 @@ TEST_CASE("gpu: pictures agree with the ray caster's") {
   }
 }
 
+TEST_CASE("gpu: shadows of the sun agree with the ray caster's, also after a move") {
+  if (!available()) return;
+  const std::uint32_t id = kFurnishedSphere;
+  const Eigen::Affine3f moved = Eigen::Translation3f(0.1f, 0.9f, -1.3f) * Eigen::Scaling(0.7f);
+  for (const int samples : {1, 4}) {
+    const auto renderer = gpu(make_sunny(), samples);
+    const auto reference = make_cpu_renderer(make_sunny(), {.samples = samples});
+    for (const Camera& camera : {kView, kPanorama}) {
+      const bool panorama = camera.projection == Projection::kEquirectangular;
+      for (const Pose& pose : kPoses) {
+        const Difference difference = compare(draw(*reference, pose, camera), draw(*renderer, pose, camera));
+        CAPTURE(samples);
+        CAPTURE(panorama);
+        CHECK(difference.color < (panorama ? 2.5 : 0.6));
+      }
+      for (const auto& each : {renderer, reference}) each->set_poses(std::span(&id, 1), std::span(&moved, 1));
+    }
+  }
+}
+
 TEST_CASE("gpu: a batch equals its views one by one, and any subset of outputs the whole") {
   if (!available()) return;
   const auto renderer = gpu(make_furnished());

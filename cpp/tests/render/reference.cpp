@@ -2,8 +2,10 @@
 #include "render/reference.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 
+#include "wiw/render/bulge.hpp"
 #include "wiw/render/shading.hpp"
 
 namespace wiw::testing {
@@ -45,7 +47,8 @@ Reference::Reference(const Scene& scene) : scene_(scene) {
   }
 }
 
-std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vector& ray, double slack) const {
+std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vector& ray, double slack,
+                                                double nearest) const {
   std::vector<Hit> hits;
   for (const Instance& instance : scene_.instances) {
     if (!meets(bounds_[instance.id - 1], origin, ray)) continue;
@@ -61,8 +64,9 @@ std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vect
         if (std::abs(system.determinant()) < 1e-12) continue;
         const Vector solution = system.inverse() * (origin - first);
         const double least = std::min({solution[0], solution[1], 1 - solution[0] - solution[1]});
-        if (least < -slack || solution[2] < shading::kNearClip) continue;
-        hits.push_back({&mesh, &instance, i, solution[2], solution[0], solution[1], system.col(0), system.col(1)});
+        if (least < -slack || solution[2] < nearest) continue;
+        hits.push_back({&mesh, &instance, i, solution[2], solution[0], solution[1], origin + solution[2] * ray,
+                        system.col(0), system.col(1)});
       }
     }
   }
@@ -125,10 +129,25 @@ double Reference::level(const Hit& hit, const Vector& ray, double spread) const 
   return std::log2(spread * hit.t * stretch * svd.singularValues()[0]);
 }
 
-double Reference::ambient(const Hit& hit, const Vector& ray) const {
+bool Reference::sees_sun(const Vector& point, const Vector& direction, bool& doubtful) const {
+  constexpr double kSlack = 1e-4;
+  bool blocked = false;
+  bool unsure = false;
+  for (const Hit& hit : all_hits(point, direction, kSlack, -1e-5)) {
+    if (is_hole(hit, unsure)) continue;
+    if (std::min({hit.b1, hit.b2, 1 - hit.b1 - hit.b2}) > kSlack && hit.t > 1e-5) return false;
+    blocked = blocked || hit.t > 0;
+    unsure = true;
+  }
+  doubtful = doubtful || unsure;
+  return !blocked;
+}
+
+double Reference::light(const Hit& hit, const Vector& ray, bool& doubtful) const {
   Vector geometric = hit.edge_1.cross(hit.edge_2).normalized();
   if (geometric.dot(ray) > 0) geometric = -geometric;
   Vector normal = geometric;
+  double lift = 0;
   if (!hit.mesh->normals.empty()) {
     const Eigen::Matrix3d to_world = hit.instance->T_world_instance.linear().cast<double>().inverse().transpose();
     Buffer<Eigen::Vector3f> turned = [&] {
@@ -139,12 +158,34 @@ double Reference::ambient(const Hit& hit, const Vector& ray) const {
       return values;
     }();
     normal = blend(turned, *hit.mesh, hit.triangle, hit.b1, hit.b2).normalized();
-    if (normal.dot(geometric) < 0) normal = -normal;
+    if (normal.dot(geometric) < 0) {
+      normal = -normal;
+    } else {
+      std::array<Eigen::Vector3f, 3> corners;
+      std::array<Eigen::Vector3f, 3> normals;
+      for (std::size_t k = 0; k < 3; ++k) {
+        const std::uint32_t vertex = hit.mesh->triangles[hit.triangle][static_cast<Eigen::Index>(k)];
+        corners[k] = hit.instance->T_world_instance * hit.mesh->positions[vertex];
+        normals[k] = turned[vertex];
+      }
+      lift = shading::shadow_lift(static_cast<double>(triangle_bulge(corners, normals)), hit.b1, hit.b2);
+    }
   }
-  return shading::ambient_light(normal.x(), normal.y(), normal.z());
+  const double ambient = shading::ambient_light(normal.x(), normal.y(), normal.z());
+  if (!scene_.sun) return ambient;
+  const Sun& sun = *scene_.sun;
+  const Vector direction = sun.direction.cast<double>();
+  const double cosine = normal.dot(direction);
+  double visibility = 0;
+  if (cosine > 0) {
+    const Vector sunward = geometric.dot(direction) < 0 ? -geometric : geometric;
+    const Vector start = hit.point + lift * normal + shading::shadow_offset(hit.t) * sunward;
+    visibility = sees_sun(start, direction, doubtful) ? 1 : 0;
+  }
+  return shading::sun_light(ambient, cosine, visibility, sun.ambient, sun.strength);
 }
 
-Vector Reference::shade(const Hit& hit, const Vector& ray, double spread) const {
+Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& doubtful) const {
   static const Material plain;
   const Mesh& mesh = *hit.mesh;
   const Material& material = mesh.material == kNone ? plain : scene_.materials[static_cast<std::size_t>(mesh.material)];
@@ -167,7 +208,7 @@ Vector Reference::shade(const Hit& hit, const Vector& ray, double spread) const 
       const Eigen::Vector2d uv = blend(mesh.lightmap_uv, mesh, hit.triangle, hit.b1, hit.b2);
       color = 2.0 * color.cwiseProduct(bilinear(mesh.lightmap, 0, uv, false).head<3>());
     } else {
-      color *= ambient(hit, ray);
+      color *= light(hit, ray, doubtful);
     }
   }
   return 255.0 * color.cwiseMax(0.0).cwiseMin(1.0);
@@ -179,7 +220,7 @@ Reference::Sample Reference::cast(const Vector& origin, const Vector& ray, doubl
   const double zenith = shading::sky_weight(ray.normalized().y());
   sample.color = 255.0 * (zenith * scene_.sky.zenith + (1 - zenith) * scene_.sky.horizon).cast<double>();
   double nearest = -1;
-  for (const Hit& hit : all_hits(origin, ray, kSlack)) {
+  for (const Hit& hit : all_hits(origin, ray, kSlack, shading::kNearClip)) {
     const bool first = nearest < 0;
     if (!first && hit.t > nearest + 1e-3) break;
     const double least = std::min({hit.b1, hit.b2, 1 - hit.b1 - hit.b2});
@@ -191,7 +232,7 @@ Reference::Sample Reference::cast(const Vector& origin, const Vector& ray, doubl
     nearest = hit.t;
     sample.depth = hit.t;
     sample.instance = hit.instance->id;
-    sample.color = shade(hit, ray, spread);
+    sample.color = shade(hit, ray, spread, sample.doubtful);
   }
   return sample;
 }

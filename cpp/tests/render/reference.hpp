@@ -28,14 +28,15 @@ class Reference {
     const Instance* instance = nullptr;
     std::size_t triangle = 0;
     double t = 0, b1 = 0, b2 = 0;
-    Eigen::Vector3d edge_1, edge_2;
+    Eigen::Vector3d point, edge_1, edge_2;
   };
-  [[nodiscard]] std::vector<Hit> all_hits(const Eigen::Vector3d& origin, const Eigen::Vector3d& ray,
-                                          double slack) const;
+  [[nodiscard]] std::vector<Hit> all_hits(const Eigen::Vector3d& origin, const Eigen::Vector3d& ray, double slack,
+                                          double nearest) const;
   [[nodiscard]] bool is_hole(const Hit& hit, bool& doubtful) const;
-  [[nodiscard]] Eigen::Vector3d shade(const Hit& hit, const Eigen::Vector3d& ray, double spread) const;
+  [[nodiscard]] Eigen::Vector3d shade(const Hit& hit, const Eigen::Vector3d& ray, double spread, bool& doubtful) const;
   [[nodiscard]] double level(const Hit& hit, const Eigen::Vector3d& ray, double spread) const;
-  [[nodiscard]] double ambient(const Hit& hit, const Eigen::Vector3d& ray) const;
+  [[nodiscard]] double light(const Hit& hit, const Eigen::Vector3d& ray, bool& doubtful) const;
+  [[nodiscard]] bool sees_sun(const Eigen::Vector3d& point, const Eigen::Vector3d& direction, bool& doubtful) const;
   [[nodiscard]] Eigen::Vector4d bilinear(std::int32_t texture, int level, const Eigen::Vector2d& uv, bool repeat) const;
 
   const Scene& scene_;

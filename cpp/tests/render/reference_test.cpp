@@ -69,7 +69,20 @@ TEST_CASE("every kind of surface is shaded as the slow twin shades it, with ever
   }
 }
 
+TEST_CASE("light and shadows of a sun are those of the slow twin, from high, and grazing") {
+  for (const Eigen::Vector3f& direction : {Eigen::Vector3f(0.48f, 0.8f, 0.36f), Eigen::Vector3f(0.8f, 0.08f, 0.6f)}) {
+    Scene changed = *make_sunny();
+    changed.sun->direction = direction.normalized();
+    const auto scene = std::make_shared<const Scene>(changed);
+    const Reference reference(*scene);
+    for (const Camera& camera : kCameras) check_all_sets(scene, reference, look({0, 1.2, 0}, 0.4, -0.2), camera);
+  }
+}
+
 TEST_CASE("a stamp of every kind of surface, small enough for an emulated processor") {
   const ScenePtr scene = make_furnished();
-  check_all_sets(scene, Reference(*scene), look({0, 1.2, 0}, 0.4, 0.0), {Projection::kPerspective, {9, 14}, 1.7});
+  const Camera camera{Projection::kPerspective, {9, 14}, 1.7};
+  check_all_sets(scene, Reference(*scene), look({0, 1.2, 0}, 0.4, 0.0), camera);
+  const ScenePtr sunny = make_sunny();
+  check_all_sets(sunny, Reference(*sunny), look({0, 1.2, 0}, 0.4, 0.0), camera);
 }

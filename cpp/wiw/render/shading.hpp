@@ -10,6 +10,15 @@
 /// light = 2 x lightmap(lightmap_uv), or 1 if emissive, or ambient_light(normal) when there is no lightmap.
 /// An emissive material ignores its lightmap.
 ///
+/// Sun. In a scene with one, surfaces without lightmap that are not emissive have, instead of ambient_light(normal),
+///   light = min(1, ambient x ambient_light(normal) + strength x max(0, normal . direction) x visibility)
+/// with the viewer-facing shading normal. Visibility is 0 where any triangle, whichever way it faces, lies between the
+/// point and the sun, holes of alpha cutouts let through, and 1 elsewhere. The point is lifted first: by shadow_offset
+/// along the geometric normal towards the sun, against a surface shadowing itself by rounding; and where vertex normals
+/// describe a curved surface, onto that one (shadow_lift), or its facets would shadow each other where light grazes it.
+/// The ray caster decides visibility by a ray, with hard edges (colour samples smooth them); the GPU by a map of depths
+/// along the sun's direction, fitted to the scene (`gpu/sun_map.hpp`), whose edges are three texels wide.
+///
 /// Filtering. Textures repeat and are sampled trilinearly from box-filtered mip levels of the encoded values
 /// (`mipmap.hpp`). Lightmaps are clamped, bilinear, level 0 only: they are smooth, and mip levels would bleed across
 /// charts. The level of detail is log2 of the longest side, in texels, of a pixel's footprint on the surface:
@@ -39,6 +48,33 @@ template <class Number>
 [[gnu::always_inline]] inline Number ambient_light(Number nx, Number ny, Number nz) {
   return 0.80f + 0.12f * ny + 0.05f * (nx * nx - nz * nz) + 0.02f * nx;
 }
+
+/// Light under a sun: `ambient` is ambient_light(normal), `cosine` the normal times the sun's direction, `visibility`
+/// between 0 and 1.
+template <class Number>
+[[gnu::always_inline]] inline Number sun_light(Number ambient, Number cosine, Number visibility, float ambient_share,
+                                               float strength) {
+  const Number direct = cosine > 0.f ? cosine * visibility : Number{};
+  const Number light = ambient_share * ambient + strength * direct;
+  return light < 1.f ? light : Number{} + 1.f;
+}
+
+/// Metres from a surface at depth `t` to where its ray to the sun starts: beyond the rounding of the point.
+template <class Number>
+[[gnu::always_inline]] inline Number shadow_offset(Number t) {
+  return 2e-4f + 1e-5f * t;
+}
+
+/// Height of the curved surface over a triangle at barycentric coordinates u, v, for the triangle's `bulge`
+/// (`bulge.hpp`): the mean height of the tangent planes at the vertices, when all edges bend alike.
+template <class Number>
+[[gnu::always_inline]] inline Number shadow_lift(Number bulge, Number u, Number v) {
+  const Number w = 1.f - u - v;
+  return 2.f * bulge * (u * v + v * w + w * u);
+}
+
+/// The greatest shadow_lift over a triangle, in bulges: what the GPU lifts by everywhere.
+constexpr float kGreatestLift = 2.f / 3.f;
 
 /// Weight of the zenith colour in the sky for a unit direction's Y; the rest is the horizon colour.
 template <class Number>

@@ -72,6 +72,7 @@ RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f
   if (cutouts_[number].surface->alpha_cutoff >= 0.f) {
     rtcSetGeometryUserData(geometry, &cutouts_[number]);
     rtcSetGeometryIntersectFilterFunction(geometry, pierce);
+    rtcSetGeometryOccludedFilterFunction(geometry, pierce);
   }
   rtcCommitGeometry(geometry);
   return geometry;

@@ -26,11 +26,12 @@ struct alignas(64) TriangleRecord {
 constexpr int kRecordWords = 16;
 static_assert(sizeof(TriangleRecord) == 4 * kRecordWords);
 
-/// What only some triangles need: shading normals (ambient light) and vertex colours.
+/// What only some triangles need: shading normals (ambient light and sun) and vertex colours.
 struct alignas(64) TriangleDetail {
   float normal[9];         // world space at vertex 0, then differences to vertices 1 and 2; zeros: geometric normal
   std::uint32_t color[3];  // RGBA bytes at the vertices
-  std::uint32_t padding[4];
+  float bulge;             // metres; 0 without a sun
+  std::uint32_t padding[3];
 };
 static_assert(sizeof(TriangleDetail) == 4 * kRecordWords);
 
@@ -55,6 +56,12 @@ struct Surface {
   bool vertex_colors;
 };
 
+struct Sunlight {
+  float direction[3];  // unit, towards the sun
+  float strength;
+  float ambient;
+};
+
 struct KernelScene {
   RTCSceneTy* fixed;                  // never null
   RTCSceneTy* moved;                  // null while nothing has moved
@@ -62,6 +69,7 @@ struct KernelScene {
   const TriangleRecord* records;
   const TriangleDetail* details;
   const Surface* surfaces;
+  const Sunlight* sun;  // null: none
   float zenith[3];
   float horizon[3];
 };

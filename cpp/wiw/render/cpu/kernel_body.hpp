@@ -33,19 +33,6 @@ inline Directions directions(const View& view, const RayGrid& grid, int x, int y
           forward * view.forward[2] + right * view.right[2] + row * view.up[2]};
 }
 
-inline void store(float* target, Floats values) { __builtin_memcpy(target, &values, sizeof values); }
-inline void store(unsigned* target, Ints values) { __builtin_memcpy(target, &values, sizeof values); }
-inline Floats load_floats(const float* source) {
-  Floats values;
-  __builtin_memcpy(&values, source, sizeof values);
-  return values;
-}
-inline Ints load_ints(const unsigned* source) {
-  Ints values;
-  __builtin_memcpy(&values, source, sizeof values);
-  return values;
-}
-
 /// What never changes from packet to packet: Embree writes only tfar and the hit.
 inline void start_rays(RayHit& rays, const View& view) {
   store(rays.ray.org_x, Floats{} + view.origin[0]);
@@ -58,10 +45,6 @@ inline void start_rays(RayHit& rays, const View& view) {
   store(rays.ray.flags, Ints{});
 }
 
-/// Zero for components below 1e-15: Embree squares its approximate reciprocals, which overflows below about 5e-20, and
-/// such rays miss everything.
-inline Floats without_dust(Floats x) { return x * x > 1e-30f ? x : Floats{}; }
-
 /// Casts the packet through the scene's two parts; the second only replaces nearer hits. Returns the mask of hits.
 inline Ints cast(const KernelScene& scene, const Directions& d, Ints valid, RayHit& rays) {
   store(rays.ray.dir_x, without_dust(d.x));
@@ -73,10 +56,9 @@ inline Ints cast(const KernelScene& scene, const Directions& d, Ints valid, RayH
   RTCIntersectContext context;
   rtcInitIntersectContext(&context);
   context.flags = RTC_INTERSECT_CONTEXT_FLAG_COHERENT;
-  alignas(64) int valid_lanes[kLanes];
-  __builtin_memcpy(valid_lanes, &valid, sizeof valid);
-  intersect(valid_lanes, scene.fixed, &context, &rays);
-  if (scene.moved != nullptr) intersect(valid_lanes, scene.moved, &context, &rays);
+  const ValidLanes traced(valid);
+  intersect(traced.lanes, scene.fixed, &context, &rays);
+  if (scene.moved != nullptr) intersect(traced.lanes, scene.moved, &context, &rays);
   return (load_ints(rays.hit.geomID) != -1) & valid;
 }
 
@@ -95,6 +77,7 @@ inline Rgb shade_rays(const KernelScene& scene, const Directions& d, const RayHi
   if (mask_bits(~hit) != 0) color = sky(scene, d);
   if (mask_bits(hit) == 0) return color;
   Hits hits;
+  hits.rays = &rays;
   hits.u = load_floats(rays.hit.u);
   hits.v = load_floats(rays.hit.v);
   hits.t = load_floats(rays.ray.tfar);

@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/render/cpu/shading_scene.hpp"
 
+#include <array>
 #include <cmath>
 #include <cstring>
 #include <limits>
 
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
+#include "wiw/render/bulge.hpp"
 #include "wiw/render/texel_density.hpp"
 
 namespace wiw::cpu {
@@ -44,6 +46,18 @@ void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& tr
   }
 }
 
+float bulge_of(const Mesh& mesh, const Triangle& triangle, const Eigen::Affine3f& T_world_instance,
+               const Eigen::Matrix3f& to_world) {
+  std::array<Eigen::Vector3f, 3> corners;
+  std::array<Eigen::Vector3f, 3> normals;
+  for (std::size_t i = 0; i < 3; ++i) {
+    const std::uint32_t vertex = triangle[static_cast<Eigen::Index>(i)];
+    corners[i] = T_world_instance * mesh.positions[vertex];
+    normals[i] = (to_world * mesh.normals[vertex]).normalized();
+  }
+  return triangle_bulge(corners, normals);
+}
+
 void write_normals(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f& to_world, float* out) {
   const Eigen::Vector3f first = (to_world * mesh.normals[triangle[0]]).normalized();
   const Eigen::Vector3f to_1 = (to_world * mesh.normals[triangle[1]]).normalized() - first;
@@ -58,6 +72,14 @@ void write_normals(const Mesh& mesh, const Triangle& triangle, const Eigen::Matr
 }  // namespace
 
 ShadingScene::ShadingScene(const Scene& scene) : scene_(scene) {
+  if (scene_.sun) {
+    // Without components that are dust beside the others, which Embree's reciprocals overflow on.
+    for (int c = 0; c < 3; ++c) {
+      sun_.direction[c] = std::abs(scene_.sun->direction[c]) < 1e-15f ? 0.f : scene_.sun->direction[c];
+    }
+    sun_.strength = scene_.sun->strength;
+    sun_.ambient = scene_.sun->ambient;
+  }
   add_parts();
   parallel_for(parts_.size(), [this](std::size_t i) {
     const Part& part = parts_[i];
@@ -148,12 +170,15 @@ void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_inst
       record.log2_density = std::log2(texel_density(to_1, to_2, uv_1, uv_2));
     }
     if (part.first_detail != kNoDetail && !mesh.normals.empty()) {
-      write_normals(mesh, triangle, normal_to_world, details_[part.first_detail + t].normal);
+      TriangleDetail& detail = details_[part.first_detail + t];
+      write_normals(mesh, triangle, normal_to_world, detail.normal);
+      if (scene_.sun) detail.bulge = bulge_of(mesh, triangle, T_world_instance, normal_to_world);
     }
   }
 }
 
 void ShadingScene::describe(KernelScene& kernel) const {
+  kernel.sun = scene_.sun ? &sun_ : nullptr;
   kernel.first_record = first_record_.data();
   kernel.records = records_.data();
   kernel.details = details_.data();

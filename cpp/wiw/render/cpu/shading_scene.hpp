@@ -28,10 +28,10 @@ class ShadingScene {
   [[nodiscard]] const Surface& surface(const Part& part) const { return surfaces_[part.surface]; }
   [[nodiscard]] const TriangleRecord* records(const Part& part) const { return records_.data() + part.first_record; }
 
-  /// Recomputes what depends on a part's pose: world normals and texel densities.
+  /// Recomputes what depends on a part's pose: world normals, bulges and texel densities.
   void place(std::size_t part, const Eigen::Affine3f& T_world_instance);
 
-  /// Fills everything but the Embree scenes.
+  /// Fills everything but the Embree scenes, with pointers into this object.
   void describe(KernelScene& kernel) const;
 
  private:
@@ -41,6 +41,7 @@ class ShadingScene {
   void add_parts();
 
   const Scene& scene_;
+  Sunlight sun_{};  // if the scene has one
   std::map<std::pair<std::int32_t, TextureStore::Edge>, std::unique_ptr<TextureStore>> textures_;
   std::map<SurfaceKey, std::uint32_t> surface_numbers_;
   std::vector<Surface> surfaces_;

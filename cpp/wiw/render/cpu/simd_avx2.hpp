@@ -14,9 +14,14 @@ constexpr int kLanes = 8;
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef std::int32_t Ints __attribute__((vector_size(4 * kLanes)));
 using RayHit = RTCRayHit8;
+using Rays = RTCRay8;
 
 inline void intersect(const int* valid, RTCScene scene, RTCIntersectContext* context, RayHit* rays) {
   rtcIntersect8(valid, scene, context, rays);
+}
+
+inline void occluded(const int* valid, RTCScene scene, RTCIntersectContext* context, Rays* rays) {
+  rtcOccluded8(valid, scene, context, rays);
 }
 
 inline Floats floor_of(Floats x) { return (Floats)_mm256_floor_ps((__m256)x); }

@@ -14,9 +14,14 @@ constexpr int kLanes = 16;
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef std::int32_t Ints __attribute__((vector_size(4 * kLanes)));
 using RayHit = RTCRayHit16;
+using Rays = RTCRay16;
 
 inline void intersect(const int* valid, RTCScene scene, RTCIntersectContext* context, RayHit* rays) {
   rtcIntersect16(valid, scene, context, rays);
+}
+
+inline void occluded(const int* valid, RTCScene scene, RTCIntersectContext* context, Rays* rays) {
+  rtcOccluded16(valid, scene, context, rays);
 }
 
 inline Floats floor_of(Floats x) {

@@ -13,9 +13,14 @@ constexpr int kLanes = 4;
 typedef float Floats __attribute__((vector_size(4 * kLanes)));
 typedef std::int32_t Ints __attribute__((vector_size(4 * kLanes)));
 using RayHit = RTCRayHit4;
+using Rays = RTCRay4;
 
 inline void intersect(const int* valid, RTCScene scene, RTCIntersectContext* context, RayHit* rays) {
   rtcIntersect4(valid, scene, context, rays);
+}
+
+inline void occluded(const int* valid, RTCScene scene, RTCIntersectContext* context, Rays* rays) {
+  rtcOccluded4(valid, scene, context, rays);
 }
 
 inline Floats floor_of(Floats x) {

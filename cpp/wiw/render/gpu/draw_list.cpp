@@ -31,4 +31,16 @@ void DrawList::gather(const View& view, const Scene& scene, const std::vector<Me
   });
 }
 
+void DrawList::gather_all(const Scene& scene, const std::vector<MeshRange>& meshes) {
+  draws_.clear();
+  for (std::uint32_t i = 0; i < scene.instances.size(); ++i) {
+    for (const std::uint32_t mesh : scene.instances[i].meshes) {
+      const MeshRange& range = meshes[mesh];
+      for (std::size_t k = range.first_chunk; k < range.first_chunk + range.chunk_count; ++k) {
+        draws_.push_back({0.f, i, mesh, static_cast<std::uint32_t>(k)});
+      }
+    }
+  }
+}
+
 }  // namespace wiw::gpu

@@ -24,6 +24,9 @@ class DrawList {
   void gather(const View& view, const Scene& scene, const std::vector<MeshRange>& meshes,
               const std::vector<Chunk>& chunks, const std::vector<Eigen::Affine3f>& poses);
 
+  /// Everything, in no particular order.
+  void gather_all(const Scene& scene, const std::vector<MeshRange>& meshes);
+
   [[nodiscard]] const std::vector<Draw>& draws() const { return draws_; }
 
  private:

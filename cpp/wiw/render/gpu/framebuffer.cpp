@@ -102,6 +102,8 @@ void Framebuffer::bind(int layer, ProgramKey outputs, bool depth_test) {
   }
   gl_.FramebufferTextureLayer(GL_FRAMEBUFFER, GL_DEPTH_ATTACHMENT, depth_test ? depth_buffer_.id() : 0, 0, 0);
   gl_.DrawBuffers(static_cast<GLsizei>(buffers.size()), buffers.data());
+  // Before OpenGL 4.1 a target without colours is incomplete while one is to be read.
+  if (outputs == 0) gl_.ReadBuffer(GL_NONE);
   if (gl_.CheckFramebufferStatus(GL_FRAMEBUFFER) != GL_FRAMEBUFFER_COMPLETE) {
     throw BackendError("the OpenGL driver cannot draw into targets of " + std::to_string(size_.height) + " x " +
                        std::to_string(size_.width) + "; use smaller images or backend=\"cpu\"");

@@ -46,6 +46,9 @@ class Framebuffer {
   /// Array texture of one output.
   [[nodiscard]] GLuint texture(std::size_t target) const { return targets_[target].id(); }
 
+  /// Array texture of one layer: what the depth test has left.
+  [[nodiscard]] GLuint depth_texture() const { return depth_buffer_.id(); }
+
   /// Gives all textures back.
   void release();
 

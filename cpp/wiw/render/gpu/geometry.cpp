@@ -2,6 +2,7 @@
 #include "wiw/render/gpu/geometry.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 #include <numeric>
@@ -9,6 +10,8 @@
 #include <string>
 
 #include "wiw/core/error.hpp"
+#include "wiw/render/bulge.hpp"
+#include "wiw/render/shading.hpp"
 
 namespace wiw::gpu {
 
@@ -42,9 +45,25 @@ void set_appearance(const Scene& scene, const Mesh& mesh, MeshRange& range) {
     range.appearance |= kLightmapped;
   }
   if (material.emissive) range.appearance |= kEmissive;
+  if (scene.sun && (range.appearance & (kLightmapped | kEmissive)) == 0) range.appearance |= kSunlit;
   if (material.alpha_cutoff >= 0) range.appearance |= kCutout;
   if (!mesh.colors.empty()) range.appearance |= kVertexColors;
   if (!mesh.normals.empty()) range.appearance |= kSmooth;
+}
+
+/// Writes how far a curved surface stands out of the triangles around each of its vertices.
+void write_lifts(const Mesh& mesh, std::span<Vertex> vertices) {
+  for (Vertex& vertex : vertices) vertex.lightmap_uv[0] = 0.f;
+  for (const auto& triangle : mesh.triangles) {
+    std::array<Eigen::Vector3f, 3> corners;
+    std::array<Eigen::Vector3f, 3> normals;
+    for (std::size_t i = 0; i < 3; ++i) {
+      corners[i] = mesh.positions[triangle[static_cast<Eigen::Index>(i)]];
+      normals[i] = mesh.normals[triangle[static_cast<Eigen::Index>(i)]];
+    }
+    const float lift = shading::kGreatestLift * triangle_bulge(corners, normals);
+    for (const std::uint32_t i : triangle) vertices[i].lightmap_uv[0] = std::max(vertices[i].lightmap_uv[0], lift);
+  }
 }
 
 /// Splits the triangles of one mesh at the median of the longest side until a part is small enough.
@@ -118,6 +137,9 @@ Geometry build_geometry(const Scene& scene) {
     range.chunk_count = geometry.chunks.size() - range.first_chunk;
     for (std::size_t i = 0; i < range.chunk_count; ++i) range.box.extend(geometry.chunks[range.first_chunk + i].box);
     set_appearance(scene, mesh, range);
+    if ((range.appearance & kSunlit) != 0 && (range.appearance & kSmooth) != 0) {
+      write_lifts(mesh, std::span(geometry.vertices).subspan(first_vertex));
+    }
     geometry.meshes.push_back(range);
   }
   return geometry;

@@ -16,7 +16,7 @@ struct Vertex {
   float position[3];
   std::int16_t normal[4];  // signed normalised
   float uv[2];
-  float lightmap_uv[2];
+  float lightmap_uv[2];  // of a mesh lit by the sun: its greatest lift around the vertex (shading.hpp), and nothing
   std::uint8_t color[4];
 };
 static_assert(sizeof(Vertex) == 40);

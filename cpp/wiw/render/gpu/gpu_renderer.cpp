@@ -2,12 +2,14 @@
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
 #include <algorithm>
+#include <optional>
 #include <tuple>
 #include <utility>
 
 #include "wiw/core/error.hpp"
 #include "wiw/render/gpu/draw_list.hpp"
 #include "wiw/render/gpu/scene_buffers.hpp"
+#include "wiw/render/gpu/sun_map.hpp"
 #include "wiw/render/gpu/workspace.hpp"
 #include "wiw/render/request.hpp"
 #include "wiw/render/shading.hpp"
@@ -42,11 +44,14 @@ struct GraphicsMemory {
   GraphicsMemory(GlContext& context, const Scene& content, const Geometry& geometry)
       : scene(context, content, geometry),
         views(context.gl(), context.info().uniform_alignment),
-        no_vertices(context.gl()) {}
+        no_vertices(context.gl()) {
+    if (content.sun) sun.emplace(context, *content.sun);
+  }
 
   SceneBuffers scene;
   UniformSlots<View> views;
   GlVertexArray no_vertices;
+  std::optional<SunMap> sun;
 };
 
 }  // namespace
@@ -84,6 +89,7 @@ class GpuRenderer final : public Renderer {
     check_size(camera);
     const GlContext::Current current(*context_);
     prepare_state();
+    if (auto& sun = memory_->sun; sun && targets.color != nullptr) prepare_sun(*sun);
     std::size_t step = std::clamp<std::size_t>(kBatchPixels / camera.size.pixels(), 1, kBatchViews);
     for (std::size_t first = 0; first < T_world_camera.size();) {
       const auto part = T_world_camera.subspan(first, std::min(step, T_world_camera.size() - first));
@@ -105,6 +111,7 @@ class GpuRenderer final : public Renderer {
       poses_[ids[i] - 1] = poses[i];
       memory_->scene.set_pose(ids[i], poses[i]);
     }
+    sun_is_drawn_ = false;
     context_->check("moving instances");
   }
 
@@ -136,6 +143,22 @@ class GpuRenderer final : public Renderer {
     gl_->Disable(GL_DITHER);
     gl_->Enable(GL_SCISSOR_TEST);
     gl_->PixelStorei(GL_PACK_ALIGNMENT, 1);
+  }
+
+  /// Draws the sun's map, if instances have moved since, and binds it.
+  void prepare_sun(SunMap& sun) {
+    if (!sun_is_drawn_) {
+      sun.begin(*scene_, meshes_, poses_);
+      memory_->scene.bind_geometry();
+      draws_.gather_all(*scene_, meshes_);
+      for (std::size_t square = 0; square < kSunSquares; ++square) {
+        sun.begin_square(square);
+        draw_chunks(kParallel);
+      }
+      context_->check("drawing shadows");
+      sun_is_drawn_ = true;
+    }
+    sun.bind();
   }
 
   void bind_layer(Framebuffer& target, int layer, Size size, ProgramKey outputs, bool depth_test) {
@@ -361,6 +384,7 @@ class GpuRenderer final : public Renderer {
   std::vector<MeshRange> meshes_;
   std::unique_ptr<GraphicsMemory> memory_;
   DrawList draws_;
+  bool sun_is_drawn_ = false;
 };
 
 }  // namespace wiw::gpu

@@ -73,13 +73,14 @@ GLuint ProgramCache::link(const char* name, const std::string& vertex, const std
 void ProgramCache::bind_names(GLuint program) {
   gl_.UseProgram(program);
   for (const auto& [block, binding] : {std::pair{"View", kViewBinding}, std::pair{"Instance", kInstanceBinding},
-                                       std::pair{"Material", kMaterialBinding}}) {
+                                       std::pair{"Material", kMaterialBinding}, std::pair{"Sun", kSunBinding}}) {
     const GLuint index = gl_.GetUniformBlockIndex(program, block);
     if (index != GL_INVALID_INDEX) gl_.UniformBlockBinding(program, index, binding);
   }
-  for (const auto& [sampler, unit] : {std::pair{"surface_texture", kColorUnit}, std::pair{"lightmap", kLightmapUnit},
-                                      std::pair{"color_map", kColorUnit}, std::pair{"depth_map", kDepthUnit},
-                                      std::pair{"id_map", kIdUnit}, std::pair{"slope_map", kSlopeUnit}}) {
+  for (const auto& [sampler, unit] :
+       {std::pair{"surface_texture", kColorUnit}, std::pair{"lightmap", kLightmapUnit},
+        std::pair{"color_map", kColorUnit}, std::pair{"depth_map", kDepthUnit}, std::pair{"id_map", kIdUnit},
+        std::pair{"slope_map", kSlopeUnit}, std::pair{"sun_map", kSunUnit}}) {
     gl_.Uniform1i(gl_.GetUniformLocation(program, sampler), unit);
   }
 }

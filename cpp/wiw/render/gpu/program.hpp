@@ -10,8 +10,8 @@
 namespace wiw::gpu {
 
 // Where uniform blocks and textures are bound, the same in every program.
-enum : GLuint { kViewBinding = 0, kInstanceBinding = 1, kMaterialBinding = 2 };
-enum : GLint { kColorUnit = 0, kDepthUnit = 1, kIdUnit = 2, kSlopeUnit = 3, kLightmapUnit = 1 };
+enum : GLuint { kViewBinding = 0, kInstanceBinding = 1, kMaterialBinding = 2, kSunBinding = 3 };
+enum : GLint { kColorUnit = 0, kDepthUnit = 1, kIdUnit = 2, kSlopeUnit = 3, kLightmapUnit = 1, kSunUnit = 4 };
 
 /// Compiles each program at its first use and keeps it: programs live as long as their context.
 class ProgramCache {

@@ -42,6 +42,9 @@ layout(location = 4) in vec4 color;
 out vec3 offset;   // from the eye, world axes
 #ifdef SMOOTH
 out vec3 smooth_normal;
+#ifdef SUNLIT
+out vec3 lift;     // onto the curved surface, world axes
+#endif
 #endif
 #ifdef TEXTURED
 out vec2 texture_uv;
@@ -57,9 +60,17 @@ void main() {
   offset = vec3(dot(world_rows[0], p), dot(world_rows[1], p), dot(world_rows[2], p)) - eye.xyz;
   float depth = -dot(back.xyz, offset);
   vec2 image = vec2(dot(right.xyz, offset), dot(up.xyz, offset)) * projection.xy - depth * projection.zw;
+#ifdef PARALLEL
+  gl_Position = vec4(dot(right.xyz, offset) * projection.x, dot(up.xyz, offset) * projection.y, -depth * lens.x, 1.0);
+#else
   gl_Position = vec4(image, lens.x, depth);   // reversed depth with the far plane at infinity: near / depth
+#endif
 #ifdef SMOOTH
   smooth_normal = vec3(dot(normal_rows[0].xyz, normal), dot(normal_rows[1].xyz, normal), dot(normal_rows[2].xyz, normal));
+#ifdef SUNLIT
+  vec3 out_of = normal * lightmap_uv.x;
+  lift = vec3(dot(world_rows[0].xyz, out_of), dot(world_rows[1].xyz, out_of), dot(world_rows[2].xyz, out_of));
+#endif
 #endif
 #ifdef TEXTURED
   texture_uv = uv;
@@ -126,6 +137,9 @@ constexpr const char* kSceneFragment = R"(
 in vec3 offset;
 #ifdef SMOOTH
 in vec3 smooth_normal;
+#ifdef SUNLIT
+in vec3 lift;
+#endif
 #endif
 #ifdef TEXTURED
 in vec2 texture_uv;
@@ -137,6 +151,60 @@ uniform sampler2D lightmap;
 #endif
 #ifdef VERTEX_COLORS
 in vec3 vertex_color;
+#endif
+)";
+
+// The map holds the greatest height towards the sun over each texel, as a share of the range of heights, in two squares
+// one over the other; the second is the finer. A texel of the map shadows a point if it is above the point's tangent
+// plane there: compared with the plane, a surface never shadows itself, however it slopes, and no offset tears shadows
+// off what casts them. What is left is rounding: of vertices to 1/256 texel, which a slope magnifies, and of heights.
+constexpr const char* kSunlight = R"(
+#ifdef SUNLIT
+layout(std140) uniform Sun {
+  vec4 sun_right;
+  vec4 sun_up;
+  vec4 sun_direction;
+  vec4 sun_corner[2];
+  vec4 sun_grid[2];   // metres a texel across and along, range of heights, texels a side
+  vec4 sun_share;     // ambient, strength
+};
+uniform sampler2DArray sun_map;
+vec2 sun_texel(vec3 point, int square) {
+  vec3 from_corner = point - sun_corner[square].xyz;
+  return vec2(dot(sun_right.xyz, from_corner), dot(sun_up.xyz, from_corner)) / sun_grid[square].xy - 0.5;
+}
+float sun_visibility(vec3 point, vec3 n) {
+  float last = sun_grid[0].w - 1.0;
+  int square = 1;
+  vec2 texel = sun_texel(point, square);
+  if (any(lessThan(texel, vec2(1.0))) || any(greaterThan(texel, vec2(last - 2.0)))) {
+    square = 0;
+    texel = sun_texel(point, square);
+  }
+  vec4 grid = sun_grid[square];
+  float height = dot(sun_direction.xyz, point - sun_corner[square].xyz);
+  vec2 slope = -vec2(dot(sun_right.xyz, n), dot(sun_up.xyz, n)) / max(dot(sun_direction.xyz, n), 0.02) * grid.xy;
+  float slack = 0.02 * (grid.x + grid.y + abs(slope.x) + abs(slope.y)) + 2e-6 * grid.z;
+  vec2 first = floor(texel) - 1.0;
+  vec2 part = texel - floor(texel);
+  vec4 across = vec4(1.0 - part.x, 1.0, 1.0, part.x);
+  vec4 along = vec4(1.0 - part.y, 1.0, 1.0, part.y);
+  float lit = 0.0;
+  for (int j = 0; j < 4; ++j) {
+    for (int i = 0; i < 4; ++i) {
+      vec2 at = first + vec2(i, j);
+      vec2 inside = clamp(at, vec2(0.0), vec2(last));
+      float blocker = texelFetch(sun_map, ivec3(inside.x, inside.y + float(square) * grid.w, 0), 0).x * grid.z;
+      lit += blocker <= height + dot(slope, at - texel) + slack ? across[i] * along[j] : 0.0;
+    }
+  }
+  return lit / 9.0;
+}
+float sun_light(vec3 point, vec3 n) {
+  float cosine = dot(n, sun_direction.xyz);
+  float direct = cosine > 0.0 ? cosine * sun_visibility(point, n) : 0.0;
+  return min(sun_share.x * ambient_light(n) + sun_share.y * direct, 1.0);
+}
 #endif
 )";
 
@@ -168,10 +236,21 @@ void main() {
   shade *= 2.0 * textureLod(lightmap, light_uv, 0.0).rgb;
 #elif !defined(EMISSIVE)
   vec3 facing = dot(n, offset) > 0.0 ? -n : n;
-#ifdef SMOOTH
-  facing = dot(smooth_normal, facing) < 0.0 ? -smooth_normal : smooth_normal;
+#ifdef SUNLIT
+  vec3 point = eye.xyz + offset;
 #endif
+#ifdef SMOOTH
+  bool turned = dot(smooth_normal, facing) < 0.0;
+  facing = turned ? -smooth_normal : smooth_normal;
+#ifdef SUNLIT
+  if (!turned) point += lift;
+#endif
+#endif
+#ifdef SUNLIT
+  shade *= sun_light(point, normalize(facing));
+#else
   shade *= ambient_light(normalize(facing));
+#endif
 #endif
   out_color = vec4(shade, 1.0);
 #endif
@@ -310,7 +389,7 @@ void main() {
 )";
 
 std::string header(ProgramKey key) {
-  static constexpr std::array<std::pair<ProgramKey, const char*>, 11> kNames{{{kTextured, "TEXTURED"},
+  static constexpr std::array<std::pair<ProgramKey, const char*>, 13> kNames{{{kTextured, "TEXTURED"},
                                                                               {kLightmapped, "LIGHTMAPPED"},
                                                                               {kEmissive, "EMISSIVE"},
                                                                               {kVertexColors, "VERTEX_COLORS"},
@@ -320,7 +399,9 @@ std::string header(ProgramKey key) {
                                                                               {kDepthOut, "DEPTH_OUT"},
                                                                               {kIdOut, "ID_OUT"},
                                                                               {kCubeFace, "CUBE_FACE"},
-                                                                              {kSampled, "SAMPLED"}}};
+                                                                              {kSampled, "SAMPLED"},
+                                                                              {kSunlit, "SUNLIT"},
+                                                                              {kParallel, "PARALLEL"}}};
   std::string text = "#version 330 core\n";
   for (const auto& [bit, name] : kNames) {
     if ((key & bit) != 0) text += std::string("#define ") + name + "\n";
@@ -332,7 +413,7 @@ std::string header(ProgramKey key) {
 
 ProgramKey reduce(ProgramKey key) {
   if ((key & kColorOut) == 0) {
-    key &= ~(kLightmapped | kEmissive | kVertexColors | kSmooth);
+    key &= ~(kLightmapped | kEmissive | kVertexColors | kSmooth | kSunlit);
     if ((key & kCutout) == 0) key &= ~kTextured;
   }
   if ((key & kEmissive) != 0) key &= ~(kLightmapped | kSmooth);
@@ -343,7 +424,7 @@ ProgramKey reduce(ProgramKey key) {
 std::string scene_vertex_source(ProgramKey key) { return header(key) + kViewBlock + kSurfaceBlocks + kSceneVertex; }
 
 std::string scene_fragment_source(ProgramKey key) {
-  return header(key) + kViewBlock + kSurfaceBlocks + kOutputs + kSceneFragment + kShading + kSceneMain;
+  return header(key) + kViewBlock + kSurfaceBlocks + kOutputs + kSceneFragment + kShading + kSunlight + kSceneMain;
 }
 
 std::string screen_vertex_source() { return header(0) + kViewBlock + kScreenVertex; }

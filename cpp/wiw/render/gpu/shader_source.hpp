@@ -13,12 +13,14 @@ enum : std::uint32_t {
   kEmissive = 1u << 2,
   kVertexColors = 1u << 3,
   kCutout = 1u << 4,
-  kSmooth = 1u << 5,    // has vertex normals
-  kColorOut = 1u << 6,  // the pass writes colour,
-  kDepthOut = 1u << 7,  // metric depth,
-  kIdOut = 1u << 8,     // instance ids
-  kCubeFace = 1u << 9,  // the pass draws one face of a panorama
-  kSampled = 1u << 10,  // the pass averages several rays a pixel
+  kSmooth = 1u << 5,     // has vertex normals
+  kColorOut = 1u << 6,   // the pass writes colour,
+  kDepthOut = 1u << 7,   // metric depth,
+  kIdOut = 1u << 8,      // instance ids
+  kCubeFace = 1u << 9,   // the pass draws one face of a panorama
+  kSampled = 1u << 10,   // the pass averages several rays a pixel
+  kSunlit = 1u << 11,    // lit by the scene's sun
+  kParallel = 1u << 12,  // the pass draws depths along the sun's direction
 };
 using ProgramKey = std::uint32_t;
 
