@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 import subprocess
 import sys
@@ -241,6 +242,12 @@ class Misbehaving(BaseHTTPRequestHandler):
         ((200, b"hello", 0), "message", "got b'hello'"),
         ((200, b'{"found": []}', 0), "message", "KeyError"),
         ((200, b'{"detections": [[{"box": [1, 2], "score": 1, "label": "a"}]]}', 0), "message", "boxes"),
+        ((200, b"[" * 100_000, 0), "message", "RecursionError"),
+        (
+            (200, b'{"detections": [[{"box": [0, 0, 1, 1' + b"0" * 400 + b'], "score": 1, "label": "a"}]]}', 0),
+            "message",
+            "OverflowError",
+        ),
         ((200, b"{}", 1), "deadline", "no answer within 0.5 s"),
     ],
 )
@@ -255,6 +262,29 @@ def test_a_server_that_misbehaves_is_named(says: Any, kind: str, words: str) -> 
             detector.detect(IMAGES[:1], ["a"])
         thread.join()
     assert raised.value.kind == kind
+
+
+def test_an_answer_that_comes_drop_by_drop_is_not_waited_for() -> None:
+    class Dripping(BaseHTTPRequestHandler):
+        def log_message(self, *args: Any) -> None: ...
+
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.end_headers()
+            with contextlib.suppress(OSError):
+                for _ in range(300):
+                    self.wfile.write(b" ")
+                    time.sleep(0.1)
+
+    with HTTPServer(("127.0.0.1", 0), Dripping) as server:
+        thread = threading.Thread(target=server.handle_request)
+        thread.start()
+        begin = time.monotonic()
+        with pytest.raises(RemoteError, match="no answer within"):
+            DETECTORS.make(f"remote:http://127.0.0.1:{server.server_port}", seconds=0.5).detect(IMAGES[:1], ["a"])
+        assert time.monotonic() - begin < 20
+        thread.join()
 
 
 def test_nobody_is_there() -> None:

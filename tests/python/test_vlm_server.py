@@ -8,7 +8,7 @@ import pickle
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -181,6 +181,32 @@ def test_bodies_that_are_no_completions_are_asked_for_again(body: bytes) -> None
     with speaking([body]) as url, pytest.raises(VlmError) as error:
         connect(url, model="m", attempts=1).ask(REQUESTS[2:3])
     assert error.value.kind == "protocol"
+
+
+@pytest.mark.parametrize("pause", [0.0, 0.2])
+def test_an_error_that_does_not_end_is_not_read_to_its_end(pause: float) -> None:
+    written = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def log_message(self, *_: Any) -> None: ...
+
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["content-length"]))
+            self.send_response(500)
+            self.end_headers()
+            with suppress(OSError):
+                while len(written) < 3000:
+                    self.wfile.write(b"broken" * (10 if pause else 10000))
+                    written.append(None)
+                    time.sleep(pause)
+
+    http = HTTPServer(("127.0.0.1", 0), Handler)
+    threading.Thread(target=http.serve_forever, args=(0.05,), daemon=True).start()
+    with pytest.raises(VlmError, match="500") as error:
+        connect(f"http://127.0.0.1:{http.server_address[1]}/v1", model="m", attempts=1, timeout=1.0).ask(REQUESTS[2:3])
+    http.shutdown()
+    http.server_close()
+    assert error.value.kind == "status" and len(written) < 1000
 
 
 def test_a_reply_that_is_cut_off_is_asked_for_again() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import json
+import time
 from collections.abc import Sequence
 from http.client import HTTPException
 from typing import Any
@@ -55,7 +56,7 @@ class Remote(Detector):
         try:
             answers = json.loads(said)["detections"]
             return [_detections(answer) for answer in answers]
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise RemoteError(
                 f"{self.address}: expected {{'detections': [[{{'box': 4 numbers, 'score': number, 'label': name}}]]}} "
                 f"with a list for each image, got {said[:80]!r} ({type(error).__name__}: {error})",
@@ -66,7 +67,7 @@ class Remote(Detector):
         request = Request(f"{self.address}/detect", body, {"Content-Type": "application/json"})
         try:
             with build_opener(ProxyHandler({})).open(request, timeout=self.seconds) as answer:
-                said = bytes(answer.read(MOST_BYTES + 1))
+                said = self._body(answer)
         except HTTPError as error:
             text = error.read(2000).decode(errors="replace").strip()
             raise RemoteError(f"{self.address} answered {error.code}: {text}", "raised") from error
@@ -81,6 +82,15 @@ class Remote(Detector):
         if len(said) > MOST_BYTES:
             raise RemoteError(f"{self.address}: an answer of more than {MOST_BYTES} bytes", "message")
         return said
+
+    def _body(self, answer: Any) -> bytes:
+        """Piece by piece, so that the pace at which they come does not say how long it takes."""
+        until, said = time.monotonic() + self.seconds, bytearray()
+        while (piece := answer.read1(1 << 16)) and len(said) <= MOST_BYTES:
+            said += piece
+            if time.monotonic() > until:
+                raise TimeoutError
+        return bytes(said)
 
 
 def _png(image: NDArray[np.uint8]) -> str:

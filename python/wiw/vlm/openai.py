@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from typing import Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
@@ -21,6 +22,8 @@ Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")
 MOST_BYTES = 4 << 20
 """Of a reply's body; what goes beyond is not read."""
+MOST_OF_AN_ERROR = 1 << 16
+"""Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0
 """Seconds that are waited before a request is sent again, however long the server asks for."""
 REFUSED_LOGPROBS = "; top_logprobs= says how many first tokens the server lists, 0 has choices voted on instead"
@@ -126,7 +129,13 @@ class OpenAIClient(Client):
         import os
 
         key = os.environ.get("OPENAI_API_KEY") or "none"
-        return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0)
+        http = openai.DefaultHttpxClient(event_hooks={"response": [self._cut_off]})
+        return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
+
+    def _cut_off(self, response: Any) -> None:
+        """The SDK reads all of an error's body; of that, the beginning will do."""
+        if response.is_error:
+            response.stream = _begin(response, self.timeout)
 
     def _body(self, call: Call, images: dict[int, str]) -> dict[str, Any]:
         body: dict[str, Any] = {
@@ -232,6 +241,26 @@ def _pieces(response: Any) -> Iterator[bytes]:
         yield from response.iter_bytes()
     except Exception as error:
         raise _BrokenOffError(f"{type(error).__name__}: {error}") from error
+
+
+def _begin(response: Any, seconds: float) -> Any:
+    """A response's stream that ends after some bytes and some time."""
+    transport: Any = import_module(type(response).__module__.partition(".")[0])  # httpx, or what the SDK has instead
+    stream = response.stream
+
+    class Begin(transport.SyncByteStream):  # type: ignore[misc]
+        def __iter__(self) -> Iterator[bytes]:
+            until, count = time.monotonic() + seconds, 0
+            for piece in stream:
+                yield piece
+                count += len(piece)
+                if count > MOST_OF_AN_ERROR or time.monotonic() > until:
+                    return
+
+        def close(self) -> None:
+            stream.close()
+
+    return Begin()
 
 
 def _remade(base_url: str, options: dict[str, Any]) -> OpenAIClient:
