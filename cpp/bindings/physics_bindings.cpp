@@ -261,8 +261,8 @@ void bind_gripper(py::module_& module) {
 
 They close with contact; when both touch the same dynamic body, a constraint holds it and the fingers go on pressing with
 `force` newtons each. All state lies in the world: a fork takes a Gripper of its own.)")
-      .def(py::init([](World& world, int articulation, std::array<std::string, 2> joints,
-                       std::array<std::string, 2> fingers, const std::string& hand, double force) {
+      .def(py::init([](World& world, int articulation, const std::array<std::string, 2>& joints,
+                       const std::array<std::string, 2>& fingers, const std::string& hand, double force) {
              return std::make_unique<Gripper>(world, articulation, GripperNames{joints, fingers, hand}, force);
            }),
            py::keep_alive<1, 2>(), py::arg("world"), py::arg("articulation") = 0, py::kw_only(),

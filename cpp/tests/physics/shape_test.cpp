@@ -7,6 +7,7 @@
 #include <random>
 
 #include "wiw/core/error.hpp"
+#include "wiw/core/rng.hpp"
 
 using namespace wiw;
 using namespace wiw::physics;
@@ -26,7 +27,7 @@ ConvexHull corners(const Vector3d& size, const Vector3d& center) {
 
 /// Mass properties by throwing points, the slow way.
 MassProperties sampled(const Vector3d& bound, auto inside) {
-  std::mt19937 random(3);
+  Rng random(3);
   std::uniform_real_distribution<double> unit(-1, 1);
   Vector3d sum = Vector3d::Zero();
   Matrix3d second = Matrix3d::Zero();
@@ -78,7 +79,7 @@ TEST_CASE("capsules and compounds agree with points thrown into them") {
 }
 
 TEST_CASE("principal axes give the inertia back") {
-  std::mt19937 random(1);
+  Rng random(1);
   std::normal_distribution<double> normal;
   for (int i = 0; i < 50; ++i) {
     const Matrix3d root = Matrix3d::NullaryExpr([&] { return normal(random); });

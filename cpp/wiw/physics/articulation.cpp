@@ -43,6 +43,7 @@ std::vector<std::string> Articulation::movable_joints() const {
 
 int Articulation::link_index(const std::string& name) const {
   std::vector<std::string> names;
+  names.reserve(links_.size());
   for (const Link& link : links_) names.push_back(link.name);
   return find(names, name, "link");
 }

@@ -78,6 +78,7 @@ InverseKinematics::InverseKinematics(ArticulationPtr articulation, int link) : a
 
 std::vector<int> InverseKinematics::joints() const {
   std::vector<int> indices;
+  indices.reserve(chain_.size());
   for (const Step& step : chain_) indices.push_back(step.index);
   return indices;
 }

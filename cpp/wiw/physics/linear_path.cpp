@@ -89,11 +89,11 @@ bool follow(World& world, int articulation, const LinearPath& path, double speed
   Eigen::VectorXd target = world.joint_targets(articulation);
   for (std::size_t i = 1; i < path.joints.size(); ++i) {
     const Eigen::VectorXd way = path.joints[i] - path.joints[i - 1];
-    double steps = 1;
-    for (const int joint : path.moved)
-      steps = std::max(steps, std::ceil(std::abs(way[joint]) / (reach * limit[joint])));
-    for (double s = 1; s <= steps; ++s) {
-      for (const int joint : path.moved) target[joint] = path.joints[i - 1][joint] + s / steps * way[joint];
+    double longest = 1;
+    for (const int joint : path.moved) longest = std::max(longest, std::abs(way[joint]) / (reach * limit[joint]));
+    const int steps = static_cast<int>(std::ceil(longest));
+    for (int step = 1; step <= steps; ++step) {
+      for (const int joint : path.moved) target[joint] = path.joints[i - 1][joint] + way[joint] * step / steps;
       world.set_joint_targets(articulation, target);
       world.step();
     }

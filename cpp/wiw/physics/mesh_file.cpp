@@ -24,7 +24,7 @@ std::vector<Eigen::Vector3d> vertices_of(const aiScene& scene, const Eigen::Vect
     const aiMesh& mesh = *scene.mMeshes[m];
     for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
       const aiVector3D& p = mesh.mVertices[v];
-      points.push_back(scale.cwiseProduct(Eigen::Vector3d(p.x, p.y, p.z)));
+      points.emplace_back(scale.x() * p.x, scale.y() * p.y, scale.z() * p.z);
     }
   }
   return points;

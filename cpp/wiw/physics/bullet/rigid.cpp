@@ -10,7 +10,7 @@ namespace wiw::physics {
 
 namespace {
 
-const Body& checked(const Body& body) {
+Body checked(Body body) {
   const std::string who = "body '" + body.name + "'";
   if (body.parts.empty()) throw ArgumentError(who + " has no parts; expected one shape or more");
   for (const Part& part : body.parts) check_part(part, who);
@@ -27,8 +27,8 @@ const Body& checked(const Body& body) {
 
 }  // namespace
 
-RigidModel::RigidModel(const Body& wanted)
-    : body(checked(wanted)),
+RigidModel::RigidModel(Body wanted)
+    : body(checked(std::move(wanted))),
       frame(body.mass > 0 ? principal_frame(mass_properties(body.parts, body.mass)) : PrincipalFrame{}),
       shape(body.parts, frame.pose) {}
 

@@ -11,7 +11,7 @@ namespace wiw::physics {
 
 /// What worlds share of a body. Throws ArgumentError for impossible numbers.
 struct RigidModel {
-  explicit RigidModel(const Body& body);
+  explicit RigidModel(Body wanted);
   Body body;
   PrincipalFrame frame;  // in the body's frame
   CollisionShape shape;

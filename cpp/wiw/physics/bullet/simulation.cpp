@@ -10,14 +10,14 @@ namespace wiw::physics {
 
 namespace {
 
-const WorldOptions& checked(const WorldOptions& options) {
+double checked_step(const WorldOptions& options) {
   const bool fits = options.gravity.allFinite() && options.time_step > 0 && options.time_step <= 0.1 &&
                     options.iterations > 0 && options.residual >= 0;
   if (!fits) {
     throw ArgumentError(
         "expected finite gravity, a time step in (0, 0.1] s, one solver iteration or more and a residual of 0 or more");
   }
-  return options;
+  return options.time_step;
 }
 
 /// Bullet's own pools take 10 MB, which makes a fork take 20 ms; beyond these it allocates singly.
@@ -31,7 +31,7 @@ btDefaultCollisionConstructionInfo small_pools() {
 }  // namespace
 
 Simulation::Simulation(const WorldOptions& options)
-    : time_step_(checked(options).time_step),
+    : time_step_(checked_step(options)),
       configuration_(small_pools()),
       dispatcher_(&configuration_),
       world_(&dispatcher_, &pairs_, &solver_, &configuration_) {
