@@ -32,7 +32,6 @@ from wiw.loop.attempts import Attempts
 from wiw.serving import server as serving
 from wiw.serving.background import served
 from wiw.serving.known import Known
-from wiw.serving.limits import check_row
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
 from wiw.types import Conditioning, Control
@@ -40,6 +39,7 @@ from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Wel
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
 from wiw.world_models.remote import Remote, link
+from wiw.world_models.remote.limits import check_row
 
 SIZE = (8, 16)
 

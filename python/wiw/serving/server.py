@@ -25,13 +25,13 @@ from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
 from wiw.serving.known import Known
-from wiw.serving.limits import check_row, most_bytes
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
 from wiw.wire.messages import Answer, Ask, Hello, Message, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id, unpack_row
 from wiw.world_models.base import WorldModel
 from wiw.world_models.remote.declaration import declaration
+from wiw.world_models.remote.limits import check_row, most_bytes
 
 PORT = 8765
 CLIENTS = 256

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, RemoteError
-from wiw.serving.limits import HISTORY, most_bytes
 from wiw.types import Conditioning, Control
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
 from wiw.world_models.remote.declaration import declared
+from wiw.world_models.remote.limits import HISTORY, most_bytes
 from wiw.world_models.remote.link import Link
 
 TOKEN = "WIW_TOKEN"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a server takes: rows as its model accepts them, and no larger."""
+"""What goes over the wire: rows as a model accepts them, and no larger."""
 
 from __future__ import annotations
 
