@@ -507,6 +507,15 @@ def test_a_port_that_is_taken():
 
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+def test_certificates_that_are_none_are_named(tmp_path):
+    (tmp_path / "text.pem").write_text("no certificate")
+    for name, reason in (("nowhere.pem", "No such file"), ("text.pem", "PEM")):
+        with pytest.raises(ArgumentError, match=rf"{name}: .*{reason}"), served(Plain(), certificate=tmp_path / name):
+            pass
+    with pytest.raises(ArgumentError, match="nothing would be encrypted"):
+        Settings(key=tmp_path / "key.pem")
+
+
 def test_behind_tls(tmp_path, monkeypatch):
     files = {"certificate": tmp_path / "certificate.pem", "key": tmp_path / "key.pem"}
     command = [

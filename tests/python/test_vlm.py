@@ -8,6 +8,7 @@ import math
 import pickle
 import sqlite3
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
@@ -210,6 +211,19 @@ def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplo
     broken.put({"a": Completion("x")})
     with pytest.raises(ArgumentError, match="above 0"):
         ReplyCache(tmp_path, 0)
+
+
+def test_the_cache_serves_several_threads(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cache = ReplyCache(tmp_path)
+    cache.put({"first": Completion("x")})
+
+    def work(k: int) -> bool:
+        cache.put({f"k{k}": Completion("x")})
+        return cache.get("first") is not None and cache.get(f"k{k}") is not None
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(work, range(40)))
+    assert not caplog.text
 
 
 def test_prices_come_from_a_file(tmp_path: Path) -> None:

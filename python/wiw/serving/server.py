@@ -64,7 +64,7 @@ class Settings:
         grace: seconds for finishing what was taken when the server is told to end.
 
     Raises:
-        ArgumentError: a number out of range, or a host beyond this machine without a token.
+        ArgumentError: a number out of range, a host beyond this machine without a token, a key without a certificate.
     """
 
     host: str = "127.0.0.1"
@@ -88,14 +88,26 @@ class Settings:
                 f"serve: {self.host} can be reached by others than this machine: set WIW_TOKEN (or --token) to a "
                 "secret that clients show, such as the output of `openssl rand -hex 16`"
             )
+        if self.key is not None and self.certificate is None:
+            raise ArgumentError("serve: a key without a certificate: name that, too, or nothing would be encrypted")
 
     @property
     def tls(self) -> ssl.SSLContext | None:
-        """For wss."""
+        """For wss.
+
+        Raises:
+            ArgumentError: the certificate or its key cannot be read.
+        """
         if self.certificate is None:
             return None
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-        context.load_cert_chain(self.certificate, self.key)
+        try:
+            context.load_cert_chain(self.certificate, self.key)
+        except OSError as error:
+            named = " and ".join(str(file) for file in (self.certificate, self.key) if file is not None)
+            raise ArgumentError(
+                f"serve: expected PEM files of a certificate and its key, got {named}: {error.strerror or error}"
+            ) from None
         return context
 
 

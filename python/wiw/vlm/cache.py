@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Answers on disk, so that the same question is put to a model, and paid for, once.
 
-One SQLite file in WAL mode, which any number of processes may share. Answers are named by all that they depend on
-(`Client.name_of`). When it outgrows its budget, what was not used for longest goes first.
+One SQLite file in WAL mode, which any number of processes may share, as any number of threads may a `ReplyCache`. Answers
+are named by all that they depend on (`Client.name_of`, `Client.manner`). When it outgrows its budget, what was not used for
+longest goes first.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 import logging
 import os
 import sqlite3
+import threading
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -51,6 +53,7 @@ class ReplyCache:
         self._connection: sqlite3.Connection | None = None
         self._process = 0
         self._broken = False
+        self._lock = threading.Lock()
 
     def __reduce__(self) -> Any:
         return ReplyCache, (self.folder, self.budget_gb)
@@ -60,7 +63,7 @@ class ReplyCache:
         if self._broken or not (self.folder / "replies.sqlite").exists():
             return None
         try:
-            with self._open() as connection:
+            with self._lock, self._open() as connection:
                 row = connection.execute("SELECT data FROM reply WHERE name = ?", (name,)).fetchone()
                 if row is None:
                     return None
@@ -79,7 +82,7 @@ class ReplyCache:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             rows = [(name, json.dumps(answer.to_json()), time.time()) for name, answer in answers.items()]
-            with self._open() as connection:
+            with self._lock, self._open() as connection:
                 connection.executemany("INSERT OR REPLACE INTO reply VALUES (?, ?, ?)", rows)
                 self._trim(connection)
         except (sqlite3.Error, OSError) as error:
@@ -87,7 +90,7 @@ class ReplyCache:
 
     def _open(self) -> sqlite3.Connection:
         if self._connection is None or self._process != os.getpid():
-            connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30)
+            connection = sqlite3.connect(self.folder / "replies.sqlite", timeout=30, check_same_thread=False)
             connection.execute("PRAGMA journal_mode = WAL")
             connection.execute("PRAGMA synchronous = NORMAL")
             connection.execute(_SCHEMA)

@@ -248,7 +248,7 @@ def _begin(response: Any, seconds: float) -> Any:
     transport: Any = import_module(type(response).__module__.partition(".")[0])  # httpx, or what the SDK has instead
     stream = response.stream
 
-    class Begin(transport.SyncByteStream):  # type: ignore[misc]
+    class Begin(transport.SyncByteStream):
         def __iter__(self) -> Iterator[bytes]:
             until, count = time.monotonic() + seconds, 0
             for piece in stream:
