@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
+from pathlib import Path
 
 import pytest
 
 from wiw.errors import ArgumentError
+from wiw.world_models.fingerprint import code_digest
 
 MODEL = """
 import functools
@@ -226,3 +229,19 @@ def test_a_module_that_was_edited_and_not_imported_again_is_another_model(tmp_pa
     import edited_model as fresh
 
     assert len({before, stale, fresh.Mine().fingerprint()}) == 3
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "beside"),
+    [
+        ("wiw.world_models.nwm", "NWM", "motion.py"),
+        ("wiw.world_models.warpnet", "WarpNet", "network.py"),
+        ("wiw.world_models.actions.variants", "SVDAction", "injection.py"),
+    ],
+)
+def test_all_files_of_a_built_in_model_count(module, name, beside, monkeypatch):
+    model = getattr(importlib.import_module(module), name)
+    before, read = code_digest(model), Path.read_bytes
+    assert code_digest(model) == before
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read(path) + (b"# edited" if path.name == beside else b""))
+    assert code_digest(model) != before

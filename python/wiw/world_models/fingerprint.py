@@ -37,8 +37,8 @@ def fingerprint(model: Any) -> str:
     """Hex digest of a model's class, the files that define it, `describe()`, and all its attributes.
 
     Arrays and tensors count by content, networks by their classes, attributes, parameters and buffers, with dtypes and
-    the kind of device; torch's precision settings belong to it. Code that is imported does not: clear the cache when it
-    has changed.
+    the kind of device; torch's precision settings belong to it. Code that is imported does not (of wiw's own models,
+    that of other folders): clear the cache when it has changed.
 
     Raises:
         ArgumentError: an attribute, or what code without a file reads, is of a kind whose content cannot be told; names
@@ -228,10 +228,12 @@ class _Content:
 
 
 def _source(cls: type) -> bytes:
-    """The file that defines a class, and the compiled core behind wiw's own; nothing where there is no file."""
+    """The file that defines a class, if any; of wiw's own models all files of the folder, and the compiled core."""
     core = build_digest().encode() if cls.__module__.startswith("wiw.") else b""
     try:
-        return core + Path(inspect.getfile(cls)).read_bytes()
+        file = Path(inspect.getfile(cls))
+        files = sorted(file.parent.glob("*.py")) if cls.__module__.startswith("wiw.world_models.") else [file]
+        return core + b"".join(each.read_bytes() for each in files)
     except (OSError, TypeError):
         return core
 

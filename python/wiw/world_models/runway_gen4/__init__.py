@@ -32,7 +32,7 @@ class RunwayGen4(WorldModel):
     """Runway Gen-4: the front view and the plan in words become a clip, on Runway's servers, for money.
 
     The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
-    together. A row that was begun is never begun again: a repeated question goes on waiting for it.
+    together. A row that the service has confirmed is never begun again: a repeated question goes on waiting for it.
 
     Args:
         model: "gen4_turbo", or "gen4.5".
