@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Answers on disk, so that the same question is put to a model, and paid for, once.
 
-One SQLite file in WAL mode, which any number of processes may share, as any number of threads may a `ReplyCache`. Answers
-are named by all that they depend on (`Client.name_of`, `Client.manner`). When it outgrows its budget, what was not used for
-longest goes first.
+One SQLite file in WAL mode, which any number of processes may share, as any number of threads may a `ReplyCache`.
+Answers are named by all that they depend on (`Client.name_of`, `Client.manner`). When it outgrows its budget, what was
+not used for longest goes first.
 """
 
 from __future__ import annotations
