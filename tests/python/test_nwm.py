@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -309,6 +310,16 @@ def test_weights_that_do_not_fit_are_named(weights: Path, tmp_path: Path, monkey
     file.write_bytes(b"not a checkpoint")
     with pytest.raises(WeightsError, match=r"x\.pth\.tar"):
         NWM(weights=str(file), vae=vae, device="cpu")
+    damaged = tmp_path / "x.safetensors"
+    damaged.write_bytes(b"nothing")
+    with pytest.raises(WeightsError, match=r"x\.safetensors is damaged"):
+        NWM(weights=str(damaged), vae=vae, device="cpu")
+    from safetensors.torch import load_file, save_file
+
+    partial = shutil.copytree(weights / "vae", tmp_path / "vae") / "diffusion_pytorch_model.safetensors"
+    save_file({n: v for n, v in load_file(partial).items() if n != "decoder.conv_in.bias"}, partial)
+    with pytest.raises(WeightsError, match=r"lacks 1 parameters: decoder\.conv_in\.bias"):
+        NWM(weights=str(weights), vae=str(partial.parent), device="cpu")
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     with pytest.raises(WeightsError, match="hub is out of reach"):

@@ -75,7 +75,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
     """The image codec from a local folder or the hub.
 
     Raises:
-        WeightsError: nothing there, or not an AutoencoderKL.
+        WeightsError: nothing there, or not a whole AutoencoderKL.
     """
     try:
         codec: Any = AutoencoderKL.from_pretrained(vae, revision=revision)
@@ -85,6 +85,8 @@ def load_codec(vae: str, revision: str | None) -> Any:
         raise WeightsError(
             f"no AutoencoderKL in {vae} ({_first_line(error)}); `hf download {CODEC} --local-dir FOLDER` fetches one"
         ) from error
+    if lacking := [name for name, value in codec.named_parameters() if value.is_meta]:
+        raise WeightsError(f"{vae} lacks {len(lacking)} parameters: {_some(lacking)}; fetch it again", "unfit")
     return codec.float().eval().requires_grad_(False)
 
 
@@ -101,9 +103,13 @@ def digest(*networks: torch.nn.Module) -> str:
 def _state(path: Path) -> dict[str, Tensor]:
     """The averaged weights of a training checkpoint, or the tensors of a safetensors file."""
     if path.suffix == ".safetensors":
+        from safetensors import SafetensorError
         from safetensors.torch import load_file
 
-        return load_file(path)
+        try:
+            return load_file(path)
+        except SafetensorError as error:
+            raise WeightsError(f"{path} is damaged ({error}); fetch or write it again", "unfit") from error
     try:
         with torch.serialization.safe_globals([Namespace]):  # the trainer's options lie beside the weights
             checkpoint: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
