@@ -5,6 +5,9 @@ Bullet at a fixed 240 Hz; metres, kilograms, seconds, radians, and **z up**, the
 [4, 4] (`T_world_body`), batches [N, 4, 4]. A world is deterministic to the last bit, whatever the threads:
 `World.fork` and `World.restore` go on exactly as the original does.
 
+Hollow things are lists of convex parts. Parts of two things that are near each other are compared pair by pair: two
+cups of 6 wall segments each, one in the other, take 7000 steps a second, of 12 segments 2900.
+
     world = World()
     world.add_body(Box([1, 1, 0.1]), T_world_body=place(z=-0.05))      # a table, static
     cube = world.add_body(Box([0.04] * 3), mass=0.1, T_world_body=place(x=0.5, z=0.02))
