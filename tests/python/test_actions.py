@@ -162,6 +162,21 @@ def test_rows_follow_their_own_actions_with_guidance_too(name: str, made) -> Non
         assert np.abs(both[row] - rollout(model, plan)[0]).max() <= 1
 
 
+@pytest.mark.parametrize("name", ["svd-action", "ltx-action", "wan2.2-a14b-action"])
+def test_layers_may_be_moved_in_and_out_while_told(name: str, made) -> None:
+    """As offload="sequential" does, with the CPU in the GPU's place."""
+    from accelerate import cpu_offload
+
+    model = made(name)
+    frames = rollout(model, [FORWARD, TURN_LEFT])
+    for network in model._pipeline.components.values():
+        if isinstance(network, torch.nn.Module):
+            cpu_offload(network, torch.device("cpu"), offload_buffers=len(network._parameters) > 0)
+    assert getattr(model._pipeline, model.denoisers[0]).device.type == "meta"
+    for _ in range(2):
+        np.testing.assert_array_equal(rollout(model, [FORWARD, TURN_LEFT]), frames)
+
+
 @pytest.mark.parametrize("name", ["svd-action", "wan2.2-a14b-action"])
 def test_checkpoints_come_back_as_they_went(name: str, made, tmp_path: Path) -> None:
     model = made(name)
