@@ -13,6 +13,9 @@ from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any, Literal
+from urllib.error import HTTPError
+from urllib.request import Request as HttpRequest
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -295,6 +298,24 @@ def test_a_script_that_fails_is_told_of() -> None:
 
     with VlmServer(MockClient(script)) as server, pytest.raises(VlmError, match="ZeroDivisionError: in the script"):
         connect(server.url, attempts=1).ask(REQUESTS[:1])
+
+
+def test_no_web_page_is_answered() -> None:
+    script = MockClient()
+    with VlmServer(script) as server:
+        page = {"Origin": "https://example.org", "Content-Type": "text/plain"}
+        body = json.dumps({"messages": [{"role": "user", "content": "x"}]}).encode()
+        with pytest.raises(HTTPError, match="403"):
+            urlopen(HttpRequest(f"{server.url}/chat/completions", body, page), timeout=10)
+        del page["Origin"]
+        with urlopen(HttpRequest(f"{server.url}/chat/completions", body, page), timeout=10) as said:
+            assert said.status == 200
+    assert len(script.asked) == 1
+
+
+def test_ports_that_are_none() -> None:
+    with pytest.raises(ArgumentError, match="choose another --port"):
+        VlmServer(MockClient(), 99999)
 
 
 @pytest.mark.parametrize("length", ["-5", "x", ""])

@@ -42,7 +42,7 @@ class VlmServer:
         self._asking, self._counting = threading.Lock(), threading.Lock()
         try:
             self._http = _Http(("127.0.0.1", port), _Handler)
-        except OSError as error:
+        except (OSError, OverflowError) as error:
             raise ArgumentError(f"serve-vlm: cannot listen on port {port}: {error}; choose another --port") from None
         self._http.server = self
 
@@ -114,6 +114,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
+        if self.headers.get("origin"):  # a browser names the page that asks; no page has business here
+            self.close_connection = True
+            self._send(403, _error("web pages are not answered"))
+            return
         told = self.headers.get("content-length", "")
         if not told.isdecimal():
             self.close_connection = True
