@@ -385,3 +385,16 @@ def test_answers_reach_the_decision_and_the_environment() -> None:
 def record_of(decision) -> DecisionRecord:
     here = Truth(np.zeros(3), 0.0, 1.0, 1.0)
     return DecisionRecord(0, 0, decision, decision.actions[:1], here, here, np.zeros((2, 3)))
+
+
+def test_a_model_may_not_answer_in_the_memory_of_an_earlier_answer(task: ImageNav) -> None:
+    class Reusing(Stamp):
+        accepts = wiw.accepts(control="trajectory", view="panorama", best_batch=1, frames=6)
+        _memory = np.zeros((1, 6, 576, 1024, 3), np.uint8)
+
+        def rollout(self, observations, controls, seeds):
+            self._memory[:] = super().rollout(observations, controls, seeds)
+            return self._memory
+
+    with pytest.raises(ContractError, match="return a new array from every call"):
+        run(task, wiw.Agent(Greedy(), Reusing()), count=1)

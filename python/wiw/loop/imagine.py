@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wiw import action, panorama
 from wiw._core import core, planner
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, ContractError
 from wiw.loop.clock import Clock
 from wiw.loop.rollout_cache import Asking
 from wiw.policies.base import FrameSpec
@@ -79,7 +79,8 @@ def imagine(
             controls = _controls(accepts, part)
         with clock("world_model"):
             before = ask.cache_seconds
-            answers.append(ask(observations, controls, seeds[part.rows]))
+            found = ask(observations, controls, seeds[part.rows])
+            answers.append(_unshared(found, answers, ask.model))
         clock.move(ask.cache_seconds - before, "world_model", "cache")
     with clock("platform"):
         rollouts = _shown(batch, panoramas, answers, accepts.view, frames)
@@ -163,6 +164,17 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         return Conditioning(whole.image[rows], depth=depth, semantic=semantic, simulators=simulators)
     assert not accepts.needs  # check_model: an imagined frame has neither depth nor labels nor a simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
+
+
+def _unshared(found: NDArray[np.uint8], before: Sequence[NDArray[np.uint8]], model: Any) -> NDArray[np.uint8]:
+    """The answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
+    if any(np.may_share_memory(found, answer) for answer in before):
+        raise ContractError(
+            f"{type(model).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by that; "
+            "return a new array from every call",
+            "memory",
+        )
+    return found
 
 
 def _slice_of(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
