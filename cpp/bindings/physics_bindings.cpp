@@ -63,7 +63,7 @@ py::array_t<double> path_joints(const LinearPath& path) {
 }
 
 LinearPath plan(World& world, const Array<double>& pose, int articulation, const std::string& link,
-                const std::vector<int>& allowed, const LinearPathOptions& options) {
+                const Touchable& allowed, const LinearPathOptions& options) {
   const Pose target = to_pose(pose, "T_world_link");
   const py::gil_scoped_release release;
   const int index = world.articulation(articulation)->link_index(link);
@@ -233,17 +233,19 @@ thread at a time may use a world; different worlds are independent, and stepping
   world.def(
       "plan_linear",
       [](World& self, const Array<double>& pose, const std::string& link, int articulation,
-         const std::vector<int>& allowed, double step, double angle_step, double tolerance) {
-        return plan(self, pose, articulation, link, allowed,
+         const std::vector<int>& allowed, const std::vector<int>& allowed_articulations, double step, double angle_step,
+         double tolerance) {
+        return plan(self, pose, articulation, link, {allowed, allowed_articulations},
                     {.step = step, .angle_step = angle_step, .tolerance = tolerance});
       },
       py::arg("T_world_link"), py::arg("link"), py::arg("articulation") = 0, py::kw_only(),
-      py::arg("allowed") = std::vector<int>{}, py::arg("step") = defaults.step,
-      py::arg("angle_step") = defaults.angle_step, py::arg("tolerance") = defaults.tolerance,
+      py::arg("allowed") = std::vector<int>{}, py::arg("allowed_articulations") = std::vector<int>{},
+      py::arg("step") = defaults.step, py::arg("angle_step") = defaults.angle_step,
+      py::arg("tolerance") = defaults.tolerance,
       "The straight way of a link to a pose [4, 4], as a LinearPath: inverse kinematics every `step` metres and "
       "`angle_step` radians, then a check of the arm, and of what it holds, for overlaps of more than `tolerance` "
-      "metres "
-      "with anything but the `allowed` bodies. The state stays as it is.");
+      "metres with anything but the `allowed` bodies and `allowed_articulations`. What it overlaps at the start it may "
+      "go on to, no deeper. The state stays as it is.");
   world.def(
       "follow",
       [](World& self, const LinearPath& path, int articulation, double speed, double tolerance, int settle) {

@@ -53,7 +53,7 @@ double LinearPath::free() const {
   return joints.empty() ? 0 : static_cast<double>(joints.size() - 1) / static_cast<double>(waypoints - 1);
 }
 
-LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_world_link, std::span<const int> allowed,
+LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_world_link, const Touchable& allowed,
                        const LinearPathOptions& options) {
   check_pose(T_world_link, "T_world_link");
   const InverseKinematics ik(world.articulation(articulation), link);

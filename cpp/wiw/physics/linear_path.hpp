@@ -2,7 +2,6 @@
 #pragma once
 
 #include <optional>
-#include <span>
 #include <vector>
 
 #include "wiw/physics/inverse_kinematics.hpp"
@@ -33,10 +32,10 @@ struct LinearPath {
 };
 
 /// Straight from where the link is to `T_world_link`: inverse kinematics from waypoint to waypoint without restarts,
-/// then a check of the arm, and of what it holds, against everything but the `allowed` bodies. The state stays as it
-/// is.
+/// then a check of the arm, and of what it holds, against everything but what is `allowed` (`World::first_collision`).
+/// The state stays as it is.
 LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_world_link,
-                       std::span<const int> allowed = {}, const LinearPathOptions& options = {});
+                       const Touchable& allowed = {}, const LinearPathOptions& options = {});
 
 /// Drives the moved joints along the path at `speed` times their velocity limits (in (0, 1]), then waits until they
 /// stand within `tolerance` of the end, at most `settle` steps. Returns whether they do.

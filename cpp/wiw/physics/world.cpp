@@ -280,10 +280,11 @@ std::vector<Contact> World::contacts(double distance) {
 }
 
 std::optional<PathCollision> World::first_collision(int articulation, const std::vector<Eigen::VectorXd>& positions,
-                                                    std::span<const int> allowed, double tolerance) {
+                                                    const Touchable& allowed, double tolerance) {
   Arm& arm = impl_->arm(articulation);
   for (const Eigen::VectorXd& each : positions) arm.articulation().check_positions(each, "positions");
-  for (const int body : allowed) impl_->body(body);
+  for (const int body : allowed.bodies) impl_->body(body);
+  for (const int other : allowed.articulations) impl_->arm(other);
   const auto held = [&](const ContactSide& side) {
     return std::any_of(impl_->attachments.begin(), impl_->attachments.end(), [&](const Attachment& each) {
       return each.articulation == articulation && each.body == side.body;
@@ -291,15 +292,25 @@ std::optional<PathCollision> World::first_collision(int articulation, const std:
   };
   const auto ours = [&](const ContactSide& side) { return side.articulation == articulation || held(side); };
   const auto free = [&](const ContactSide& side) {
-    return ours(side) || (side.body >= 0 && std::find(allowed.begin(), allowed.end(), side.body) != allowed.end());
+    return ours(side) || (side.body >= 0 && std::ranges::find(allowed.bodies, side.body) != allowed.bodies.end()) ||
+           std::ranges::find(allowed.articulations, side.articulation) != allowed.articulations.end();
   };
   const std::vector<double> before = impl_->numbers();
+  std::vector<Contact> begun;  // overlaps of the first position
+  const auto deepens = [&](const Contact& contact) {
+    return std::ranges::none_of(begun, [&](const Contact& first) {
+      return first.a == contact.a && first.b == contact.b && contact.distance > first.distance - tolerance;
+    });
+  };
   std::optional<PathCollision> found;
   for (std::size_t i = 0; i < positions.size() && !found; ++i) {
     arm.set_positions(positions[i]);
     impl_->carry(articulation);
     for (const Contact& contact : impl_->detect(-tolerance)) {
-      if ((ours(contact.a) && !free(contact.b)) || (ours(contact.b) && !free(contact.a))) {
+      if (!((ours(contact.a) && !free(contact.b)) || (ours(contact.b) && !free(contact.a)))) continue;
+      if (i == 0) {
+        begun.push_back(contact);
+      } else if (deepens(contact)) {
         found = PathCollision{static_cast<int>(i), contact};
         break;
       }

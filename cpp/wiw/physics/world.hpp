@@ -59,6 +59,11 @@ struct WorldState {
   std::vector<Attachment> attachments;
 };
 
+/// What an arm may touch on its way.
+struct Touchable {
+  std::vector<int> bodies, articulations;
+};
+
 /// Where along a joint path the arm, or what it holds, first touches something.
 struct PathCollision {
   int waypoint;
@@ -128,9 +133,10 @@ class World {
   /// % of its size is looked at, and two boxes are seen only where they overlap.
   [[nodiscard]] std::vector<Contact> contacts(double distance = 0);
   /// Puts the articulation at each of `positions` in turn, held bodies along with it, and returns the first overlap by
-  /// more than `tolerance` metres with anything but `allowed` bodies. The state stays as it is.
+  /// more than `tolerance` metres with anything but what is `allowed`. Overlaps of the first position may go on, but
+  /// not deepen by more than that: an arm that touches something can leave it. The state stays as it is.
   std::optional<PathCollision> first_collision(int articulation, const std::vector<Eigen::VectorXd>& positions,
-                                               std::span<const int> allowed, double tolerance);
+                                               const Touchable& allowed, double tolerance);
 
   /// Holds a dynamic body by a link, where both are now.
   void attach(int articulation, int link, int body);

@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A table with a robot arm and things on it: their physics, and pictures of the same.
+
+The frame is that of robots: z up, x from the arm to the front camera, the table's top at `TABLE`. Pictures are drawn in
+the renderer's frame, where y is up (`Y_UP`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from wiw.errors import ArgumentError
+from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, panda, place
+from wiw.render import Output, Renderer
+from wiw.scenes import Scene
+from wiw.scenes.shapes import joined, mesh_of
+
+Colour = tuple[float, float, float]
+"""RGB from 0 to 1, as displayed."""
+Pose = NDArray[np.float64]
+"""[4, 4]."""
+
+TABLE = 0.75
+"""Metres from the floor to the table's top, which is about that of RLBench."""
+TOP = (1.1, 1.4, 0.05)
+"""Metres of the table's top."""
+BASE = place(x=-0.35, z=TABLE)
+"""Where the arm stands; the middle of the table's top lies half a metre in front of it."""
+MIDDLE = place(x=0.15, z=TABLE - TOP[2] / 2)
+Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+SUN = {"direction": (0.35, 1.0, 0.45)}
+SHUT = 0.5
+"""A gripper value below it closes the fingers."""
+
+
+@dataclass(frozen=True)
+class Thing:
+    """Something on the table: a rigid body of one or several shapes, or a mechanism with joints."""
+
+    name: str
+    parts: tuple[tuple[Any, Pose], ...] = ()
+    """Shapes of `wiw.physics` and their poses in the thing's frame."""
+    colour: Colour = (0.5, 0.5, 0.5)
+    mass: float = 0.0
+    """Kilograms; what has none stays where it is."""
+    friction: float = 0.5
+    mechanism: Articulation | None = None
+    """In place of parts; in the colours of its own description."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Where pictures are taken from."""
+
+    eye: tuple[float, float, float]
+    at: tuple[float, float, float]
+    hfov_deg: float = 60.0
+    link: str = ""
+    """Of the arm, whose frame the places are in; empty for the table's."""
+
+
+CAMERAS: Mapping[str, Camera] = {
+    "front": Camera((1.15, 0.0, 1.45), (0.1, 0.0, 0.9)),
+    "left_shoulder": Camera((-0.45, 0.75, 1.6), (0.2, 0.0, 0.8)),
+    "right_shoulder": Camera((-0.45, -0.75, 1.6), (0.2, 0.0, 0.8)),
+    "wrist": Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, "panda_hand"),
+}
+
+
+@dataclass(frozen=True)
+class Move:
+    """How far the arm came on its way to a pose."""
+
+    free: float
+    """Share of the straight way that it went, from 0 to 1."""
+    why: str
+    """"free", or what ended the way: "out of reach", "joint limits", "not converged", "jump" or "collision"."""
+
+
+class Workbench:
+    """The arm, the table and things, in a state that can be forked.
+
+    Args:
+        things: what stands on the table, and where: poses [4, 4].
+
+    Raises:
+        ArgumentError: two things of one name, or impossible shapes or numbers.
+    """
+
+    def __init__(self, things: Sequence[tuple[Thing, Pose]]) -> None:
+        self.things = {thing.name: thing for thing, _ in things}
+        if len(self.things) < len(things):
+            raise ArgumentError(f"Workbench: expected a name for each thing, got {[t.name for t, _ in things]}")
+        self._world = World()
+        self._table = self._world.add_body(Box(TOP), T_world_body=MIDDLE, name="table", friction=0.8)
+        self._arm = self._world.add_articulation(panda(), BASE)
+        self._bodies, self._mechanisms = dict[str, int](), dict[str, int]()
+        for thing, pose in things:
+            if thing.mechanism is None:
+                self._bodies[thing.name] = self._world.add_body(
+                    list(thing.parts), mass=thing.mass, T_world_body=pose, name=thing.name, friction=thing.friction
+                )
+            else:
+                self._mechanisms[thing.name] = self._world.add_articulation(thing.mechanism, pose)
+        self._world.set_joint_positions(PANDA_READY, self._arm)
+        self._pictures = _Pictures(self)
+
+    def fork(self) -> Workbench:
+        """The same state apart, to be run ahead; pictures are drawn with the same renderer."""
+        other = object.__new__(Workbench)
+        other.__dict__.update(self.__dict__)
+        other._world = self._world.fork()
+        return other
+
+    # -- the arm -------------------------------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> NDArray[np.float64]:
+        """float64 [7]: x, y, z, roll, pitch, yaw of the point between the finger tips, and how open they are."""
+        tip = self._world.link_poses(self._arm)[panda().link_index(PANDA_TCP)]
+        angles = Rotation.from_matrix(tip[:3, :3]).as_euler("xyz")
+        return np.array([*tip[:3, 3], *angles, Gripper(self._world, self._arm).opening])
+
+    @property
+    def held(self) -> str | None:
+        """What the gripper holds."""
+        index = Gripper(self._world, self._arm).held
+        return next((name for name, body in self._bodies.items() if body == index), None)
+
+    def go(self, pose: ArrayLike) -> Move:
+        """Moves the gripper straight to a pose [7] as far as the way is free, then opens or closes it.
+
+        A way that leads into the table or out of reach is gone as far as it is free; the arm may touch everything else.
+
+        Raises:
+            ArgumentError: not finite, another shape, or a gripper outside [0, 1]; nothing has moved then.
+        """
+        wanted = np.asarray(pose, np.float64)
+        if wanted.shape != (7,) or not np.isfinite(wanted).all() or not 0 <= wanted[6] <= 1:
+            raise ArgumentError(f"go: expected a finite pose [7] with a gripper from 0 to 1, got {wanted.tolist()}")
+        x, y, z, *angles = wanted[:6]
+        path = self._world.plan_linear(
+            place(x, y, z, angles),
+            PANDA_TCP,
+            self._arm,
+            allowed=list(self._bodies.values()),
+            allowed_articulations=list(self._mechanisms.values()),
+        )
+        self._world.follow(path, self._arm)
+        gripper = Gripper(self._world, self._arm)
+        if wanted[6] < SHUT and gripper.held is None:
+            gripper.close()
+        elif wanted[6] >= SHUT and (gripper.held is not None or gripper.opening < wanted[6]):
+            gripper.open(float(wanted[6]))
+        return Move(path.free, path.reason)
+
+    # -- things --------------------------------------------------------------------------------------------------------
+
+    def place_of(self, name: str) -> Pose:
+        """Where a thing is, [4, 4]; a mechanism's base."""
+        if name in self._bodies:
+            return self._world.body_poses()[self._bodies[name]]
+        return self._world.link_poses(self._mechanisms[name])[0]
+
+    def joints_of(self, name: str) -> NDArray[np.float64]:
+        """float64 [dof]: joint positions of a mechanism."""
+        return self._world.joint_positions(self._mechanisms[name])
+
+    def set_spring(self, name: str, force: float) -> None:
+        """Lets the joints of a mechanism go back to zero with at most so many newtons (or newton metres)."""
+        count = len(self.joints_of(name))
+        self._world.set_joint_targets(np.zeros(count), self._mechanisms[name])
+        self._world.set_joint_forces(np.full(count, force), self._mechanisms[name])
+
+    def settle(self, steps: int = 240) -> None:
+        """Lets things come to rest."""
+        self._world.step(steps)
+
+    # -- pictures ------------------------------------------------------------------------------------------------------
+
+    def picture(
+        self, camera: str = "front", size: tuple[int, int] = (480, 480), outputs: Sequence[Output] = ("color",)
+    ) -> dict[str, NDArray[Any]]:
+        """What a camera sees: "color" uint8 [H, W, 3], "depth" float32 [H, W] planar metres, "instance" uint32 [H, W].
+
+        Raises:
+            ArgumentError: no such camera.
+        """
+        if camera not in CAMERAS:
+            raise ArgumentError(f"picture: expected a camera among {', '.join(CAMERAS)}, got {camera!r}")
+        found = self._pictures.taken(self, CAMERAS[camera], size, outputs)
+        return {name: image[0] for name, image in found.items()}
+
+    def fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
+        """uint8 [K, H, W, 3]: the front camera's view after each of the poses [K, 7], gone to one after another."""
+        views = []
+        for pose in np.asarray(poses, np.float64):
+            self.go(pose)
+            views.append(self.picture("front", size)["color"])
+        return np.stack(views)
+
+    def poses_of_parts(self) -> list[Pose]:
+        """T_world of all that is drawn and may move: things by their order, then the arm's visuals."""
+        bodies, arm = self._world.body_poses(), self._world.link_poses(self._arm)
+        found: list[Pose] = []
+        for name, thing in self.things.items():
+            if thing.mechanism is None:
+                found.append(bodies[self._bodies[name]])
+            else:
+                links = self._world.link_poses(self._mechanisms[name])
+                found += [links[each["link"]] @ each["T_link_visual"] for each in thing.mechanism.visuals]
+        return found + [arm[each["link"]] @ each["T_link_visual"] for each in panda().visuals]
+
+    def link_pose(self, link: str) -> Pose:
+        """Of the arm, [4, 4]."""
+        return self._world.link_poses(self._arm)[panda().link_index(link)]
+
+
+class _Pictures:
+    """The scene of a workbench and its renderer, which all its forks draw with."""
+
+    def __init__(self, bench: Workbench) -> None:
+        meshes: list[dict[str, Any]] = []
+        materials: list[dict[str, Any]] = []
+
+        def add(mesh: Mapping[str, Any], colour: Sequence[float], pose: Pose, name: str) -> None:
+            materials.append({"name": name, "base_color": (*map(float, colour[:3]), 1.0)})
+            meshes.append({**mesh, "material": len(materials) - 1, "name": name, "T_world_instance": Y_UP @ pose})
+
+        for name, shape, colour, pose in _ROOM:
+            add(mesh_of(shape), colour, pose, name)
+        self._first = len(meshes) + 1
+        poses = iter(bench.poses_of_parts())
+        for thing in bench.things.values():
+            if thing.mechanism is None:
+                whole = joined([(mesh_of(shape), pose) for shape, pose in thing.parts])
+                add(whole, thing.colour, next(poses), thing.name)
+            else:
+                for each in thing.mechanism.visuals:
+                    add(mesh_of(each["shape"]), each["color"], next(poses), thing.name)
+        for each in panda().visuals:
+            add(mesh_of(each["shape"]), each["color"], next(poses), "arm")
+        scene = Scene.from_arrays(meshes, name="workbench", materials=materials, sun=SUN)
+        self._renderer = Renderer(scene, samples=4)
+
+    def taken(
+        self, bench: Workbench, camera: Camera, size: tuple[int, int], outputs: Sequence[Output]
+    ) -> dict[str, NDArray[Any]]:
+        """A batch of one picture of a state."""
+        moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
+        ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
+        self._renderer.core.set_poses(ids, moved.astype(np.float32))
+        pose = _looking(camera)
+        if camera.link:
+            pose = bench.link_pose(camera.link) @ pose
+        return self._renderer.perspective(Y_UP @ pose, size, camera.hfov_deg, outputs=outputs)
+
+
+def _looking(camera: Camera) -> Pose:
+    """The pose of a camera, which looks along -z with +y up, from its eye to what it looks at."""
+    ahead = np.subtract(camera.at, camera.eye) / np.linalg.norm(np.subtract(camera.at, camera.eye))
+    up = (0, 0, 1) if abs(ahead[2]) < 0.95 else (1, 0, 0)
+    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+    pose[:3, 3] = camera.eye
+    return pose
+
+
+_LEG = Box((0.05, 0.05, TABLE - TOP[2]))
+_ROOM: list[tuple[str, Any, Colour, Pose]] = [
+    ("floor", Box((6, 6, 0.02)), (0.55, 0.55, 0.57), place(z=-0.01)),
+    ("wall", Box((0.02, 6, 3)), (0.83, 0.84, 0.82), place(x=-1.2, z=1.5)),
+    ("table", Box(TOP), (0.72, 0.58, 0.42), MIDDLE),
+    *(
+        ("table", _LEG, (0.6, 0.48, 0.35), place(x=x, y=y, z=(TABLE - TOP[2]) / 2))
+        for x in (-0.35, 0.65)
+        for y in (-0.64, 0.64)
+    ),
+]
+"""What is drawn and never moves."""

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The arm at its table: moves, grasps, mechanisms, forks, and pictures that show the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from wiw.envs.workbench import CAMERAS, TABLE, Thing, Workbench
+from wiw.errors import ArgumentError
+from wiw.physics import Articulation, Box, Capsule, ConvexHull, Cylinder, Sphere, place
+from wiw.scenes.shapes import joined, mesh_of
+
+DOWN = (np.pi, 0.0, 0.0)
+BUTTON = """<robot name="button">
+  <link name="base"><visual><geometry><cylinder radius="0.045" length="0.016"/></geometry></visual>
+    <collision><geometry><cylinder radius="0.045" length="0.016"/></geometry></collision></link>
+  <link name="plate"><inertial><mass value="0.05"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><geometry><cylinder radius="0.032" length="0.02"/></geometry></visual>
+    <collision><geometry><cylinder radius="0.032" length="0.02"/></geometry></collision></link>
+  <joint name="press" type="prismatic"><parent link="base"/><child link="plate"/><origin xyz="0 0 0.02"/>
+    <axis xyz="0 0 1"/><limit lower="-0.016" upper="0" effort="5" velocity="1"/></joint></robot>"""
+
+
+def cube(name: str, colour=(0.8, 0.1, 0.1)) -> Thing:
+    return Thing(name, ((Box([0.045] * 3), np.eye(4)),), colour, mass=0.08)
+
+
+def on_table(x: float, y: float, height: float = 0.045):
+    return place(x, y, TABLE + height / 2)
+
+
+@pytest.fixture
+def bench() -> Workbench:
+    return Workbench([(cube("red"), on_table(0.1, -0.15)), (cube("green", (0.1, 0.6, 0.2)), on_table(0.2, 0.15))])
+
+
+def at(x: float, y: float, height: float, gripper: float = 1.0):
+    return [x, y, TABLE + height, *DOWN, gripper]
+
+
+@settings(max_examples=25)
+@given(
+    st.floats(0.0, 0.3), st.floats(-0.25, 0.25), st.floats(0.15, 0.4), st.floats(-0.4, 0.4), st.sampled_from([0.0, 1.0])
+)
+def test_it_goes_where_it_is_told(x: float, y: float, height: float, yaw: float, gripper: float) -> None:
+    bench = Workbench([])
+    wanted = np.array([x, y, TABLE + height, np.pi, 0, yaw, gripper])
+    move = bench.go(wanted)
+    assert move.why == "free" and move.free == 1
+    came = bench.pose
+    assert np.linalg.norm(came[:3] - wanted[:3]) < 0.003 and abs(came[6] - gripper) < 0.02
+    turned = Rotation.from_euler("xyz", came[3:6]).inv() * Rotation.from_euler("xyz", wanted[3:6])
+    assert np.degrees(turned.magnitude()) < 0.6
+
+
+def test_it_takes_a_cube_and_puts_it_on_another(bench: Workbench) -> None:
+    for pose in (at(0.1, -0.15, 0.15), at(0.1, -0.15, 0.02), at(0.1, -0.15, 0.02, 0), at(0.1, -0.15, 0.2, 0)):
+        assert bench.go(pose).why == "free"
+    assert bench.held == "red" and bench.place_of("red")[2, 3] > TABLE + 0.15
+    for pose in (at(0.2, 0.15, 0.2, 0), at(0.2, 0.15, 0.067, 0), at(0.2, 0.15, 0.067), at(0.2, 0.15, 0.2)):
+        assert bench.go(pose).why == "free"
+    bench.settle()
+    red, green = bench.place_of("red")[:3, 3], bench.place_of("green")[:3, 3]
+    assert bench.held is None and np.abs(red - green - (0, 0, 0.045)).max() < 0.006
+
+
+def test_a_spring_goes_down_under_the_hand_and_comes_back() -> None:
+    button = Thing("button", mechanism=Articulation.from_text(BUTTON))
+    bench = Workbench([(button, place(0.2, 0.1, TABLE + 0.008))])
+    bench.set_spring("button", 4.0)
+    bench.settle()
+    assert abs(bench.joints_of("button")[0]) < 1e-3
+    bench.go(at(0.2, 0.1, 0.12, 0))
+    bench.go(at(0.2, 0.1, 0.028, 0))
+    assert bench.joints_of("button")[0] < -0.003
+    bench.go(at(0.2, 0.1, 0.12, 0))
+    bench.settle()
+    assert abs(bench.joints_of("button")[0]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("pose", "why"),
+    [
+        ([2.0, 0, 1.0, *DOWN, 1], {"out of reach", "not converged", "joint limits"}),
+        (at(0.15, 0.0, -0.1), {"collision"}),
+    ],
+)
+def test_a_way_that_is_not_free_ends_early_and_can_be_left(bench: Workbench, pose, why) -> None:
+    move = bench.go(pose)
+    assert move.why in why and move.free < 1
+    assert bench.pose[2] > TABLE - 0.002
+    assert bench.go(at(0.15, 0.0, 0.3)).why == "free"
+
+
+@pytest.mark.parametrize("pose", [[np.nan] * 7, [0.2, 0, 1, *DOWN, 1.2], [0.2, 0, 1, *DOWN], [0.2, 0, 1, *DOWN, -0.1]])
+def test_what_is_no_pose_moves_nothing(bench: Workbench, pose) -> None:
+    before = bench.pose
+    with pytest.raises(ArgumentError, match="gripper from 0 to 1"):
+        bench.go(pose)
+    np.testing.assert_array_equal(bench.pose, before)
+
+
+def test_a_fork_goes_on_as_the_original_does_and_leaves_it_alone(bench: Workbench) -> None:
+    bench.go(at(0.1, -0.15, 0.15))
+    fork = bench.fork()
+    plan = [at(0.1, -0.15, 0.02), at(0.1, -0.15, 0.02, 0), at(0.25, 0.0, 0.25, 0)]
+    foreseen = fork.fronts_after(plan, (120, 120))
+    assert bench.held is None and fork.held == "red"
+    truth = [bench.go(pose) and bench.picture("front", (120, 120))["color"] for pose in plan]
+    np.testing.assert_array_equal(foreseen, np.stack(truth))
+    np.testing.assert_array_equal(bench.pose, fork.pose)
+    np.testing.assert_array_equal(bench.place_of("red"), fork.place_of("red"))
+
+
+def test_pictures_show_things_where_they_are(bench: Workbench) -> None:
+    for camera in CAMERAS:
+        assert bench.picture(camera, (60, 80))["color"].shape == (60, 80, 3)
+    before = bench.picture("front", (240, 240), ("color", "depth", "instance"))
+    red = (before["color"].astype(int) @ [1, -1, -1]) > 60
+    assert 20 < red.sum() < 400 and len(np.unique(before["instance"][red])) == 1
+    eye = np.array(CAMERAS["front"].eye)
+    seen = np.linalg.norm(bench.place_of("red")[:3, 3] - eye)
+    assert abs(np.median(before["depth"][red]) / seen - 1) < 0.1
+    for pose in (at(0.1, -0.15, 0.15), at(0.1, -0.15, 0.02), at(0.1, -0.15, 0.02, 0), at(0.1, 0.2, 0.3, 0)):
+        bench.go(pose)
+    after = bench.picture("front", (240, 240))["color"]
+    moved = (after.astype(int) @ [1, -1, -1]) > 60
+    assert np.argwhere(moved)[:, 1].mean() > np.argwhere(red)[:, 1].mean() + 20
+    with pytest.raises(ArgumentError, match="left_shoulder"):
+        bench.picture("behind")
+
+
+def test_names_are_told_apart() -> None:
+    with pytest.raises(ArgumentError, match="a name for each thing"):
+        Workbench([(cube("one"), on_table(0.1, 0)), (cube("one"), on_table(0.2, 0))])
+
+
+# -- meshes ------------------------------------------------------------------------------------------------------------
+
+SHAPES = {
+    "box": (Box([0.2, 0.3, 0.4]), 0.024),
+    "ball": (Sphere(0.2), 4 / 3 * np.pi * 0.008),
+    "cylinder": (Cylinder(0.1, 0.5), np.pi * 0.01 * 0.5),
+    "capsule": (Capsule(0.1, 0.5), np.pi * 0.01 * 0.5 + 4 / 3 * np.pi * 0.001),
+    "hull": (ConvexHull(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])), 1 / 6),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_meshes_enclose_the_volume_of_their_shape(name: str) -> None:
+    shape, volume = SHAPES[name]
+    mesh = mesh_of(shape)
+    corners = mesh["positions"].astype(float)[mesh["triangles"]]
+    enclosed = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert enclosed == pytest.approx(volume, rel=0.01)
+    flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = mesh["normals"][mesh["triangles"]].mean(axis=1)
+    assert ((flat * normals).sum(-1) >= -1e-9).all()
+    np.testing.assert_allclose(np.linalg.norm(mesh["normals"], axis=1), 1, atol=1e-5)
+
+
+def test_parts_make_one_mesh_and_other_things_none() -> None:
+    both = joined([(mesh_of(Box([1, 1, 1])), place(z=2)), (mesh_of(Box([1, 1, 1])), place(x=3, rpy=(0, 0, 0.3)))])
+    assert len(both["positions"]) == 48 and both["triangles"].max() == 47
+    assert both["positions"][:24, 2].min() == pytest.approx(1.5)
+    with pytest.raises(ArgumentError, match=r"a shape of wiw\.physics"):
+        mesh_of("ball")
