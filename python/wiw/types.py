@@ -118,6 +118,8 @@ class ArmObservation:
     """float64 [7]: of the gripper, in the world's frame; `docs/conventions.md` has axes and units."""
     depth: NDArray[np.float32] | None = None
     """float32 [480, 480] planar z in metres of the front view, 0 where nothing is hit; None unless asked for."""
+    places: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    """float64 [4, 4] by name: the objects' exact poses, which the paper gives policies that cannot see them so well."""
 
     def as_dict(self) -> dict[str, Any]:
         """The observation as gymnasium spaces see it; `depth` only where present."""

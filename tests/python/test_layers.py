@@ -33,7 +33,7 @@ FACES = {
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "metrics", "perception", "vlm", "wire"},
+    {"datasets", "metrics", "perception", "tabletop", "vlm", "wire"},
     {"envs", "policies", "world_models"},
     {"tasks", "loop", "training"},
     {"evaluation"},

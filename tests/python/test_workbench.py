@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from wiw.envs.workbench import CAMERAS, TABLE, Thing, Workbench
 from wiw.errors import ArgumentError
 from wiw.physics import Articulation, Box, Capsule, ConvexHull, Cylinder, Sphere, place
-from wiw.scenes.shapes import joined, mesh_of
+from wiw.tabletop.shapes import joined, mesh_of
+from wiw.tabletop.workbench import CAMERAS, TABLE, Thing, Workbench
 
 DOWN = (np.pi, 0.0, 0.0)
 BUTTON = """<robot name="button">

@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, panda, place
 from wiw.render import Output, Renderer
 from wiw.scenes import Scene
-from wiw.scenes.shapes import joined, mesh_of
+from wiw.tabletop.shapes import joined, mesh_of
 
 Colour = tuple[float, float, float]
 """RGB from 0 to 1, as displayed."""
@@ -52,6 +52,8 @@ class Thing:
     friction: float = 0.5
     mechanism: Articulation | None = None
     """In place of parts; in the colours of its own description."""
+    touched: bool = True
+    """Whether it has a body; what has none is only seen, as a mark on the table."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,10 @@ class Workbench:
         self._table = self._world.add_body(Box(TOP), T_world_body=MIDDLE, name="table", friction=0.8)
         self._arm = self._world.add_articulation(panda(), BASE)
         self._bodies, self._mechanisms = dict[str, int](), dict[str, int]()
+        self._marks = {thing.name: pose for thing, pose in things if not thing.touched}
         for thing, pose in things:
+            if not thing.touched:
+                continue
             if thing.mechanism is None:
                 self._bodies[thing.name] = self._world.add_body(
                     list(thing.parts), mass=thing.mass, T_world_body=pose, name=thing.name, friction=thing.friction
@@ -164,9 +169,15 @@ class Workbench:
 
     def place_of(self, name: str) -> Pose:
         """Where a thing is, [4, 4]; a mechanism's base."""
+        if name in self._marks:
+            return self._marks[name]
         if name in self._bodies:
             return self._world.body_poses()[self._bodies[name]]
         return self._world.link_poses(self._mechanisms[name])[0]
+
+    def places(self, names: Sequence[str]) -> dict[str, Pose]:
+        """Where things are, by name."""
+        return {name: self.place_of(name) for name in names}
 
     def joints_of(self, name: str) -> NDArray[np.float64]:
         """float64 [dof]: joint positions of a mechanism."""
@@ -211,7 +222,7 @@ class Workbench:
         found: list[Pose] = []
         for name, thing in self.things.items():
             if thing.mechanism is None:
-                found.append(bodies[self._bodies[name]])
+                found.append(bodies[self._bodies[name]] if thing.touched else self._marks[name])
             else:
                 links = self._world.link_poses(self._mechanisms[name])
                 found += [links[each["link"]] @ each["T_link_visual"] for each in thing.mechanism.visuals]

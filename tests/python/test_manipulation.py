@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The four tasks at the table: their experts, their words, and episodes of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wiw.action import PoseGrid
+from wiw.envs.manipulation import ManipulationEnv
+from wiw.errors import ArgumentError
+from wiw.tabletop.kind import PALETTE, REACH, scattered
+from wiw.tabletop.workbench import TABLE
+from wiw.tasks.manipulation import KINDS, Manipulation
+
+GRID = PoseGrid()
+
+
+def solved(env: ManipulationEnv, discrete: bool = False) -> dict[str, float]:
+    """The result of an episode that its expert plays, asked anew where a plan was not enough."""
+    kind, setup = env.table.kind, env.table.setup
+    while True:
+        plan = kind.expert(env.observation.places, setup.target)
+        for pose in GRID.decode(GRID.encode(plan)) if discrete else plan:
+            *_, done, over, info = env.step(pose)
+            if done or over:
+                return info["result"]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("name", KINDS)
+def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
+    """Of 200 tables each 98 % and more, 95 % on the grid; these few, which no table was shaped after, all but one."""
+    env = Manipulation(name, seed=7).environment()
+    results = []
+    for index in range(4):
+        env.reset(options={"episode": index})
+        assert not env.table.succeeded()
+        results.append(solved(env, discrete))
+    assert sum(result["success"] for result in results) >= 3
+    assert all(result["poses"] <= 15 for result in results)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_another_target_than_the_one_that_is_told_is_no_success(name: str) -> None:
+    env = Manipulation(name, seed=3).environment()
+    env.reset(options={"episode": 0})
+    kind, setup = env.table.kind, env.table.setup
+    others = [
+        name for name in setup.objects if name not in ("ring", "block") and name not in np.atleast_1d(setup.target)
+    ]
+    wrong = (others[0],) if isinstance(setup.target, tuple) else others[0]
+    for pose in kind.expert(env.observation.places, wrong):
+        _, _, done, over, _ = env.step(pose)
+        assert not done
+        if over:
+            break
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_instructions_name_the_target_and_tables_are_functions_of_their_seed(name: str) -> None:
+    kind = KINDS[name]
+    for seed, variation in ((0, 0), (1, 1), (2, 7), (3, 19)):
+        setup, again = kind.setup(seed, variation), kind.setup(seed, variation)
+        for colour in np.atleast_1d(setup.target):
+            assert colour in setup.instruction and colour in setup.objects
+        assert setup.instruction == again.instruction and setup.target == again.target
+        for (one, here), (other, there) in zip(setup.things, again.things, strict=True):
+            assert one.name == other.name
+            np.testing.assert_array_equal(here, there)
+        moved = [pose for _, pose in kind.setup(seed + 100, variation).things]
+        assert any(not np.allclose(pose, other) for pose, (_, other) in zip(moved, setup.things, strict=True))
+
+
+def test_buttons_count_in_their_order() -> None:
+    kind = KINDS["push_buttons"]
+    setup = kind.setup(5, 2)
+    assert len(setup.target) == 3
+    for order, right in ((setup.target, True), (setup.target[::-1], False), ((*setup.target, setup.target[0]), False)):
+        bench = setup.bench()
+        memory = kind.begin(bench, setup)
+        for pose in kind.expert(bench.places(setup.objects), order):
+            bench.go(pose)
+            kind.note(bench, setup, memory)
+        assert memory == list(order)
+        assert kind.succeeded(bench, setup, memory) is right
+
+
+def test_the_environment_is_gymnasiums() -> None:
+    env = Manipulation("slide_block").environment(depth=True)
+    check_env(env, skip_render_check=True)
+    observation, info = env.reset(options={"episode": 2})
+    assert observation["front"].shape == (480, 480, 3) and observation["depth"].shape == (480, 480)
+    assert info["instruction"] == env.goal.text
+    again, _ = env.reset(options={"episode": 2})
+    np.testing.assert_array_equal(observation["front"], again["front"])
+
+
+def test_episodes_end_with_their_actions_and_record_what_was_refused() -> None:
+    env = Manipulation("push_buttons", actions=3).environment()
+    env.reset(options={"episode": 0})
+    far, into = [3.0, 0, 1, np.pi, 0, 0, 1], [0.35, 0.25, TABLE - 0.2, np.pi, 0, 0, 1]
+    segment = env.run([far, into, [0.2, 0, 1.1, np.pi, 0, 0, 1], far])
+    assert len(segment.executed) == 3 and segment.truncated and not segment.terminated
+    assert len(segment.refused) == 2 and segment.path.shape == (4, 3)
+    assert env.result() == {"success": 0.0, "actions": 1.0, "poses": 3.0, "refused": 2.0}
+    with pytest.raises(ArgumentError, match="finite pose"):
+        env.table.bench.go([np.nan] * 7)
+
+
+def test_what_is_no_task_is_named() -> None:
+    with pytest.raises(ArgumentError, match="push_buttons, slide_block, insert_peg, stack_cups, got juggle"):
+        Manipulation("juggle")
+    with pytest.raises(ArgumentError, match="at least one action"):
+        Manipulation(actions=0)
+    with pytest.raises(ArgumentError, match=r"reset\(\) first"):
+        Manipulation().environment().step(np.zeros(7))
+    names = [episode.info["task"] for episode in Manipulation("slide_block,insert_peg").episodes(4)]
+    assert names == ["slide_block", "insert_peg"] * 2
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**32), st.integers(1, 4))
+def test_things_are_scattered_apart_and_in_reach(key: int, count: int) -> None:
+    places = scattered(key, count, 0.13)
+    assert (places >= REACH[0]).all() and (places <= REACH[1]).all()
+    gaps = np.linalg.norm(places[:, None] - places, axis=-1) + 9 * np.eye(count)
+    assert gaps.min() >= 0.13
+    with pytest.raises(ArgumentError, match="room"):
+        scattered(key, 3, 2.0)
+
+
+def test_the_palette_is_told_apart() -> None:
+    colours = np.array(list(PALETTE.values()))
+    gaps = np.abs(colours[:, None] - colours).max(-1) + np.eye(len(colours))
+    assert gaps.min() >= 0.1 and len(PALETTE) == 19
