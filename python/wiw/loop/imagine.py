@@ -17,7 +17,7 @@ from wiw.errors import ArgumentError, ContractError
 from wiw.loop.clock import Clock
 from wiw.loop.rollout_cache import Asking
 from wiw.policies.base import FrameSpec
-from wiw.types import Conditioning, Control, Proposal, Rollout, View
+from wiw.types import Conditioning, Control, Key, Proposal, Rollout, View
 from wiw.world_models.base import Accepts
 
 
@@ -116,10 +116,7 @@ def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> Condi
     maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
     depth = simulators = None
     if "depth" in accepts.needs:
-        depths = [query.observation.depth for query in queries]
-        if any(value is None for value in depths):
-            raise ArgumentError("the world model needs depth: make the environment with depth=True")
-        depth = batch.depths(np.stack(depths), maker)
+        depth = batch.depths(depths_of(queries), maker)
     semantic = _labels(accepts, batch, queries) if "semantic" in accepts.needs else None
     if "simulator" in accepts.needs:
         simulators = [
@@ -207,12 +204,27 @@ def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
     return primitives if accepts.vocabulary is None else action.to_controls(primitives, accepts.vocabulary)
 
 
+def seed_of(key: Key, candidate: int) -> int:
+    """The seed of a candidate's future, whatever else is imagined beside it."""
+    return int(core.fold_key([key.seed, key.episode, key.decision, candidate]))
+
+
+def depths_of(queries: Sequence[Any]) -> NDArray[np.float32]:
+    """Depth of all observations, stacked.
+
+    Raises:
+        ArgumentError: one has none.
+    """
+    depths = [query.observation.depth for query in queries]
+    if any(value is None for value in depths):
+        raise ArgumentError("the world model needs depth: make the environment with depth=True")
+    return np.stack(depths)
+
+
 def _seeds(batch: Any, queries: Sequence[Any], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
     """uint64 [rows]: keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
     keys = [
-        core.fold_key([query.key.seed, query.key.episode, query.key.decision, candidate])
-        for query, numbers in zip(queries, origins, strict=True)
-        for candidate in numbers
+        seed_of(query.key, candidate) for query, numbers in zip(queries, origins, strict=True) for candidate in numbers
     ]
     return np.array(keys, np.uint64)[batch.row_owner]
 

@@ -18,10 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import action
-from wiw._core import core
 from wiw.errors import ArgumentError
 from wiw.loop.clock import Clock
-from wiw.loop.imagine import Imagination, imagine
+from wiw.loop.imagine import Imagination, depths_of, imagine, seed_of
 from wiw.loop.rollout_cache import Asking
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout, Space, View
@@ -105,9 +104,8 @@ def _rows(
             name = plan.actions.tobytes(), plan.text
             if name not in known:
                 known[name] = len(rows)
-                seed = core.fold_key([query.key.seed, query.key.episode, query.key.decision, number])
                 control = _control(accepts, plan, query.observation.pose)
-                rows.append(_Row(episode, plan.actions, control, seed))
+                rows.append(_Row(episode, plan.actions, control, seed_of(query.key, number)))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 
@@ -140,10 +138,7 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
 def _conditioning(accepts: Accepts, queries: Sequence[Any]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depths = [query.observation.depth for query in queries]
-        if any(value is None for value in depths):
-            raise ArgumentError("the world model needs depth: make the environment with depth=True")
-        depth = np.stack([_resized(value, accepts.size, cv2.INTER_NEAREST) for value in depths])
+        depth = np.stack([_resized(value, accepts.size, cv2.INTER_NEAREST) for value in depths_of(queries)])
     if "simulator" in accepts.needs:
         simulators = [query.simulator for query in queries]
         if any(value is None for value in simulators):
