@@ -42,9 +42,6 @@ class Table(Protocol):
     def succeeded(self) -> bool:
         """Whether what is asked for is done."""
 
-    def left(self) -> float:
-        """Metres of what is still to be moved, or as the task measures it; 0 when done."""
-
 
 class ManipulationTask(Protocol):
     """What the environment asks of a task."""
@@ -124,17 +121,16 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return observation.as_dict(), {"key": self._key, "instruction": self.goal.text}
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Goes to one pose.
+        """Goes to one pose, which is a decision of its own.
 
         Raises:
             ArgumentError: no finite pose [7] with a gripper from 0 to 1; nothing has moved then.
         """
-        segment = self._carry_out(np.asarray(action, np.float64)[None])
+        segment = self.run(np.asarray(action, np.float64)[None])
         info: dict[str, Any] = {"key": segment.key, "refused": segment.refused}
         if segment.terminated or segment.truncated:
             info["result"] = self.result()
-        reward = float(self.table.succeeded())
-        return segment.observation.as_dict(), reward, segment.terminated, segment.truncated, info
+        return segment.observation.as_dict(), float(segment.terminated), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
         """The front view."""
@@ -151,8 +147,24 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
 
     def run(self, plan: ArrayLike) -> Segment:
         """Carries out one decision's poses [K, 7], as far as the episode goes on; observes once, at the end."""
+        table, executed, refused = self.table, [], []
+        path = [table.bench.pose[:3]]
+        for pose in np.asarray(plan, np.float64)[: self.task.actions - self._taken]:
+            move = table.bench.go(pose)
+            table.note()
+            executed.append(pose)
+            path.append(table.bench.pose[:3])
+            refused += [] if move.why == "free" else [move.why]
+            if table.succeeded():
+                break
         self._decisions += 1
-        return self._carry_out(np.asarray(plan, np.float64))
+        self._taken += len(executed)
+        self._refused += refused
+        self._key = self._key.at(self._key.decision + 1)
+        done = table.succeeded()
+        over = not done and self._taken >= self.task.actions
+        taken = np.array(executed).reshape(-1, 7)
+        return Segment(self._observe(), taken, np.stack(path), done, over, self._key, tuple(refused))
 
     @property
     def goal(self) -> Goal:
@@ -178,8 +190,8 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return self.table.bench.fork()
 
     def truth(self) -> Truth:
-        """Where the gripper is, and what is left to do; for metrics, records and reports alone."""
-        return Truth(self.table.bench.pose[:3], 0.0, self.table.left(), float("nan"))
+        """Where the gripper is, at distance 0 when what is asked for is done, else 1; for records and reports alone."""
+        return Truth(self.table.bench.pose[:3], 0.0, float(not self.table.succeeded()), float("nan"))
 
     def result(self) -> dict[str, float]:
         """Metrics of the running episode: success (0 or 1), `actions` (decisions, as the paper counts), poses gone to,
@@ -193,25 +205,6 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         }
 
     # ------------------------------------------------------------------------------------------------------------------
-
-    def _carry_out(self, plan: NDArray[np.float64]) -> Segment:
-        table, executed, refused = self.table, [], []
-        path = [table.bench.pose[:3]]
-        for pose in plan[: self.task.actions - self._taken]:
-            move = table.bench.go(pose)
-            table.note()
-            executed.append(pose)
-            path.append(table.bench.pose[:3])
-            refused += [] if move.why == "free" else [move.why]
-            if table.succeeded():
-                break
-        self._taken += len(executed)
-        self._refused += refused
-        self._key = self._key.at(self._key.decision + 1)
-        done = table.succeeded()
-        over = not done and self._taken >= self.task.actions
-        taken = np.array(executed).reshape(-1, 7)
-        return Segment(self._observe(), taken, np.stack(path), done, over, self._key, tuple(refused))
 
     def _observe(self) -> ArmObservation:
         bench = self.table.bench

@@ -100,7 +100,7 @@ class Workbench:
         if len(self.things) < len(things):
             raise ArgumentError(f"Workbench: expected a name for each thing, got {[t.name for t, _ in things]}")
         self._world = World()
-        self._table = self._world.add_body(Box(TOP), T_world_body=MIDDLE, name="table", friction=0.8)
+        self._world.add_body(Box(TOP), T_world_body=MIDDLE, name="table", friction=0.8)
         self._arm = self._world.add_articulation(panda(), BASE)
         self._bodies, self._mechanisms = dict[str, int](), dict[str, int]()
         self._marks = {thing.name: pose for thing, pose in things if not thing.touched}

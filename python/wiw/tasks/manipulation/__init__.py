@@ -84,7 +84,3 @@ class Table:
     def succeeded(self) -> bool:
         """Whether what is asked for is done."""
         return self.kind.succeeded(self.bench, self.setup, self._memory)
-
-    def left(self) -> float:
-        """0 when done, else 1."""
-        return 0.0 if self.succeeded() else 1.0
