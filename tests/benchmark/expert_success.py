@@ -23,16 +23,14 @@ def solved(kind: Kind, seed: int, on_grid: bool) -> bool:
     """Whether the expert does what the table of a seed asks."""
     setup = kind.setup(seed, seed % kind.variations)
     bench, left = setup.bench(), POSES
-    memory = kind.begin(bench, setup)
-    while left and not kind.succeeded(bench, setup, memory):
+    while left and not kind.succeeded(bench, setup):
         plan = kind.expert(bench.places(setup.objects), setup.target)
         for pose in (GRID.decode(GRID.encode(plan)) if on_grid else plan)[:left]:
             bench.go(pose)
-            kind.note(bench, setup, memory)
             left -= 1
-            if kind.succeeded(bench, setup, memory):
+            if kind.succeeded(bench, setup):
                 break
-    return kind.succeeded(bench, setup, memory)
+    return kind.succeeded(bench, setup)
 
 
 def main() -> None:

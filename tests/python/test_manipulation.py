@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from wiw.action import PoseGrid
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
-from wiw.tabletop.kind import PALETTE, REACH, scattered
-from wiw.tabletop.workbench import TABLE
+from wiw.tabletop.kind import PALETTE, REACH, above, scattered
+from wiw.tabletop.workbench import LAMPS, TABLE
 from wiw.tasks.manipulation import KINDS, Manipulation
 
 GRID = PoseGrid()
@@ -81,12 +81,30 @@ def test_buttons_count_in_their_order() -> None:
     assert len(setup.target) == 3
     for order, right in ((setup.target, True), (setup.target[::-1], False), ((*setup.target, setup.target[0]), False)):
         bench = setup.bench()
-        memory = kind.begin(bench, setup)
         for pose in kind.expert(bench.places(setup.objects), order):
             bench.go(pose)
-            kind.note(bench, setup, memory)
-        assert memory == list(order)
-        assert kind.succeeded(bench, setup, memory) is right
+        assert bench.pressed == order
+        assert kind.succeeded(bench, setup) is right
+
+
+def test_rings_light_up_by_the_order_of_pushes_whatever_is_asked() -> None:
+    kind = KINDS["push_buttons"]
+    setup = kind.setup(5, 2)
+    bench = setup.bench()
+    dark, before = bench.picture()["color"].astype(int), bench.fork()
+    one, other, third = setup.objects
+    order = (third, one, other, third)
+    for pose in kind.expert(bench.places(setup.objects), order):
+        bench.go(pose)
+    assert bench.pressed == order and before.pressed == ()
+    bench.go(above(0.0, 0.35, 0.35, 0.0))
+    lit = bench.picture()["color"].astype(int)
+    changed = np.abs(lit - dark).sum(-1) > 60
+    pixels = {}
+    for lamp, colour in LAMPS.items():
+        alike = lit @ colour / np.linalg.norm(lit, axis=-1) / np.linalg.norm(colour)
+        pixels[lamp] = int((changed & (alike > 0.98)).sum())
+    assert pixels["lime"] < 20 and pixels["amber"] > 60 and pixels["red"] > 120, pixels
 
 
 def test_the_environment_is_gymnasiums() -> None:

@@ -36,9 +36,6 @@ class Table(Protocol):
     def objects(self) -> Sequence[str]:
         """Names of what agents are told the place of."""
 
-    def note(self) -> None:
-        """Looks at the table after an action."""
-
     def succeeded(self) -> bool:
         """Whether what is asked for is done."""
 
@@ -151,7 +148,6 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         path = [table.bench.pose[:3]]
         for pose in np.asarray(plan, np.float64)[: self.task.actions - self._taken]:
             move = table.bench.go(pose)
-            table.note()
             executed.append(pose)
             path.append(table.bench.pose[:3])
             refused += [] if move.why == "free" else [move.why]

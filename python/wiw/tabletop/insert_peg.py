@@ -54,7 +54,7 @@ class InsertPeg(Kind):
         instruction = PHRASES[variation % len(PHRASES)].format(target)
         return Setup((*pegs, (ring, lying)), instruction, target, objects=("ring", *colours))
 
-    def succeeded(self, bench: Workbench, setup: Setup, memory: Any) -> bool:
+    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The ring is around the peg, below its top."""
         ring, peg = bench.place_of("ring"), bench.place_of(setup.target)
         off = np.abs(ring[:2, 3] - peg[:2, 3]).max()

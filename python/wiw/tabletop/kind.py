@@ -76,16 +76,8 @@ class Kind(ABC):
     def setup(self, seed: int, variation: int) -> Setup:
         """The table of a seed: where things are, and in which of their colours."""
 
-    def begin(self, bench: Workbench, setup: Setup) -> Any:
-        """What is kept of an episode to tell whether it is done; nothing by default."""
-        return None
-
-    def note(self, bench: Workbench, setup: Setup, memory: Any) -> None:
-        """Looks at the table after an action."""
-        return
-
     @abstractmethod
-    def succeeded(self, bench: Workbench, setup: Setup, memory: Any) -> bool:
+    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """Whether what the instruction asks for is done."""
 
     @abstractmethod

@@ -9,18 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.physics import Articulation, place
+from wiw.physics import Articulation, Cylinder, place
 from wiw.tabletop.kind import PALETTE, Kind, Setup, above, chosen, key_of, scattered
-from wiw.tabletop.workbench import TABLE, Pose, Thing, Workbench
+from wiw.tabletop.workbench import LAMPS, TABLE, Pose, Thing, Workbench
 
 BUTTONS = 3
-PUSHED = 0.003
-"""Metres that a plate has to go down; RLBench's number."""
 SPRING = 4.0
 """Newtons."""
 TOP = 0.038
 """Metres from the table to the plate's top."""
-COLOURS = [name for name in PALETTE if name not in ("red", "lime")]
+RING, HIGH = 0.056, 0.016
+"""Metres of the dark ring around the plate: its radius, wide enough to be seen from the front, and its height."""
+LAMP = Cylinder(RING + 0.0005, HIGH + 0.001)
+"""Over the ring when it is lit."""
+COLOURS = [name for name in PALETTE if name not in (*LAMPS, "yellow")]
+"""Of plates; none is that of a lamp, or near."""
 PHRASES = ("push the {0} button", "press the {0} button", "push down the button that is {0}")
 AND_THEN = (", then push the {0} one", ", then press the {0} one", ", and after it the {0} one")
 
@@ -39,24 +42,14 @@ class PushButtons(Kind):
         words = variation // BUTTONS % len(PHRASES)
         instruction = PHRASES[words].format(asked[0]) + "".join(AND_THEN[words].format(name) for name in asked[1:])
         things = tuple(
-            (Thing(colour, mechanism=_button(PALETTE[colour])), place(x, y, TABLE + 0.008))
+            (Thing(colour, mechanism=_button(PALETTE[colour]), lamp=LAMP), place(x, y, TABLE + HIGH / 2))
             for colour, (x, y) in zip(colours, places, strict=True)
         )
         return Setup(things, instruction, asked, dict.fromkeys(colours, SPRING), tuple(colours))
 
-    def begin(self, bench: Workbench, setup: Setup) -> list[str]:
-        """Buttons in the order in which they were pushed."""
-        return []
-
-    def note(self, bench: Workbench, setup: Setup, memory: list[str]) -> None:
-        """A button counts once while it is down; one that was pushed before counts again when it is let go of first."""
-        for name in setup.objects:
-            if bench.joints_of(name)[0] < -PUSHED and (not memory or memory[-1] != name):
-                memory.append(name)
-
-    def succeeded(self, bench: Workbench, setup: Setup, memory: Any) -> bool:
+    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The pushes so far are those that are asked for."""
-        return tuple(memory) == setup.target
+        return bench.pressed == setup.target
 
     def expert(self, places: Mapping[str, Pose], target: Any) -> NDArray[np.float64]:
         """Down and up again over each, with shut fingers."""
@@ -70,14 +63,14 @@ class PushButtons(Kind):
 def _button(colour: tuple[float, float, float]) -> Articulation:
     """A plate on a spring in a dark ring."""
     rgba = " ".join(f"{value}" for value in (*colour, 1.0))
-    return Articulation.from_text(_URDF.format(rgba=rgba))
+    return Articulation.from_text(_URDF.format(rgba=rgba, ring=RING, high=HIGH))
 
 
 _URDF = """<robot name="button">
   <link name="base">
-    <visual><geometry><cylinder radius="0.045" length="0.016"/></geometry>
+    <visual><geometry><cylinder radius="{ring}" length="{high}"/></geometry>
       <material name="ring"><color rgba="0.2 0.2 0.22 1"/></material></visual>
-    <collision><geometry><cylinder radius="0.045" length="0.016"/></geometry></collision>
+    <collision><geometry><cylinder radius="{ring}" length="{high}"/></geometry></collision>
   </link>
   <link name="plate">
     <inertial><mass value="0.05"/>

@@ -52,7 +52,7 @@ class SlideBlock(Kind):
         words = PHRASES[int(core.uniform(key_of(seed, variation, 2), 1)[0] * len(PHRASES))]
         return Setup(tuple(things), words.format(colour), colour, objects=("block", *COLOURS))
 
-    def succeeded(self, bench: Workbench, setup: Setup, memory: Any) -> bool:
+    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The block's middle is over the square."""
         off = bench.place_of("block")[:2, 3] - bench.place_of(setup.target)[:2, 3]
         return bool(np.abs(off).max() < SQUARE / 2 - 0.02)

@@ -51,7 +51,7 @@ class StackCups(Kind):
         instruction = PHRASES[variation % len(PHRASES)].format(colours[0])
         return Setup(things, instruction, colours[0], objects=tuple(colours))
 
-    def succeeded(self, bench: Workbench, setup: Setup, memory: Any) -> bool:
+    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The others stand upright in the target, and nothing is held."""
         base = bench.place_of(setup.target)
         others = [bench.place_of(name) for name in setup.objects if name != setup.target]

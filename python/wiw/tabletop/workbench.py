@@ -37,6 +37,12 @@ Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 SUN = {"direction": (0.35, 1.0, 0.45)}
 SHUT = 0.5
 """A gripper value below it closes the fingers."""
+PUSHED = 0.003
+"""Metres that the plate of a button has to go down; RLBench's number."""
+LAMPS: Mapping[str, Colour] = {"lime": (0.45, 0.95, 0.1), "amber": (1.0, 0.62, 0.0), "red": (0.95, 0.05, 0.05)}
+"""Colours of the first, second and third push of an episode; later ones are as the third."""
+OFF = place(z=-1.0)
+"""Where lamps are that are off: under the floor, out of every view."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +60,8 @@ class Thing:
     """In place of parts; in the colours of its own description."""
     touched: bool = True
     """Whether it has a body; what has none is only seen, as a mark on the table."""
+    lamp: Any = None
+    """Of a button, which is a mechanism: a shape around its base that lights up, by `LAMPS`, when it is pushed."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +122,8 @@ class Workbench:
             else:
                 self._mechanisms[thing.name] = self._world.add_articulation(thing.mechanism, pose)
         self._world.set_joint_positions(PANDA_READY, self._arm)
+        self._buttons = tuple(thing.name for thing, _ in things if thing.lamp is not None)
+        self._pressed: tuple[str, ...] = ()
         self._pictures = _Pictures(self)
 
     def fork(self) -> Workbench:
@@ -163,6 +173,7 @@ class Workbench:
             gripper.close()
         elif wanted[6] >= SHUT and (gripper.held is not None or gripper.opening < wanted[6]):
             gripper.open(float(wanted[6]))
+        self._note_pushes()
         return Move(path.free, path.reason)
 
     # -- things --------------------------------------------------------------------------------------------------------
@@ -183,6 +194,14 @@ class Workbench:
         """float64 [dof]: joint positions of a mechanism."""
         return self._world.joint_positions(self._mechanisms[name])
 
+    @property
+    def pressed(self) -> tuple[str, ...]:
+        """Buttons in the order in which they were pushed: those whose plate was down when a way ended.
+
+        The same one twice in a row counts once.
+        """
+        return self._pressed
+
     def set_spring(self, name: str, force: float) -> None:
         """Lets the joints of a mechanism go back to zero with at most so many newtons (or newton metres)."""
         count = len(self.joints_of(name))
@@ -192,6 +211,11 @@ class Workbench:
     def settle(self, steps: int = 240) -> None:
         """Lets things come to rest."""
         self._world.step(steps)
+
+    def _note_pushes(self) -> None:
+        for name in self._buttons:
+            if self.joints_of(name)[0] < -PUSHED and self._pressed[-1:] != (name,):
+                self._pressed = (*self._pressed, name)
 
     # -- pictures ------------------------------------------------------------------------------------------------------
 
@@ -226,7 +250,15 @@ class Workbench:
             else:
                 links = self._world.link_poses(self._mechanisms[name])
                 found += [links[each["link"]] @ each["T_link_visual"] for each in thing.mechanism.visuals]
+            if thing.lamp is not None:
+                lit = self._lamp_of(name)
+                found += [self.place_of(name) if number == lit else OFF for number in range(len(LAMPS))]
         return found + [arm[each["link"]] @ each["T_link_visual"] for each in panda().visuals]
+
+    def _lamp_of(self, name: str) -> int | None:
+        """Which of its lamps is on: that of its latest push."""
+        pushes = [number for number, other in enumerate(self._pressed) if other == name]
+        return min(pushes[-1], len(LAMPS) - 1) if pushes else None
 
     def link_pose(self, link: str) -> Pose:
         """Of the arm, [4, 4]."""
@@ -255,6 +287,9 @@ class _Pictures:
             else:
                 for each in thing.mechanism.visuals:
                     add(mesh_of(each["shape"]), each["color"], next(poses), thing.name)
+            if thing.lamp is not None:
+                for colour in LAMPS.values():
+                    add(mesh_of(thing.lamp), colour, next(poses), thing.name)
         for each in panda().visuals:
             add(mesh_of(each["shape"]), each["color"], next(poses), "arm")
         scene = Scene.from_arrays(meshes, name="workbench", materials=materials, sun=SUN)

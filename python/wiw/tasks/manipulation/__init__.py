@@ -75,12 +75,7 @@ class Table:
         self.bench = setup.bench()
         self.goal = Goal(Manipulation.name, text=setup.instruction)
         self.objects = setup.objects
-        self._memory = kind.begin(self.bench, setup)
-
-    def note(self) -> None:
-        """Looks at the table after an action."""
-        self.kind.note(self.bench, self.setup, self._memory)
 
     def succeeded(self) -> bool:
         """Whether what is asked for is done."""
-        return self.kind.succeeded(self.bench, self.setup, self._memory)
+        return self.kind.succeeded(self.bench, self.setup)
