@@ -226,6 +226,8 @@ thread at a time may use a world; different worlds are independent, and stepping
   world.def("snapshot", &World::snapshot, "The state, as a WorldState.");
   world.def("restore", &World::restore, py::arg("state"),
             "Goes back to a snapshot of this world, or of one built by the same calls; ArgumentError for others.");
+  world.def("record", &World::record, "From now on keeps a snapshot of every step, the present state first.");
+  world.def("recorded", &World::recorded, "What `record` kept, oldest first, as WorldStates; ends the recording.");
   world.def("fork", &World::fork, Unlocked(), "An independent world in the same state; shapes are shared.");
   bind_bodies(world);
   bind_articulated(world);

@@ -117,6 +117,25 @@ def test_a_fork_goes_on_as_the_original_does_and_leaves_it_alone(bench: Workbenc
     np.testing.assert_array_equal(bench.place_of("red"), fork.place_of("red"))
 
 
+def test_a_film_shows_every_step_of_the_way_it_goes(bench: Workbench) -> None:
+    bench.go(at(0.1, -0.15, 0.1))
+    before, other = bench.pose, bench.fork()
+    move, film = bench.film(at(0.1, -0.15, 0.02, 0))
+    assert move == other.go(at(0.1, -0.15, 0.02, 0))
+    np.testing.assert_array_equal(bench.pose, other.pose)
+    np.testing.assert_array_equal(film[0].pose, before)
+    np.testing.assert_array_equal(film[-1].pose, bench.pose)
+    seconds = np.array([moment.seconds for moment in film])
+    np.testing.assert_allclose(np.diff(seconds), 1 / 240)
+    assert film[-1].seconds == bench.seconds and bench.held == "red"
+    heights = [film[i].pose[2] for i in range(0, len(film), 20)]
+    assert len(heights) > 5 and heights == sorted(heights, reverse=True)
+    with pytest.raises(ArgumentError, match="finite pose"):
+        bench.film([np.nan] * 7)
+    bench.settle(1)
+    assert bench.film(at(0.1, -0.15, 0.1, 0))[1][0].seconds == pytest.approx(seconds[-1] + 1 / 240)
+
+
 def test_pictures_show_things_where_they_are(bench: Workbench) -> None:
     for camera in CAMERAS:
         assert bench.picture(camera, (60, 80))["color"].shape == (60, 80, 3)

@@ -123,6 +123,24 @@ TEST_CASE("the same world gives the same bits, run by run and thread by thread")
   CHECK(other->snapshot().numbers != ends[0].numbers);
 }
 
+TEST_CASE("a recording has every step since, and changes none") {
+  const auto world = heap(3), other = heap(3);
+  world->step(5);
+  other->step(5);
+  CHECK(world->recorded().empty());
+  world->record();
+  CHECK(world->fork()->recorded().empty());
+  world->step(20);
+  other->step(20);
+  world->step();
+  const std::vector<WorldState> states = world->recorded();
+  REQUIRE(states.size() == 22);
+  for (std::size_t i = 0; i < states.size(); ++i) CHECK(states[i].steps == static_cast<std::int64_t>(5 + i));
+  CHECK(states[20].numbers == other->snapshot().numbers);
+  world->step();
+  CHECK(world->recorded().empty());
+}
+
 TEST_CASE("forks and restored snapshots go on as the original does, at any moment") {
   const auto world = heap(3);
   for (int moment = 0; moment < 12; ++moment) {

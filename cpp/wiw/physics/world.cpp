@@ -4,6 +4,7 @@
 #include <BulletDynamics/Featherstone/btMultiBodyFixedConstraint.h>
 
 #include <cmath>
+#include <utility>
 #include <variant>
 
 #include "wiw/core/error.hpp"
@@ -167,6 +168,7 @@ struct World::Impl {
   std::vector<Attachment> attachments;
   std::vector<std::unique_ptr<btMultiBodyFixedConstraint>> constraints;
   std::int64_t steps = 0;
+  std::optional<std::vector<WorldState>> recording;
 };
 
 World::World(const WorldOptions& options) : impl_(std::make_unique<Impl>(options)) {}
@@ -191,8 +193,11 @@ int World::add_articulation(ArticulationPtr articulation, const Pose& T_world_ba
 
 void World::step(int count) {
   if (count < 0) throw ArgumentError("expected a number of steps of 0 or more, got " + std::to_string(count));
-  for (int i = 0; i < count; ++i) impl_->simulation.step();
-  impl_->steps += count;
+  for (int i = 0; i < count; ++i) {
+    impl_->simulation.step();
+    ++impl_->steps;
+    if (impl_->recording) impl_->recording->push_back(snapshot());
+  }
 }
 
 std::vector<Pose> World::body_poses() const {
@@ -358,6 +363,12 @@ void World::restore(const WorldState& state) {
   impl_->set_numbers(state.numbers);
   impl_->hold(state.attachments);
   impl_->steps = state.steps;
+}
+
+void World::record() { impl_->recording = {snapshot()}; }
+
+std::vector<WorldState> World::recorded() {
+  return std::exchange(impl_->recording, std::nullopt).value_or(std::vector<WorldState>{});
 }
 
 std::unique_ptr<World> World::fork() const {

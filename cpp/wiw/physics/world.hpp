@@ -147,6 +147,10 @@ class World {
   [[nodiscard]] WorldState snapshot() const;
   /// ArgumentError if the snapshot is of a world that was built otherwise.
   void restore(const WorldState& state);
+  /// From now on keeps a snapshot of every step, the present state first. What is recorded is no part of the state.
+  void record();
+  /// What was kept, oldest first; ends the recording.
+  std::vector<WorldState> recorded();
   /// An independent world in the same state.
   [[nodiscard]] std::unique_ptr<World> fork() const;
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from wiw.errors import ArgumentError
-from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, panda, place
+from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, WorldState, panda, place
 from wiw.render import Output, Renderer
 from wiw.scenes import Scene
 from wiw.tabletop.shapes import joined, mesh_of
@@ -93,6 +93,23 @@ class Move:
     """"free", or what ended the way: "out of reach", "joint limits", "not converged", "jump" or "collision"."""
 
 
+@dataclass(frozen=True)
+class Film:
+    """A workbench as it was at each physics step of a way, the start first; its items are forks.
+
+    What is noticed only once the way has ended, such as what is held now, the workbench itself can tell.
+    """
+
+    start: Workbench
+    states: Sequence[WorldState]
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def __getitem__(self, index: int) -> Workbench:
+        return self.start.fork(self.states[index])
+
+
 class Workbench:
     """The arm, the table and things, in a state that can be forked.
 
@@ -126,12 +143,23 @@ class Workbench:
         self._pressed: tuple[str, ...] = ()
         self._pictures = _Pictures(self)
 
-    def fork(self) -> Workbench:
-        """The same state apart, to be run ahead; pictures are drawn with the same renderer."""
+    def fork(self, state: WorldState | None = None) -> Workbench:
+        """The same state apart, to be run ahead; pictures are drawn with the same renderer.
+
+        Args:
+            state: of the physics; the present one if None.
+        """
         other = object.__new__(Workbench)
         other.__dict__.update(self.__dict__)
         other._world = self._world.fork()
+        if state is not None:
+            other._world.restore(state)
         return other
+
+    @property
+    def seconds(self) -> float:
+        """Of the physics, since the table was made."""
+        return self._world.time
 
     # -- the arm -------------------------------------------------------------------------------------------------------
 
@@ -175,6 +203,20 @@ class Workbench:
             gripper.open(float(wanted[6]))
         self._note_pushes()
         return Move(path.free, path.reason)
+
+    def film(self, pose: ArrayLike) -> tuple[Move, Film]:
+        """`go`, and what it looked like on the way.
+
+        Raises:
+            ArgumentError: as `go`.
+        """
+        start = self.fork()
+        self._world.record()
+        try:
+            move = self.go(pose)
+        finally:
+            states = self._world.recorded()
+        return move, Film(start, states)
 
     # -- things --------------------------------------------------------------------------------------------------------
 

@@ -8,14 +8,9 @@ from typing import Any
 
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
-from wiw.tabletop.insert_peg import InsertPeg
 from wiw.tabletop.kind import Kind, Setup, key_of
-from wiw.tabletop.push_buttons import PushButtons
-from wiw.tabletop.slide_block import SlideBlock
-from wiw.tabletop.stack_cups import StackCups
+from wiw.tabletop.kinds import KINDS
 from wiw.types import Episode, Goal, Wording
-
-KINDS: dict[str, Kind] = {kind.name: kind for kind in (PushButtons(), SlideBlock(), InsertPeg(), StackCups())}
 
 
 class Manipulation:
