@@ -30,9 +30,9 @@ py::array box(const Pixels& image, const std::array<double, 4>& edges, const Col
 }
 
 py::array mark(const Pixels& image, const std::array<double, 2>& center, const Color& color, int radius,
-               const std::string& label) {
+               const std::string& label, int gap) {
   const auto [copy, view] = copy_of(image);
-  draw_mark(view, {center[0], center[1]}, color, radius, label);
+  draw_mark(view, {center[0], center[1]}, color, radius, label, gap);
   return copy;
 }
 
@@ -65,7 +65,7 @@ void bind_annotate(py::module_& module) {
   module.def("box", &box, py::arg("image"), py::arg("box"), py::arg("color"), py::arg("thickness"), py::arg("label"),
              "Copy of uint8 [H, W, 3] with the box (left, top, right, bottom).");
   module.def("mark", &mark, py::arg("image"), py::arg("center"), py::arg("color"), py::arg("radius"), py::arg("label"),
-             "Copy of uint8 [H, W, 3] with a disc at (x, y).");
+             py::arg("gap"), "Copy of uint8 [H, W, 3] with a disc at (x, y).");
   module.def("axes", &axes, py::arg("image"), py::arg("origin"), py::arg("ends"), py::arg("thickness"),
              "Copy of uint8 [H, W, 3] with three arrows.");
   module.def("strip", &strip, py::arg("frames"), py::arg("titles"), py::arg("columns"), py::arg("bar"), py::arg("gap"),

@@ -45,9 +45,11 @@ def box(
     return _core.box(image, list(edges), color, thickness, label)
 
 
-def mark(image: Image, center: Sequence[float], label: str = "", *, color: Color = RED, radius: int = 7) -> Image:
-    """Put a disc at (x, y) and a label beside it."""
-    return _core.mark(image, list(center), color, radius, label)
+def mark(
+    image: Image, center: Sequence[float], label: str = "", *, color: Color = RED, radius: int = 7, gap: int = 2
+) -> Image:
+    """Put a disc at (x, y) and a label on a line: ``gap`` pixels to its right, or to its left where negative."""
+    return _core.mark(image, list(center), color, radius, label, gap)
 
 
 def axes(image: Image, origin: Sequence[float], ends: Sequence[Sequence[float]], *, thickness: int = 2) -> Image:

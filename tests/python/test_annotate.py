@@ -114,3 +114,13 @@ def test_errors_say_what_was_expected():
         annotate.mark(canvas(), (float("nan"), 3))
     with pytest.raises(ArgumentError, match="thickness"):
         annotate.box(canvas(), (0, 0, 5, 5), thickness=0)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_label_stands_off_its_mark_on_a_line(side):
+    drawn = annotate.mark(canvas(), (50.5, 30.5), "1", radius=3, gap=side * 12)
+    changed = (drawn != 128).any(-1)
+    assert changed[30, 50 + side * 4 : 50 + side * 20 : side].all()
+    beside = changed[:, 50 + side * 5 : 50 + side * 14 : side]
+    assert beside.any(0).all() and beside.sum(0).max() <= 3
+    assert not changed[:, 50 - side * 5 :: -side].any()

@@ -58,12 +58,17 @@ void fill(const Image& image, const Box& box, const Color& color) {
   cv::rectangle(mat, {left, top}, {right, bottom}, as_scalar(color), cv::FILLED);
 }
 
+int plate_height(const Image& image) { return std::clamp(image.size.height / 24, 12, 22); }
+
+int plate_width(const Image& image, const std::string& label) {
+  const double scale = std::max(kSmallestScale, (plate_height(image) - 4) / kFullHeight);
+  return std::min(extent(printable(label), scale).width + 8, image.size.width);
+}
+
 /// A label on a plate whose upper left corner is at `corner`, moved into the image.
 void draw_label(const Image& image, const Point& corner, const std::string& label, const Color& plate) {
-  const int height = std::clamp(image.size.height / 24, 12, 22);
-  const std::string text = printable(label);
-  const double scale = std::max(kSmallestScale, (height - 4) / kFullHeight);
-  const double width = std::min<double>(extent(text, scale).width + 8, image.size.width);
+  const int height = plate_height(image);
+  const double width = plate_width(image, label);
   const double left = std::clamp(corner.x, 0.0, std::max(0.0, image.size.width - width));
   const double top = std::clamp(corner.y, 0.0, std::max(0.0, double(image.size.height) - height));
   const Box area{left, top, left + width, top + height};
@@ -109,18 +114,22 @@ void draw_box(Image image, const Box& box, const Color& color, int thickness, co
     outline(image, {box.left, box.top, beyond, box.bottom}, color, thickness);
     outline(image, {-2.0 * thickness, box.top, box.right, box.bottom}, color, thickness);
   }
-  if (!label.empty()) draw_label(image, {box.left, box.top - std::clamp(image.size.height / 24, 12, 22)}, label, color);
+  if (!label.empty()) draw_label(image, {box.left, box.top - plate_height(image)}, label, color);
 }
 
-void draw_mark(Image image, const Point& center, const Color& color, int radius, const std::string& label) {
+void draw_mark(Image image, const Point& center, const Color& color, int radius, const std::string& label, int gap) {
   check_image(image);
   check_finite({center.x, center.y});
   if (radius < 1) throw ArgumentError("radius: expected at least 1 pixel, got " + std::to_string(radius));
   cv::Mat mat = as_mat(image);
   const cv::Point at{pixel(center.x, image.size.width), pixel(center.y, image.size.height)};
+  const int beside = gap < 0 ? at.x - radius + gap : at.x + radius + gap;
+  if (!label.empty()) cv::line(mat, at, {beside, at.y}, as_scalar(kDark), 1, cv::LINE_AA);
   cv::circle(mat, at, radius, as_scalar(kLight), cv::FILLED, cv::LINE_AA);
   cv::circle(mat, at, std::max(radius - 2, 1), as_scalar(color), cv::FILLED, cv::LINE_AA);
-  if (!label.empty()) draw_label(image, {center.x + radius + 2, center.y - radius}, label, kDark);
+  if (label.empty()) return;
+  const int left = gap < 0 ? beside - plate_width(image, label) : beside;
+  draw_label(image, {double(left), at.y - plate_height(image) / 2.0}, label, kDark);
 }
 
 void draw_axes(Image image, const Point& origin, const std::array<Point, 3>& ends, int thickness) {

@@ -26,8 +26,9 @@ struct Box {
 /// moved into the image where it would stick out; an empty label draws none.
 void draw_box(Image image, const Box& box, const Color& color, int thickness, const std::string& label);
 
-/// Disc with a light rim, and a label beside it on a dark plate (numbered candidates, the goal).
-void draw_mark(Image image, const Point& center, const Color& color, int radius, const std::string& label);
+/// Disc with a light rim, and a label on a dark plate (numbered candidates, the goal), with a line to it: `gap` pixels
+/// to its right, or to its left where negative.
+void draw_mark(Image image, const Point& center, const Color& color, int radius, const std::string& label, int gap = 2);
 
 /// Arrows from `origin` to three points: x red, y green, z blue, lettered at their ends.
 void draw_axes(Image image, const Point& origin, const std::array<Point, 3>& ends, int thickness);
