@@ -189,3 +189,16 @@ def test_parts_make_one_mesh_and_other_things_none() -> None:
     assert both["positions"][:24, 2].min() == pytest.approx(1.5)
     with pytest.raises(ArgumentError, match=r"a shape of wiw\.physics"):
         mesh_of("ball")
+
+
+@pytest.mark.parametrize("size", [(480, 480), (240, 320)])
+def test_cameras_tell_where_points_are_in_their_pictures(size: tuple[int, int]) -> None:
+    spots = np.array([[0.0, -0.2, TABLE + 0.02], [0.3, 0.25, TABLE + 0.02], [0.1, 0.1, 1.1]])
+    ball = ((Sphere(0.02), np.eye(4)),)
+    bench = Workbench([(Thing(f"ball {i}", ball), place(*spot)) for i, spot in enumerate(spots)])
+    ids = bench.picture("front", size, ("instance",))["instance"]
+    for at in CAMERAS["front"].pixels_of(spots, size):
+        column, row = np.floor(at).astype(int)
+        rows, columns = np.nonzero(ids == ids[row, column])
+        assert len(rows) < 400, "no ball is there"
+        np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], at, atol=0.7)

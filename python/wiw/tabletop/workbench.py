@@ -74,6 +74,13 @@ class Camera:
     link: str = ""
     """Of the arm, whose frame the places are in; empty for the table's."""
 
+    def pixels_of(self, points: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:
+        """float64 [N, 2]: where points [N, 3] before the camera are in its picture, in pixels right and down."""
+        height, width = size
+        seen = (np.asarray(points, np.float64) - self.eye) @ _looking(self)[:3, :3]
+        focal = width / 2 / np.tan(np.radians(self.hfov_deg) / 2)
+        return np.array([width / 2, height / 2]) + focal * seen[:, :2] * (1, -1) / -seen[:, 2:]
+
 
 CAMERAS: Mapping[str, Camera] = {
     "front": Camera((1.15, 0.0, 1.45), (0.1, 0.0, 0.9)),
