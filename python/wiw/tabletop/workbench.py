@@ -74,10 +74,21 @@ class Camera:
     link: str = ""
     """Of the arm, whose frame the places are in; empty for the table's."""
 
+    @property
+    def pose(self) -> Pose:
+        """[4, 4]: it looks along -z with +y up, from its eye to what it looks at."""
+        ahead = np.subtract(self.at, self.eye) / np.linalg.norm(np.subtract(self.at, self.eye))
+        up = (0, 0, 1) if abs(ahead[2]) < 0.95 else (1, 0, 0)
+        right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
+        pose[:3, 3] = self.eye
+        return pose
+
     def pixels_of(self, points: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:
         """float64 [N, 2]: where points [N, 3] before the camera are in its picture, in pixels right and down."""
         height, width = size
-        seen = (np.asarray(points, np.float64) - self.eye) @ _looking(self)[:3, :3]
+        seen = (np.asarray(points, np.float64) - self.eye) @ self.pose[:3, :3]
         focal = width / 2 / np.tan(np.radians(self.hfov_deg) / 2)
         return np.array([width / 2, height / 2]) + focal * seen[:, :2] * (1, -1) / -seen[:, 2:]
 
@@ -351,21 +362,10 @@ class _Pictures:
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
         self._renderer.core.set_poses(ids, moved.astype(np.float32))
-        pose = _looking(camera)
+        pose = camera.pose
         if camera.link:
             pose = bench.link_pose(camera.link) @ pose
         return self._renderer.perspective(Y_UP @ pose, size, camera.hfov_deg, outputs=outputs)
-
-
-def _looking(camera: Camera) -> Pose:
-    """The pose of a camera, which looks along -z with +y up, from its eye to what it looks at."""
-    ahead = np.subtract(camera.at, camera.eye) / np.linalg.norm(np.subtract(camera.at, camera.eye))
-    up = (0, 0, 1) if abs(ahead[2]) < 0.95 else (1, 0, 0)
-    right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([right, np.cross(right, ahead), -ahead], axis=1)
-    pose[:3, 3] = camera.eye
-    return pose
 
 
 _LEG = Box((0.05, 0.05, TABLE - TOP[2]))
