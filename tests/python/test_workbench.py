@@ -154,6 +154,14 @@ def test_pictures_show_things_where_they_are(bench: Workbench) -> None:
         bench.picture("behind")
 
 
+def test_a_picture_without_the_arm_shows_what_is_behind_it(bench: Workbench) -> None:
+    bench.go(at(0.1, -0.15, 0.15))
+    color, bare = (bench.picture("front", (240, 240), arm=arm)["color"] for arm in (True, False))
+    white = (bare.min(axis=-1) > 190) & (color.min(axis=-1) > 190)
+    assert (np.abs(color.astype(int) - bare).max(axis=-1) > 8).mean() > 0.03 and white.mean() < 0.005
+    np.testing.assert_array_equal(bench.picture("front", (240, 240))["color"], color)
+
+
 def test_names_are_told_apart() -> None:
     with pytest.raises(ArgumentError, match="a name for each thing"):
         Workbench([(cube("one"), on_table(0.1, 0)), (cube("one"), on_table(0.2, 0))])

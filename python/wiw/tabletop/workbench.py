@@ -35,6 +35,8 @@ BASE = place(x=-0.35, z=TABLE)
 MIDDLE = place(x=0.15, z=TABLE - TOP[2] / 2)
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 SUN = {"direction": (0.35, 1.0, 0.45)}
+FAR_BELOW = 1e3
+"""Metres under the floor, where nobody sees what is left out of a picture."""
 SHUT = 0.5
 """A gripper value below it closes the fingers."""
 PUSHED = 0.003
@@ -280,16 +282,26 @@ class Workbench:
     # -- pictures ------------------------------------------------------------------------------------------------------
 
     def picture(
-        self, camera: str = "front", size: tuple[int, int] = (480, 480), outputs: Sequence[Output] = ("color",)
+        self,
+        camera: str = "front",
+        size: tuple[int, int] = (480, 480),
+        outputs: Sequence[Output] = ("color",),
+        arm: bool = True,
     ) -> dict[str, NDArray[Any]]:
         """What a camera sees: "color" uint8 [H, W, 3], "depth" float32 [H, W] planar metres, "instance" uint32 [H, W].
+
+        Args:
+            camera: one of `CAMERAS`.
+            size: (height, width) in pixels.
+            outputs: any of the three.
+            arm: whether the arm is there to be seen.
 
         Raises:
             ArgumentError: no such camera.
         """
         if camera not in CAMERAS:
             raise ArgumentError(f"picture: expected a camera among {', '.join(CAMERAS)}, got {camera!r}")
-        found = self._pictures.taken(self, CAMERAS[camera], size, outputs)
+        found = self._pictures.taken(self, CAMERAS[camera], size, outputs, arm)
         return {name: image[0] for name, image in found.items()}
 
     def fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
@@ -356,10 +368,12 @@ class _Pictures:
         self._renderer = Renderer(scene, samples=4)
 
     def taken(
-        self, bench: Workbench, camera: Camera, size: tuple[int, int], outputs: Sequence[Output]
+        self, bench: Workbench, camera: Camera, size: tuple[int, int], outputs: Sequence[Output], arm: bool
     ) -> dict[str, NDArray[Any]]:
         """A batch of one picture of a state."""
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
+        if not arm:
+            moved[-len(panda().visuals) :, 1, 3] -= FAR_BELOW
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
         self._renderer.core.set_poses(ids, moved.astype(np.float32))
         pose = camera.pose
