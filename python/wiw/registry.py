@@ -198,7 +198,15 @@ POLICIES = Registry(
     },
     "wiw.policies.base:Policy",
 )
-TASKS = Registry("task", "wiw.tasks", {"imagenav": "wiw.tasks.imagenav:ImageNav", "ar": "wiw.tasks.ar:AR"})
+TASKS = Registry(
+    "task",
+    "wiw.tasks",
+    {
+        "imagenav": "wiw.tasks.imagenav:ImageNav",
+        "ar": "wiw.tasks.ar:AR",
+        "manipulation": "wiw.tasks.manipulation:Manipulation",
+    },
+)
 TRACKERS = Registry(
     "tracker",
     "",

@@ -16,11 +16,11 @@ def episodes(
     /,
     *,
     out: Annotated[Path, arg(metavar="FILE")] = Path("episodes.json.gz"),
-    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     episodes: Annotated[int, arg(metavar="N")] = 20,
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
-    backend: Literal["auto", "cpu", "gpu"] = "auto",
+    backend: Literal["auto", "cpu", "gpu"] | None = None,
     task_option: Options = (),
 ) -> int:
     """Generates the episodes of a task and writes them to a file, which `wiw run --episode-file` takes.
@@ -35,23 +35,29 @@ def episodes(
     Args:
         task: See `wiw list`.
         out: JSON; gzipped if the name ends in .gz.
-        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
+            apartments:val if not given.
         episodes: How many.
         per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
         seed: The episodes are a function of it and the scenes.
-        backend: Renderer, which sees to it that goals are out of sight.
+        backend: Renderer, which sees to it that goals are out of sight; auto if not given.
         task_option: Another option of the task, such as categories=bed,sofa; may be given again.
     """
     from wiw.datasets.episodes import save
-    from wiw.errors import FileError
+    from wiw.errors import ArgumentError, FileError
     from wiw.registry import TASKS
 
     flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene}
     made = TASKS.make(task, **task_options(task, task_option, flags))
+    if not hasattr(made, "episode_file"):
+        raise ArgumentError(
+            f"episodes: task '{task}' reads no episode file; its episodes are a function of the seed, so "
+            f"`wiw run {task} --seed {seed} --episodes {episodes}` has the same ones anywhere"
+        )
     found = made.episodes(episodes)
     choices = {"categories": list(made.choices)} if getattr(made, "choices", ()) else {}
     try:
-        save(out, found, task, seed=seed, scenes=scenes, **choices)
+        save(out, found, task, seed=seed, scenes=scenes or made.scenes, **choices)
     except OSError as error:
         raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
     places = len({episode.scene for episode in found})

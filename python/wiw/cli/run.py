@@ -29,11 +29,12 @@ def run(
     policy: MaybeName = None,
     revision: MaybeName = None,
     arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
-    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     per_scene: MaybeCount = None,
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None,
     scene_folder: Folder = None,
-    episodes: Count = 20,
+    episodes: MaybeCount = None,
     seed: Count = 0,
     workers: Count = 1,
     out: Folder = None,
@@ -44,7 +45,7 @@ def run(
     motion: Literal["refuse", "slide"] | None = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     task_option: Options = (),
-    backend: Literal["auto", "cpu", "gpu"] = "auto",
+    backend: Literal["auto", "cpu", "gpu"] | None = None,
     live: Count = 4,
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2,
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
@@ -68,6 +69,7 @@ def run(
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
+    $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
 
@@ -80,23 +82,25 @@ def run(
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
             other plans, or from elsewhere; placebo-shuffled:MODEL names another.
-        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        tasks: For manipulation: which of its tasks, taken in turn; all of them if not given.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
+            apartments:val if not given.
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
         scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
-        episodes: How many.
+        episodes: How many; if not given, 20, for manipulation what the preset says: 50 of each task.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.
         out: Folder of the run; runs/TASK-TIME if not given.
         candidates: Plans imagined at each decision; the task's own number if not given.
-        horizon: Primitives in a plan; the task's own number if not given.
+        horizon: Primitives or poses in a plan; the task's own number if not given.
         depth: Levels of the beam search; each one after the first extends the best plans by another horizon.
         width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
             categories=bed,sofa; may be given again.
-        backend: Renderer.
+        backend: Renderer; auto if not given.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         keep_images: Episodes that keep pictures for `wiw report` and `wiw view`; all: every one, at 0.2 MB a decision.
         deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
@@ -120,8 +124,8 @@ def run(
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
 
     flags = {
-        "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion, "per_scene": per_scene,
-        "episode_file": episode_file, "scene_folder": scene_folder,
+        "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
+        "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder,
     }  # fmt: skip
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
     policy = policy or default_policy(task)

@@ -26,7 +26,8 @@ def scale(
     revision: Annotated[str | None, arg(metavar="NAME")] = None,
     candidates: Values = None,
     imagine_fraction: Values = None,
-    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val",
+    tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     episodes: Count = 20,
     seed: Count = 0,
     workers: Count = 1,
@@ -34,7 +35,7 @@ def scale(
     horizon: Annotated[int | None, arg(metavar="L")] = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     task_option: Options = (),
-    backend: Literal["auto", "cpu", "gpu"] = "auto",
+    backend: Literal["auto", "cpu", "gpu"] | None = None,
     live: Count = 4,
     deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
     cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
@@ -60,16 +61,18 @@ def scale(
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
         imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
-        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        tasks: For manipulation: which of its tasks, taken in turn; all of them if not given.
+        scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
+            apartments:val if not given.
         episodes: How many.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.
         out: Folder of the run; runs/scale-TIME if not given.
-        horizon: Primitives in a plan; the task's own number if not given.
+        horizon: Primitives or poses in a plan; the task's own number if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as per_scene=2; may
             be given again.
-        backend: Renderer.
+        backend: Renderer; auto if not given.
         live: Episodes kept live at a time in a process, so that model calls are batched.
         deadline: Most seconds for a call of the world model, 300 if not given.
         cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
@@ -92,7 +95,7 @@ def scale(
         semantics_options=semantics_options(semantics, semantics_option),
         policy_options=vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""]),
     )  # fmt: skip
-    flags = {"scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
+    flags = {"tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
     folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")

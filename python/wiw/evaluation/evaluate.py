@@ -28,7 +28,7 @@ from wiw.types import Episode, EpisodeResult, Wording
 def evaluate(
     env_or_task: Any,
     agent: Any,
-    episodes: int = 20,
+    episodes: int | None = None,
     seed: int | None = None,
     out: str | Path | None = None,
     workers: int = 1,
@@ -57,7 +57,7 @@ def evaluate(
     Args:
         env_or_task: an environment from `wiw.make`, its task, a `TaskRecipe`, or a task's name.
         agent: a `wiw.Agent` or an `AgentRecipe`.
-        episodes: how many.
+        episodes: how many; None means as many as the task's preset says, else 20.
         seed: of the run; None means the task's own.
         out: folder of the run; None means `runs/<task>-<time>`.
         workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
@@ -87,14 +87,15 @@ def evaluate(
         WeightsError: those of LPIPS are not there; says which, and how to get them.
     """
     limits = _Limits(deadline, cache, cache_gb, fidelity, lpips)
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
-    return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), options)
+    task = task_recipe(env_or_task, task_options)
+    options = _Options(_count(task, episodes), seed, out, workers, progress, live, keep_images, resume, limits)
+    return _run(task, arm_recipes(agent, arms), options)
 
 
 def run_arms(
     env_or_task: Any,
     agents: Mapping[str, Any],
-    episodes: int = 20,
+    episodes: int | None = None,
     seed: int | None = None,
     out: str | Path | None = None,
     workers: int = 1,
@@ -111,8 +112,9 @@ def run_arms(
 ) -> RunLog:
     """Runs several named agents on the same episodes; see `evaluate` for the rest."""
     limits = _Limits(deadline, cache, cache_gb, fidelity, lpips)
-    options = _Options(episodes, seed, out, workers, progress, live, keep_images, resume, limits)
-    return _run(task_recipe(env_or_task), {name: agent_recipe(agent) for name, agent in agents.items()}, options)
+    task = task_recipe(env_or_task)
+    options = _Options(_count(task, episodes), seed, out, workers, progress, live, keep_images, resume, limits)
+    return _run(task, {name: agent_recipe(agent) for name, agent in agents.items()}, options)
 
 
 def resume_run(
@@ -165,6 +167,8 @@ def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
     return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
 
 
+USUAL = 20
+"""Episodes of a run where neither its caller nor its task says how many."""
 FOR_EVER = 1e12
 """Seconds that stand for no deadline where a number has to be written down."""
 
@@ -230,6 +234,11 @@ class _Options:
     def pictures(self) -> int:
         """How many episodes keep pictures."""
         return self.episodes if self.keep_images == "all" else self.keep_images
+
+
+def _count(task: Any, episodes: int | None) -> int:
+    """How many episodes to run."""
+    return int(getattr(task.build(), "usual", USUAL)) if episodes is None else episodes
 
 
 def _at_least(name: str, value: int, least: int) -> None:

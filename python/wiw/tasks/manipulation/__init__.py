@@ -3,14 +3,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
 from wiw.tabletop.kind import Kind, Setup, key_of
 from wiw.tabletop.kinds import KINDS
+from wiw.tasks import presets
 from wiw.types import Episode, Goal, Wording
+
+WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "backend", "motion")
+"""Options of the tasks in which an agent walks, which mean nothing at a table."""
+
+
+@dataclass(frozen=True)
+class ManipulationRules:
+    """Budget of an episode and size of a run; their values are in the presets (`wiw/configs`)."""
+
+    actions: int
+    """K, poses that an episode may take."""
+    candidates: int
+    """M, plans imagined per decision."""
+    horizon: int
+    """L, poses per plan."""
+    execute: int
+    """Poses carried out per decision; 0: all of the chosen plan; negative: all but that many, at least one."""
+    episodes: int
+    """Of each task, where a run is not told how many."""
+
+    def __post_init__(self) -> None:
+        if min(self.actions, self.candidates, self.horizon, self.episodes) < 1:
+            raise ArgumentError(f"manipulation: actions, candidates, horizon and episodes must be positive, got {self}")
 
 
 class Manipulation:
@@ -19,25 +45,51 @@ class Manipulation:
     Args:
         tasks: "all", or names of `KINDS`; episodes take them in turn.
         seed: of the episodes and of the run.
-        actions: K, poses an episode may take.
+        preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
     """
 
     name = "manipulation"
     metrics = ("success", "mean_trajectory")
     wording = Wording(succeeded="did what it was told", won="done", lost="not done", goal="what is left", asked="Told")
 
-    def __init__(self, tasks: str | Sequence[str] = "all", seed: int = 0, actions: int = 15) -> None:
-        names = tuple(KINDS) if tasks == "all" else tuple(tasks.split(",") if isinstance(tasks, str) else tasks)
-        if unknown := [name for name in names if name not in KINDS]:
-            raise ArgumentError(f"manipulation: expected tasks among {', '.join(KINDS)}, got {', '.join(unknown)}")
-        if actions < 1:
-            raise ArgumentError(f"manipulation: expected at least one action an episode, got {actions}")
-        self.tasks, self.seed, self.actions = names, seed, actions
-        self.defaults = {"candidates": 5, "horizon": 5, "execute": 5}
+    def __init__(
+        self,
+        tasks: str | Sequence[str] = "all",
+        seed: int = 0,
+        preset: str | Path = presets.DEFAULT,
+        **rules: Any,
+    ) -> None:
+        if walking := [name for name in rules if name in WALKING]:
+            raise ArgumentError(
+                f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
+                "tables are set by `tasks` and `seed`"
+            )
+        self.tasks, self.seed = _named(tasks), seed
+        self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
+
+    @staticmethod
+    def portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """The same options, with a preset's path that means the same in any folder."""
+        return {name: presets.absolute(value) if name == "preset" else value for name, value in options.items()}
+
+    @property
+    def actions(self) -> int:
+        """K: poses that an episode may take."""
+        return self.rules.actions
+
+    @property
+    def usual(self) -> int:
+        """Episodes of a run that is not told how many."""
+        return self.rules.episodes * len(self.tasks)
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Options for `wiw.Agent` that the task prescribes."""
+        return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity for the run's manifest."""
-        return {"task": self.name, "tasks": list(self.tasks), "seed": self.seed, "actions": self.actions}
+        """JSON-able identity: what must be equal for two runs to be comparable."""
+        return {"task": self.name, "tasks": list(self.tasks), "seed": self.seed, **asdict(self.rules)}
 
     def environment(self, depth: bool = False) -> ManipulationEnv:
         """An environment for the task's episodes."""
@@ -60,6 +112,22 @@ class Manipulation:
         """An episode's table, at rest."""
         kind = KINDS[episode.info["task"]]
         return Table(kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])))
+
+
+def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
+    """The tasks that "all", "a,b" or ["a", "b"] mean.
+
+    Raises:
+        ArgumentError: none, one twice, or one that is not known.
+    """
+    names = tuple(KINDS) if tasks == "all" else tuple(tasks.split(",") if isinstance(tasks, str) else tasks)
+    names = tuple(name.strip() for name in names)
+    if not names or len(set(names)) < len(names) or not set(names) <= set(KINDS):
+        known = ", ".join(KINDS)
+        raise ArgumentError(
+            f"manipulation: expected tasks as all, or different ones of {known}, got {', '.join(names)}"
+        )
+    return names
 
 
 class Table:

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs of the manipulation task: everything that a run of any task can do."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.cli import main
+from wiw.errors import ArgumentError
+from wiw.evaluation.evaluate import evaluate, resume_run
+from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
+from wiw.evaluation.runlog import load_run
+from wiw.evaluation.store import RunStore
+from wiw.tasks.manipulation import KINDS, Manipulation
+
+POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
+SHORT = {"tasks": "push_buttons,slide_block", "actions": 3, "candidates": 2, "horizon": 3}
+FLAGS = ["--tasks", "push_buttons,slide_block", "--task-option", "actions=3", "--candidates", "2", "--horizon", "3"]
+ARMS = ["none", "copy", "oracle", "placebo-swapped:oracle"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of each of two tasks, by all reference arms, with fidelity."""
+    out = tmp_path_factory.mktemp("runs") / "first"
+    command = ["run", "manipulation", *FLAGS, "--policy", POLICY, "--episodes", "4", "--arms", ",".join(ARMS)]
+    assert main([*command, "--fidelity", "--no-report", "--out", str(out)]) == 0
+    return out
+
+
+def told(path: Path) -> dict[Any, Any]:
+    """What was decided and what came of it, by arm and episode."""
+    log = load_run(path)
+    ends = {(e["arm"], e["episode"]): (e["status"], e["metrics"]) for e in log.episodes}
+    plans = {(d["arm"], d["episode"], d["decision"]): (d["actions"], d["scores"]) for d in log.decisions}
+    return {**ends, **plans}
+
+
+def test_a_run_has_all_arms_and_episodes_of_each_task_in_turn(run: Path) -> None:
+    log = load_run(run)
+    assert log.arms == ARMS and len(log.episodes) == 16 and all(e["status"] == "done" for e in log.episodes)
+    with RunStore.read(run) as store:
+        assert [episode.info["task"] for episode in store.episodes()] == ["push_buttons", "slide_block"] * 2
+    assert all(e["metrics"]["poses"] <= 3 and e["metrics"]["actions"] == 1 for e in log.episodes)
+    lines = log.summary().arms
+    assert [line.done for line in lines] == [4] * 4
+    assert all(line.estimates["success"].scenes == 4 for line in lines)
+
+
+def test_imagination_is_measured_against_a_fork(run: Path) -> None:
+    """The oracle is true to the last bit, another episode's future is not."""
+    errors = {arm: [] for arm in ARMS[1:]}
+    for decision in load_run(run).decisions:
+        if decision["arm"] != "none":
+            errors[decision["arm"]] += decision["fidelity"]["psnr"]
+    assert min(errors["oracle"]) > 60
+    assert max(errors["copy"]) < 60 and max(errors["placebo-swapped:oracle"]) < 40
+
+
+def test_a_run_is_verified_compared_and_exported(run: Path, tmp_path: Path, capsys: Any) -> None:
+    assert main(["verify", str(run), "--episodes", "2"]) == 0
+    assert "all as recorded" in capsys.readouterr().out
+    assert main(["compare", str(run), str(run)]) == 0
+    assert main(["export", str(run), "--csv", str(tmp_path / "tables")]) == 0
+    with pytest.raises(ArgumentError, match="does not say what a plan is truly worth"):
+        wiw.attribute(run, "none")
+
+
+def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=3)
+    evaluate(TaskRecipe("manipulation", SHORT), agent, 4, 0, tmp_path / "two", 2, progress=False, live=1, fidelity=True)
+    one = {key: value for key, value in told(run).items() if key[0] == "oracle"}
+    assert told(tmp_path / "two") == one and len(one) == 8
+
+
+def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write, left = RunStore.write, [3]
+
+    def stopping(store: RunStore, row: Any) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        write(store, row)
+
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=3)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(RunStore, "write", stopping)
+        evaluate(TaskRecipe("manipulation", SHORT), agent, 4, 0, tmp_path, progress=False, live=1, fidelity=True)
+    with RunStore.read(tmp_path) as store:
+        assert 0 < len(store.outcomes()) < 4
+    resume_run(tmp_path, progress=False)
+    assert told(tmp_path) == {key: value for key, value in told(run).items() if key[0] == "oracle"}
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--scenes", "apartments:val"], "scenes: this is for tasks in which an agent walks"),
+        (["--backend", "cpu"], "backend: this is for"),
+        (["--motion", "slide"], "motion: this is for"),
+        (["--per-scene", "2"], "per_scene: this is for"),
+        (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: this is for"),
+        (["--tasks", "juggle"], "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
+        (["--tasks", "slide_block,slide_block"], "different ones"),
+        (["--preset", "official"], "there are paper"),
+        (["--task-option", "actions=0"], "must be positive"),
+        (["--task-option", "decisions=3"], "unknown rules decisions; there are actions"),
+    ],
+)
+def test_what_does_not_apply_is_refused(flags: list[str], said: str, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "run"
+    assert main(["run", "manipulation", "--policy", POLICY, "--out", str(out), *flags]) == 2
+    assert said in capsys.readouterr().err and not out.exists()
+
+
+def test_other_tasks_have_no_tasks(capsys: Any) -> None:
+    assert main(["run", "imagenav", "--tasks", "push_buttons", "--policy", "heuristic"]) == 2
+    assert "unknown rules tasks" in capsys.readouterr().err
+    assert main(["episodes", "manipulation"]) == 2
+    assert "a function of the seed" in capsys.readouterr().err
+
+
+def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert Manipulation().usual == 200 and Manipulation("slide_block").usual == 50
+    own = tmp_path / "mine.yaml"
+    own.write_text("episodes: 1\nactions: 1\n")
+    agent = AgentRecipe(POLICY, candidates=1, horizon=1)
+    log = evaluate("manipulation", agent, out=tmp_path / "run", progress=False, tasks="push_buttons", preset=str(own))
+    assert len(log.episodes) == 1
+    recorded = json.loads(
+        sqlite3.connect(tmp_path / "run" / "run.sqlite").execute("SELECT info FROM run").fetchone()[0]
+    )
+    assert recorded["task"]["options"]["preset"] == str(own)
+
+
+def test_gymnasium_knows_the_task() -> None:
+    env = wiw.make("Manipulation-v0", tasks=["stack_cups"], seed=4, depth=False)
+    observation, info = env.reset(options={"episode": 1})
+    assert {*observation} == {"front", "pose"} and "cup" in info["instruction"]
+    assert env.unwrapped.task.tasks == ("stack_cups",) and [*KINDS] == list(Manipulation().tasks)
+    assert np.ptp(observation["front"]) > 100
