@@ -26,6 +26,7 @@ __all__ = [
     "annotate",
     "attribute",
     "check_model",
+    "collect",
     "compare",
     "envs",
     "errors",
@@ -59,6 +60,7 @@ _HOME = {
     "accepts": "wiw.world_models.base",
     "attribute": "wiw.evaluation.attribute",
     "check_model": "wiw.evaluation.model_check",
+    "collect": "wiw.training.collect",
     "compare": "wiw.evaluation.compare",
     "evaluate": "wiw.evaluation.evaluate",
     "load_run": "wiw.evaluation.runlog",
@@ -114,5 +116,6 @@ if TYPE_CHECKING:
     from wiw.metrics.headlines import Headline
     from wiw.policies.base import Policy
     from wiw.registry import make, make_vec, policy, world_model
+    from wiw.training.collect import collect
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts

@@ -12,6 +12,7 @@ import tyro
 import wiw
 from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
+from wiw.cli.collect import collect
 from wiw.cli.compare import compare
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
@@ -61,6 +62,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (scenes, "scenes", "Look at scenes: pictures and figures."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
+    (collect, "collect", "Collect demonstrations of manipulation tasks, to learn from."),
     (train, "train", "Train the recogniser of Active Recognition."),
 )
 

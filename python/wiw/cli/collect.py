@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw collect`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import Positional, arg
+
+
+def collect(
+    what: Positional[Annotated[Literal["manipulation"], arg(metavar="WHAT")]] = "manipulation",
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="DIR")] = Path("demonstrations"),
+    tasks: Annotated[str, arg(metavar="NAMES")] = "all",
+    episodes: Annotated[int, arg(metavar="N")] = 200,
+    seed: Annotated[int, arg(metavar="N")] = 0,
+    size: Annotated[int, arg(metavar="N")] = 480,
+    frames: Annotated[int, arg(metavar="N")] = 150,
+    format: Literal["jpeg", "png"] = "jpeg",
+    depth: bool = False,
+    keep_failed: bool = False,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Collects demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
+
+    $ wiw collect manipulation --out demos --workers 4
+    $ wiw collect manipulation --tasks push_buttons,stack_cups --episodes 20 --size 128 --frames 60 --depth --out few
+
+    Experts who know where things are play each task; only what succeeds is kept. A row is a frame: the front view,
+    where the gripper is and where it is told to go. `docs/demonstrations.md` names the columns,
+    `wiw.datasets.demonstrations.Demonstrations` reads them. Tables are never those of an evaluation. The same command
+    again goes on where one was stopped.
+
+    Args:
+        what: manipulation.
+        out: Folder that is new, or was begun by the same command.
+        tasks: all, or push_buttons, slide_block, insert_peg, stack_cups with commas between them.
+        episodes: Demonstrations of each task.
+        seed: The demonstrations are a function of it.
+        size: Pixels of a side of the front view.
+        frames: Of each demonstration, evenly spread over its time.
+        format: Of the pictures: jpeg of quality 95, or png without loss.
+        depth: Writes the front view's depth too.
+        keep_failed: Keeps demonstrations that fail, too; else another table takes the place of theirs.
+        workers: Processes; the files are the same for any number of them.
+    """
+    from wiw.training.collect import collect
+
+    began = time.monotonic()
+    asked = {"episodes": episodes, "seed": seed, "size": size, "frames": frames, "format": format, "depth": depth}
+    with _Bars() as bars:
+        made = collect(out, tasks, workers=workers, progress=bars, keep_failed=keep_failed, **asked)
+    megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
+    failed = sum(made.failed.values())
+    print(
+        f"{len(made)} demonstrations of {frames} frames, {megabytes:.1f} MB, in {time.monotonic() - began:.0f} s; "
+        f"experts failed at {failed} table{'' if failed == 1 else 's'}"
+    )
+    print(f"written   {out}")
+    return 0
+
+
+class _Bars:
+    """A bar for each task; plain lines at quarter marks where the output is no terminal."""
+
+    def __enter__(self) -> _Bars:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self._console = Console(stderr=True)
+        name, text = TextColumn("[bold]{task.description:<12}"), TextColumn("{task.fields[text]}")
+        times = TimeElapsedColumn(), TextColumn("<"), TimeRemainingColumn()
+        columns = name, BarColumn(bar_width=32), text, *times
+        self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._tasks: dict[str, Any] = {}
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def __call__(self, task: str, done: int, episodes: int, failed: int) -> None:
+        text = f"{done}/{episodes} demonstrations" + (f", {failed} failed" if failed else "")
+        if task not in self._tasks:
+            self._tasks[task] = self._bars.add_task(task, total=episodes, text=text)
+        before = self._bars.tasks[self._tasks[task]].completed
+        self._bars.update(self._tasks[task], completed=done, text=text)
+        if not self._console.is_terminal and 4 * done // episodes > 4 * before // episodes:
+            self._console.print(f"{task}: {text}", highlight=False)

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Demonstrations of manipulation tasks, as `wiw collect` writes them.
+
+    for each in Demonstrations("demos"):
+        each.instruction, each.images, each.poses, each.actions
+
+`docs/demonstrations.md` describes the files.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets.shards import Shard, require_pyarrow
+from wiw.errors import ArgumentError, FileError
+
+MANIFEST = "manifest.json"
+SHARD = 10
+"""Demonstrations a file."""
+DEPTH_UNITS = 5000
+"""A metre."""
+QUALITY = 95
+"""Of JPEG, whose colours are as fine as its brightness."""
+
+Format = Literal["jpeg", "png"]
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """How an expert did what it was told, in T frames evenly spread over time; frame 0 is before anything was done.
+
+    Pictures are decoded when they are first asked for.
+    """
+
+    task: str
+    variation: int
+    seed: int
+    episode: int
+    """Its number within the task."""
+    instruction: str
+    success: bool
+    places: Mapping[str, NDArray[np.float64]]
+    """T_world_object [4, 4] in frame 0, by name."""
+    seconds: NDArray[np.float64]
+    """float64 [T], of the physics."""
+    poses: NDArray[np.float64]
+    """float64 [T, 7]: where the gripper is."""
+    actions: NDArray[np.float64]
+    """float64 [T, 7]: the pose that it is told to go to."""
+    keys: NDArray[np.int32]
+    """int32 [T]: number of the action under way, from 1; 0 in frame 0."""
+    ended: NDArray[np.bool_]
+    """bool [T]: whether the action ends in this frame."""
+    encoded_images: tuple[bytes, ...]
+    """T front views, JPEG or PNG."""
+    encoded_depths: tuple[bytes, ...] | None = None
+    """T depths of the front view, 16-bit PNG."""
+
+    def __len__(self) -> int:
+        return len(self.seconds)
+
+    @cached_property
+    def images(self) -> NDArray[np.uint8]:
+        """uint8 [T, H, W, 3]: the front views.
+
+        Raises:
+            FileError: one of them is damaged.
+        """
+        return np.stack([_decoded(data, cv2.IMREAD_COLOR) for data in self.encoded_images])[..., ::-1]
+
+    @cached_property
+    def depths(self) -> NDArray[np.float32] | None:
+        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None where none were collected.
+
+        Raises:
+            FileError: one of them is damaged.
+        """
+        if self.encoded_depths is None:
+            return None
+        units = np.stack([_decoded(data, cv2.IMREAD_UNCHANGED) for data in self.encoded_depths])
+        return units.astype(np.float32) / np.float32(DEPTH_UNITS)
+
+
+@dataclass(frozen=True)
+class FrontCamera:
+    """Where pictures were taken from. It looks along its -z, +y is up; the world's z is up."""
+
+    intrinsics: NDArray[np.float64]
+    """float64 [3, 3]: a point (x, y, z) before it is seen at K (x, -y, -z) / -z, in pixels right and down."""
+    T_world_camera: NDArray[np.float64]
+    """float64 [4, 4]."""
+
+
+class Demonstrations(Sequence[Demonstration]):
+    """A folder that `wiw collect` has written: its demonstrations, task by task.
+
+    Args:
+        folder: with the manifest.
+        tasks: "all", or names of those to read.
+        partial: whether to read what there is of a collection that has not come to its end.
+
+    Raises:
+        DependencyError: pyarrow is not installed.
+        FileError: there is no such collection, or a file of it is missing or damaged.
+        ArgumentError: a task that was not collected.
+    """
+
+    def __init__(self, folder: str | Path, tasks: str | Sequence[str] = "all", partial: bool = False) -> None:
+        require_pyarrow()
+        self.folder = Path(folder)
+        self.config = read_manifest(self.folder)
+        """What was asked for when it was collected."""
+        paths = [path for task in self._asked(tasks) for path in shard_paths(self.folder, self.config, task)]
+        self._shards = [Shard(path) for path in paths if not partial or path.exists()]
+        self._ends = list(accumulate(len(shard) for shard in self._shards))
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, index: Any) -> Any:
+        """One demonstration, or a list of those of a slice.
+
+        Raises:
+            FileError: its file is damaged.
+        """
+        if isinstance(index, slice):
+            return [self[each] for each in range(*index.indices(len(self)))]
+        at = index + len(self) if index < 0 else index
+        if not 0 <= at < len(self):
+            raise IndexError(f"expected one of {len(self)} demonstrations, got {index}")
+        shard = bisect_right(self._ends, at)
+        return self._shards[shard][at - (self._ends[shard - 1] if shard else 0)]
+
+    def __iter__(self) -> Iterator[Demonstration]:
+        return (shard[index] for shard in self._shards for index in range(len(shard)))
+
+    @property
+    def failed(self) -> dict[str, int]:
+        """Tables that experts failed at, by task; another one was set in the place of each, unless they were kept."""
+        counts = dict.fromkeys(self.config["tasks"], 0)
+        for shard in self._shards:
+            counts[shard.facts["task"]] += shard.facts["failed"]
+        return counts
+
+    @property
+    def camera(self) -> FrontCamera:
+        """Of the front view.
+
+        Raises:
+            FileError: nothing has been collected yet.
+        """
+        if not self._shards:
+            raise FileError(f"{self.folder}: nothing has been collected yet")
+        facts = self._shards[0].facts["camera"]
+        return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
+
+    def _asked(self, tasks: str | Sequence[str]) -> list[str]:
+        known = self.config["tasks"]
+        names = known if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)
+        if unknown := [name for name in names if name not in known]:
+            raise ArgumentError(f"{self.folder}: expected tasks among {', '.join(known)}, got {', '.join(unknown)}")
+        return list(names)
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """What was asked for when a folder was collected.
+
+    Raises:
+        FileError: there is no manifest, or none that can be read.
+    """
+    path = folder / MANIFEST
+    try:
+        return dict(json.loads(path.read_text()))
+    except FileNotFoundError as error:
+        raise FileError(f"{path} is missing; expected a folder that `wiw collect` has written") from error
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: expected a manifest of `wiw collect`, got something else ({error})") from error
+
+
+def shard_paths(folder: Path, config: Mapping[str, Any], task: str) -> list[Path]:
+    """The files of a task, of `SHARD` demonstrations each but for the last."""
+    return [folder / f"{task}-{number:05d}.parquet" for number in range(-(-config["episodes"] // SHARD))]
+
+
+def shard_range(number: int, episodes: int) -> range:
+    """Which of so many demonstrations are in a file."""
+    return range(SHARD * number, min(SHARD * (number + 1), episodes))
+
+
+def encoded_image(image: NDArray[np.uint8], kind: Format) -> bytes:
+    """A picture as JPEG or PNG."""
+    fine = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, *fine] if kind == "jpeg" else []
+    return bytes(cv2.imencode(f".{kind}", image[..., ::-1], options)[1])
+
+
+def encoded_depth(depth: NDArray[np.float32]) -> bytes:
+    """Metres as a 16-bit PNG; what is further away than 13 m is as far."""
+    units = np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    return bytes(cv2.imencode(".png", units)[1])
+
+
+def _decoded(data: bytes, how: int) -> NDArray[Any]:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None
+    if image is None:
+        raise FileError("a picture of a demonstration is damaged; delete its file, then `wiw collect` makes it anew")
+    return image

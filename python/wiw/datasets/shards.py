@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of demonstrations: Parquet, a row a frame, a row group a demonstration (`docs/demonstrations.md`)."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from wiw.errors import DependencyError, FileError
+
+if TYPE_CHECKING:
+    from wiw.datasets.demonstrations import Demonstration
+
+FORMAT = 1
+KEY = b"wiw"
+"""Of the metadata, which are JSON."""
+COLUMNS: Mapping[str, str] = {
+    "task": "which kind of manipulation it is",
+    "variation": "number of the combination of colours, counts and targets",
+    "seed": "of the table: where things are",
+    "episode": "number of the demonstration within its task",
+    "frame": "from 0",
+    "seconds": "of the physics, since frame 0",
+    "instruction": "what is asked for, in words",
+    "pose": "where the gripper is: x, y, z in metres, z up; roll, pitch, yaw in radians, R = Rz Ry Rx; 1 open, 0 shut",
+    "action": "the pose that it is told to go to, likewise; in frame 0 the first",
+    "key": "number of the action under way, from 1; 0 in frame 0",
+    "ended": "whether the action has ended in this frame, which makes it a key frame",
+    "success": "whether what is asked for is done in the end",
+    "places": "JSON: T_world_object [4, 4] in frame 0 of all that agents are told the place of, by name",
+    "image": "the front view, sRGB, JPEG or PNG",
+    "depth": "the front view's planar depth, 16-bit PNG, 5000 a metre, 0 where nothing is hit",
+}
+REPEATED = ("task", "instruction", "places")
+"""Text that is the same all through a demonstration, which Parquet then writes once."""
+
+
+def require_pyarrow() -> None:
+    """Raises:
+    DependencyError: pyarrow is not installed.
+    """
+    from importlib.util import find_spec
+
+    if find_spec("pyarrow") is None:
+        raise DependencyError("demonstrations are Parquet files, which need pyarrow: pip install 'wiw[export]'")
+
+
+def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[str, Any]) -> None:
+    """Writes a file, which is there whole or not at all.
+
+    Args:
+        path: of the file; what it held is replaced.
+        demonstrations: of as many frames each.
+        facts: JSON-able: what holds for all of them.
+
+    Raises:
+        FileError: it cannot be written, for instance because the disk is full.
+    """
+    from pyarrow import parquet
+
+    depth = demonstrations[0].encoded_depths is not None
+    schema = _schema(depth, facts)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        with parquet.ParquetWriter(part, schema, use_dictionary=list(REPEATED), compression=_packing(depth)) as file:
+            for each in demonstrations:
+                file.write_table(_table(each, schema), row_group_size=len(each))
+        with part.open("rb") as written:
+            os.fsync(written.fileno())
+        part.replace(path)
+    except OSError as error:
+        raise FileError(
+            f"{path}: cannot be written ({error.strerror or error}); make room or name another folder"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)
+
+
+class Shard:
+    """A file that is read demonstration by demonstration.
+
+    Raises:
+        FileError: it is not there, is damaged, or is none of ours.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from pyarrow import ArrowException, parquet
+
+        self.path = path
+        try:
+            self._metadata = parquet.read_metadata(path)
+            self.facts: dict[str, Any] = json.loads(self._metadata.metadata[KEY])
+        except FileNotFoundError as error:
+            raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
+        except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
+            raise _damaged(path, error) from error
+        if self.facts.get("format") != FORMAT:
+            raise FileError(f"{path}: expected demonstrations of format {FORMAT}, got {self.facts.get('format')}")
+
+    def __len__(self) -> int:
+        return int(self._metadata.num_row_groups)
+
+    def __getitem__(self, index: int) -> Demonstration:
+        """Raises:
+        FileError: the file is damaged.
+        """
+        from pyarrow import ArrowException, parquet
+
+        try:
+            with parquet.ParquetFile(self.path, metadata=self._metadata) as file:
+                return _demonstration(file.read_row_group(index).to_pydict())
+        except (OSError, ArrowException, KeyError, ValueError) as error:
+            raise _damaged(self.path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> FileError:
+    return FileError(
+        f"{path}: expected a whole file of demonstrations, got a damaged one ({error}); delete it, then `wiw collect`, "
+        "asked for the same again, makes it anew"
+    )
+
+
+def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
+    import pyarrow as pa
+
+    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    pose = pa.list_(pa.float64(), 7)
+    types = {
+        "task": pa.string(),
+        "variation": pa.int32(),
+        "seed": pa.int64(),
+        "episode": pa.int32(),
+        "frame": pa.int32(),
+        "seconds": pa.float64(),
+        "instruction": pa.string(),
+        "pose": pose,
+        "action": pose,
+        "key": pa.int32(),
+        "ended": pa.bool_(),
+        "success": pa.bool_(),
+        "places": pa.string(),
+        "image": picture,
+        "depth": picture,
+    }
+    if not depth:
+        del types["depth"]
+    about = {"format": FORMAT, **facts, "columns": {name: COLUMNS[name] for name in types}}
+    metadata = {KEY: json.dumps(about).encode(), b"huggingface": json.dumps(_features(types)).encode()}
+    return pa.schema(list(types.items()), metadata=metadata)
+
+
+def _features(types: Mapping[str, Any]) -> dict[str, Any]:
+    """What the library `datasets` is told of columns, so that it decodes pictures by itself."""
+    import pyarrow as pa
+
+    def feature(kind: Any) -> dict[str, Any]:
+        if pa.types.is_struct(kind):
+            return {"_type": "Image"}
+        if pa.types.is_fixed_size_list(kind):
+            return {"feature": {"dtype": "float64", "_type": "Value"}, "length": 7, "_type": "Sequence"}
+        return {"dtype": {"double": "float64"}.get(str(kind), str(kind)), "_type": "Value"}
+
+    return {"info": {"features": {name: feature(kind) for name, kind in types.items()}}}
+
+
+def _packing(depth: bool) -> dict[str, str]:
+    """Pictures are packed already."""
+    numbers = [name for name in COLUMNS if name not in ("image", "depth", "pose", "action")]
+    packed = dict.fromkeys((*numbers, "pose.list.element", "action.list.element"), "zstd")
+    pictures = ("image", "depth") if depth else ("image",)
+    return packed | {f"{name}.{part}": "none" for name in pictures for part in ("bytes", "path")}
+
+
+def _table(demonstration: Demonstration, schema: Any) -> Any:
+    import pyarrow as pa
+
+    each, count = demonstration, len(demonstration)
+    pictures = [{"bytes": data, "path": None} for data in each.encoded_images]
+    columns: dict[str, Any] = {
+        "task": [each.task] * count,
+        "variation": [each.variation] * count,
+        "seed": [each.seed] * count,
+        "episode": [each.episode] * count,
+        "frame": range(count),
+        "seconds": each.seconds,
+        "instruction": [each.instruction] * count,
+        "pose": list(each.poses),
+        "action": list(each.actions),
+        "key": each.keys,
+        "ended": each.ended,
+        "success": [each.success] * count,
+        "places": [json.dumps({name: pose.tolist() for name, pose in each.places.items()})] * count,
+        "image": pictures,
+    }
+    if each.encoded_depths is not None:
+        columns["depth"] = [{"bytes": data, "path": None} for data in each.encoded_depths]
+    return pa.table([pa.array(columns[name], schema.field(name).type) for name in schema.names], schema=schema)
+
+
+def _demonstration(rows: Mapping[str, list[Any]]) -> Demonstration:
+    from wiw.datasets.demonstrations import Demonstration
+
+    depths = rows.get("depth")
+    return Demonstration(
+        task=rows["task"][0],
+        variation=rows["variation"][0],
+        seed=rows["seed"][0],
+        episode=rows["episode"][0],
+        instruction=rows["instruction"][0],
+        success=rows["success"][0],
+        places={name: np.array(pose, np.float64) for name, pose in json.loads(rows["places"][0]).items()},
+        seconds=np.array(rows["seconds"], np.float64),
+        poses=np.array(rows["pose"], np.float64),
+        actions=np.array(rows["action"], np.float64),
+        keys=np.array(rows["key"], np.int32),
+        ended=np.array(rows["ended"], np.bool_),
+        encoded_images=tuple(picture["bytes"] for picture in rows["image"]),
+        encoded_depths=None if depths is None else tuple(picture["bytes"] for picture in depths),
+    )
