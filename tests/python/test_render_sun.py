@@ -201,3 +201,28 @@ def test_a_sun_comes_back_as_it_was_given():
 def test_suns_out_of_range_are_refused(sun, message):
     with pytest.raises(ArgumentError, match=message):
         make_scene(sun)
+
+
+def test_pictures_do_not_remember_earlier_moves():
+    angles = np.linspace(0, 2 * np.pi, 25)[:-1]
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    tube = np.concatenate([np.insert(0.2 * ring, 1, height, axis=1) for height in (0.0, 0.5)]).astype(np.float32)
+    sides = [[i, j, i + 24] for i, j in zip(range(24), (*range(1, 24), 0), strict=True)]
+    sides += [[j, j + 24, i + 24] for i, j, _ in sides]
+    normals = np.insert(np.concatenate([ring, ring]), 1, 0.0, axis=1).astype(np.float32)
+    floor = quad([-1, 0, 1], [2, 0, 0], [0, 0, -2])
+    meshes = [
+        {"positions": floor, "triangles": quads_to_triangles(floor)},
+        {"positions": tube, "triangles": np.array(sides), "normals": normals},
+    ]
+    scene = Scene.from_arrays(meshes, sun={"direction": SUNS["high"]})
+    turned, wide = np.eye(4), np.diag([2.0, 1, 1, 1])
+    turned[:3, :3] = [[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]
+    travelled, fresh = Renderer(scene, "cpu"), Renderer(scene, "cpu")
+    for pose in (turned, wide, turned):
+        travelled.set_poses([2], pose[None])
+    fresh.set_poses([2], turned[None])
+    one, other = (renderer.perspective(POSE, SIZE, HFOV) for renderer in (travelled, fresh))
+    assert (one["instance"] == 2).sum() > 300
+    for name in one:
+        np.testing.assert_array_equal(one[name], other[name])

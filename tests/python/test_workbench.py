@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from wiw.errors import ArgumentError
 from wiw.physics import Articulation, Box, Capsule, ConvexHull, Cylinder, Sphere, place
-from wiw.tabletop.shapes import joined, mesh_of
+from wiw.tabletop.shapes import joined, mesh_of, painted
 from wiw.tabletop.workbench import CAMERAS, TABLE, Thing, Workbench
 
 DOWN = (np.pi, 0.0, 0.0)
@@ -178,17 +178,35 @@ SHAPES = {
 }
 
 
+@pytest.mark.parametrize("rounded", [False, True])
 @pytest.mark.parametrize("name", SHAPES)
-def test_meshes_enclose_the_volume_of_their_shape(name: str) -> None:
+def test_meshes_enclose_the_volume_of_their_shape(name: str, rounded: bool) -> None:
     shape, volume = SHAPES[name]
-    mesh = mesh_of(shape)
+    mesh = mesh_of(shape, rounded)
     corners = mesh["positions"].astype(float)[mesh["triangles"]]
     enclosed = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    assert enclosed == pytest.approx(volume, rel=0.01)
+    assert enclosed == pytest.approx(volume, rel=0.02)
     flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals = mesh["normals"][mesh["triangles"]].mean(axis=1)
     assert ((flat * normals).sum(-1) >= -1e-9).all()
     np.testing.assert_allclose(np.linalg.norm(mesh["normals"], axis=1), 1, atol=1e-5)
+
+
+def test_broken_edges_keep_measures_and_are_smooth() -> None:
+    for shape in (Box([0.2, 0.3, 0.4]), Cylinder(0.1, 0.4)):
+        sharp, smooth = mesh_of(shape), mesh_of(shape, rounded=True)
+        np.testing.assert_allclose(np.ptp(smooth["positions"], axis=0), np.ptp(sharp["positions"], axis=0), atol=1e-6)
+        slanted = (np.abs(smooth["normals"]) > 0.1).sum(axis=1) > 1
+        assert slanted.any()
+        corners = smooth["positions"][slanted] + 0.02 * smooth["normals"][slanted]
+        assert (np.abs(corners).max(axis=1) > 0.1).all()  # edges look outwards
+
+
+def test_paint_stays_on_its_part() -> None:
+    red, blue = painted(mesh_of(Box([1, 1, 1])), (1, 0, 0)), painted(mesh_of(Sphere(1)), (0, 0, 1, 0.5))
+    both = joined([(red, np.eye(4)), (blue, place(z=3))])
+    assert (both["colors"][:24] == (255, 0, 0, 255)).all() and (both["colors"][24:] == (0, 0, 255, 255)).all()
+    assert both["colors"].dtype == np.uint8 and len(both["colors"]) == len(both["positions"])
 
 
 def test_parts_make_one_mesh_and_other_things_none() -> None:

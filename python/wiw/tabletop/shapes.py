@@ -3,49 +3,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wiw.errors import ArgumentError
 from wiw.physics import Box, Capsule, ConvexHull, Cylinder, Sphere
 
-AROUND = 48
+AROUND = 32
 """Sides of a circle."""
+FACETS = 2
+"""Sides of a rounded edge."""
 
 Mesh = dict[str, NDArray[Any]]
-"""positions float32 [V, 3], normals float32 [V, 3], triangles uint32 [T, 3]."""
+"""positions float32 [V, 3], normals float32 [V, 3], triangles uint32 [T, 3], and colors uint8 [V, 4] where painted."""
 
 
-def mesh_of(shape: Any) -> Mesh:
+def mesh_of(shape: Any, rounded: bool = False) -> Mesh:
     """The surface of a shape of `wiw.physics`, with normals that show curves as curves and edges as edges.
+
+    Args:
+        shape: a box, ball, cylinder, capsule or hull.
+        rounded: breaks the edges of boxes and cylinders, as those of moulded things are: by a sixth of their least
+            measure, a centimetre at most.
 
     Raises:
         ArgumentError: another kind of thing.
     """
     if isinstance(shape, Box):
-        return _box(np.asarray(shape.size))
+        size = np.asarray(shape.size)
+        return _rounded_box(size, _edge(size.min())) if rounded else _box(size)
     if isinstance(shape, Sphere):
         return _turned(*_arc(shape.radius, 0.0, 0.0))
     if isinstance(shape, Capsule):
         return _turned(*_arc(shape.radius, shape.length / 2, -shape.length / 2))
     if isinstance(shape, Cylinder):
-        return _cylinder(shape.radius, shape.length / 2)
+        edge = _edge(min(2 * shape.radius, shape.length)) if rounded else 0.0
+        return _cylinder(shape.radius, shape.length / 2, edge)
     if isinstance(shape, ConvexHull):
         return _hull(np.asarray(shape.points))
     raise ArgumentError(f"mesh_of: expected a shape of wiw.physics, got {type(shape).__name__}")
 
 
-def joined(parts: list[tuple[Mesh, NDArray[np.float64]]]) -> Mesh:
-    """One mesh of several, each with its pose [4, 4]."""
+def painted(mesh: Mesh, colour: ArrayLike) -> Mesh:
+    """The same in a colour of its own, RGB or RGBA from 0 to 1: "colors" uint8 [V, 4]."""
+    rgba = np.append(np.asarray(colour, np.float64)[:3], 1.0)
+    row = np.clip(np.round(255 * rgba), 0, 255).astype(np.uint8)
+    return {**mesh, "colors": np.tile(row, (len(mesh["positions"]), 1))}
+
+
+def joined(parts: Sequence[tuple[Mesh, NDArray[np.float64]]]) -> Mesh:
+    """One mesh of several, each with its pose [4, 4]; all of them painted, or none."""
     positions, normals, triangles, count = [], [], [], 0
     for mesh, pose in parts:
         positions.append(mesh["positions"] @ pose[:3, :3].T + pose[:3, 3])
         normals.append(mesh["normals"] @ pose[:3, :3].T)
         triangles.append(mesh["triangles"] + np.uint32(count))
         count += len(mesh["positions"])
-    return _mesh(np.concatenate(positions), np.concatenate(normals), np.concatenate(triangles))
+    whole = _mesh(np.concatenate(positions), np.concatenate(normals), np.concatenate(triangles))
+    if "colors" in parts[0][0]:
+        whole["colors"] = np.concatenate([mesh["colors"] for mesh, _ in parts])
+    return whole
 
 
 def _mesh(positions: NDArray[Any], normals: NDArray[Any], triangles: NDArray[Any]) -> Mesh:
@@ -69,6 +89,30 @@ def _box(size: NDArray[np.float64]) -> Mesh:
     first = 4 * np.arange(6)[:, None, None]
     halves = np.array([[0, 1, 2], [0, 2, 3]])
     return _mesh(np.array(positions) * size / 2, np.array(normals), (first + halves).reshape(-1, 3))
+
+
+def _edge(least: float) -> float:
+    """Radius of the edges of something whose least measure is so many metres."""
+    return min(0.01, least / 6)
+
+
+def _rounded_box(size: NDArray[np.float64], edge: float) -> Mesh:
+    """Six sides, whose outer strips are bent around the edges: a ball's surface, its octants drawn apart."""
+    bend = np.tan(np.linspace(0, np.pi / 4, FACETS + 1))
+    line, side = np.concatenate([-bend[::-1], bend]), np.repeat([-1.0, 1.0], FACETS + 1)
+    row, column = np.mgrid[: len(line) - 1, : len(line) - 1]
+    a = row * len(line) + column
+    b, c, d = a + 1, a + len(line), a + len(line) + 1
+    quads = np.stack([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)], axis=2).reshape(-1, 3)
+    faces = []
+    for axis in range(3):
+        for sign in (-1, 1):
+            outward, octant = np.full((2, len(line), len(line), 3), float(sign))
+            for way, values in ((outward, line), (octant, side)):
+                way[..., (axis + 1) % 3], way[..., (axis + 2) % 3] = values[:, None], sign * values
+            normals = (outward / np.linalg.norm(outward, axis=-1, keepdims=True)).reshape(-1, 3)
+            faces.append(_mesh(octant.reshape(-1, 3) * (size / 2 - edge) + edge * normals, normals, quads))
+    return joined([(face, np.eye(4)) for face in faces])
 
 
 def _arc(radius: float, top: float, bottom: float) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -97,12 +141,19 @@ def _turned(profile: NDArray[Any], normals: NDArray[Any]) -> Mesh:
     return _mesh(positions.reshape(-1, 3), outward.reshape(-1, 3), triangles)
 
 
-def _cylinder(radius: float, half: float) -> Mesh:
-    """Mantle and two lids, each with normals of its own."""
-    lid = _turned(np.array([[0, half], [radius, half]]), np.array([[0.0, 1], [0, 1]]))
-    mantle = _turned(np.array([[radius, half], [radius, -half]]), np.array([[1.0, 0], [1, 0]]))
-    floor = _turned(np.array([[radius, -half], [0, -half]]), np.array([[0.0, -1], [0, -1]]))
-    return joined([(part, np.eye(4)) for part in (lid, mantle, floor)])
+def _cylinder(radius: float, half: float, edge: float = 0.0) -> Mesh:
+    """Mantle and two lids, each with normals of its own; between them edges of a radius."""
+    inner, low = radius - edge, half - edge
+    lid = _turned(np.array([[0, half], [inner, half]]), np.array([[0.0, 1], [0, 1]]))
+    mantle = _turned(np.array([[radius, low], [radius, -low]]), np.array([[1.0, 0], [1, 0]]))
+    floor = _turned(np.array([[inner, -half], [0, -half]]), np.array([[0.0, -1], [0, -1]]))
+    parts = [lid, mantle, floor]
+    if edge:
+        angles = np.linspace(0, np.pi / 2, FACETS + 1)
+        upper = np.stack([np.sin(angles), np.cos(angles)], axis=1)
+        lower = upper[::-1] * (1, -1)
+        parts += [_turned((inner, low) + edge * upper, upper), _turned((inner, -low) + edge * lower, lower)]
+    return joined([(part, np.eye(4)) for part in parts])
 
 
 def _hull(points: NDArray[np.float64]) -> Mesh:

@@ -19,6 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, WorldState, panda, place
 from wiw.render import Output, Renderer
 from wiw.scenes import Scene
+from wiw.tabletop.looks import looks_of
 from wiw.tabletop.shapes import joined, mesh_of
 
 Colour = tuple[float, float, float]
@@ -34,7 +35,7 @@ BASE = place(x=-0.35, z=TABLE)
 """Where the arm stands; the middle of the table's top lies half a metre in front of it."""
 MIDDLE = place(x=0.15, z=TABLE - TOP[2] / 2)
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
-SUN = {"direction": (0.35, 1.0, 0.45)}
+SUN = {"direction": (0.45, 1.0, 0.45), "strength": 0.5, "ambient": 0.66}
 FAR_BELOW = 1e3
 """Metres under the floor, where nobody sees what is left out of a picture."""
 SHUT = 0.5
@@ -96,7 +97,7 @@ class Camera:
 
 
 CAMERAS: Mapping[str, Camera] = {
-    "front": Camera((1.15, 0.0, 1.45), (0.1, 0.0, 0.9)),
+    "front": Camera((1.0, 0.0, 1.4), (0.0, 0.0, 0.96)),
     "left_shoulder": Camera((-0.45, 0.75, 1.6), (0.2, 0.0, 0.8)),
     "right_shoulder": Camera((-0.45, -0.75, 1.6), (0.2, 0.0, 0.8)),
     "wrist": Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, "panda_hand"),
@@ -313,7 +314,7 @@ class Workbench:
         return np.stack(views)
 
     def poses_of_parts(self) -> list[Pose]:
-        """T_world of all that is drawn and may move: things by their order, then the arm's visuals."""
+        """T_world of all that is drawn and may move: things by their order, then the arm's links."""
         bodies, arm = self._world.body_poses(), self._world.link_poses(self._arm)
         found: list[Pose] = []
         for name, thing in self.things.items():
@@ -321,11 +322,11 @@ class Workbench:
                 found.append(bodies[self._bodies[name]] if thing.touched else self._marks[name])
             else:
                 links = self._world.link_poses(self._mechanisms[name])
-                found += [links[each["link"]] @ each["T_link_visual"] for each in thing.mechanism.visuals]
+                found += [links[link] for link, _ in looks_of(thing.mechanism)]
             if thing.lamp is not None:
                 lit = self._lamp_of(name)
                 found += [self.place_of(name) if number == lit else OFF for number in range(len(LAMPS))]
-        return found + [arm[each["link"]] @ each["T_link_visual"] for each in panda().visuals]
+        return found + [arm[link] for link, _ in looks_of(panda())]
 
     def _lamp_of(self, name: str) -> int | None:
         """Which of its lamps is on: that of its latest push."""
@@ -357,13 +358,13 @@ class _Pictures:
                 whole = joined([(mesh_of(shape), pose) for shape, pose in thing.parts])
                 add(whole, thing.colour, next(poses), thing.name)
             else:
-                for each in thing.mechanism.visuals:
-                    add(mesh_of(each["shape"]), each["color"], next(poses), thing.name)
+                for _, mesh in looks_of(thing.mechanism):
+                    add(mesh, _PAINTED, next(poses), thing.name)
             if thing.lamp is not None:
                 for colour in LAMPS.values():
                     add(mesh_of(thing.lamp), colour, next(poses), thing.name)
-        for each in panda().visuals:
-            add(mesh_of(each["shape"]), each["color"], next(poses), "arm")
+        for _, mesh in looks_of(panda()):
+            add(mesh, _PAINTED, next(poses), "arm")
         scene = Scene.from_arrays(meshes, name="workbench", materials=materials, sun=SUN)
         self._renderer = Renderer(scene, samples=4)
 
@@ -373,7 +374,7 @@ class _Pictures:
         """A batch of one picture of a state."""
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
         if not arm:
-            moved[-len(panda().visuals) :, 1, 3] -= FAR_BELOW
+            moved[-len(looks_of(panda())) :, 1, 3] -= FAR_BELOW
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
         self._renderer.core.set_poses(ids, moved.astype(np.float32))
         pose = camera.pose
@@ -382,13 +383,15 @@ class _Pictures:
         return self._renderer.perspective(Y_UP @ pose, size, camera.hfov_deg, outputs=outputs)
 
 
+_PAINTED: Colour = (1.0, 1.0, 1.0)
+"""Of what has its colours in its mesh."""
 _LEG = Box((0.05, 0.05, TABLE - TOP[2]))
 _ROOM: list[tuple[str, Any, Colour, Pose]] = [
-    ("floor", Box((6, 6, 0.02)), (0.55, 0.55, 0.57), place(z=-0.01)),
-    ("wall", Box((0.02, 6, 3)), (0.83, 0.84, 0.82), place(x=-1.2, z=1.5)),
-    ("table", Box(TOP), (0.72, 0.58, 0.42), MIDDLE),
+    ("floor", Box((12, 12, 0.02)), (0.5, 0.52, 0.55), place(z=-0.01)),
+    ("wall", Box((0.02, 12, 3)), (0.9, 0.92, 0.93), place(x=-1.2, z=1.5)),
+    ("table", Box(TOP), (0.78, 0.69, 0.57), MIDDLE),
     *(
-        ("table", _LEG, (0.6, 0.48, 0.35), place(x=x, y=y, z=(TABLE - TOP[2]) / 2))
+        ("table", _LEG, (0.6, 0.52, 0.43), place(x=x, y=y, z=(TABLE - TOP[2]) / 2))
         for x in (-0.35, 0.65)
         for y in (-0.64, 0.64)
     ),

@@ -66,6 +66,8 @@ class CpuRenderer final : public Renderer {
         shading_(*scene_),
         embree_(*scene_, shading_, isa) {
     shading_.describe(kernel_scene_);
+    for (const Part& part : shading_.parts())
+      last_.push_back(scene_->instances[part.instance].T_world_instance.matrix());
   }
 
   void render(std::span<const Pose> T_world_camera, const Camera& camera, const RenderTargets& targets) override {
@@ -93,6 +95,7 @@ class CpuRenderer final : public Renderer {
     check_poses(*scene_, ids, poses);
     const std::scoped_lock lock(mutex_);
     const auto parts = shading_.parts();
+    std::vector<EmbreeScene::Placed> moved;
     for (std::size_t i = 0; i < ids.size(); ++i) {
       const std::uint32_t index = ids[i] - 1;
       // Parts are ordered by instance.
@@ -100,11 +103,13 @@ class CpuRenderer final : public Renderer {
                                    [](const Part& p, std::uint32_t value) { return p.instance < value; });
       for (; part != parts.end() && part->instance == index; ++part) {
         const auto number = static_cast<std::size_t>(part - parts.begin());
+        if (last_[number] == poses[i].matrix()) continue;
+        last_[number] = poses[i].matrix();
         shading_.place(number, poses[i]);
-        embree_.move(number, poses[i]);
+        moved.push_back({number, &poses[i]});
       }
     }
-    embree_.commit_moved();
+    embree_.move(moved);
   }
 
   [[nodiscard]] const Scene& scene() const override { return *scene_; }
@@ -120,6 +125,7 @@ class CpuRenderer final : public Renderer {
   ShadingScene shading_;
   EmbreeScene embree_;
   KernelScene kernel_scene_{};
+  std::vector<Eigen::Matrix4f> last_;  // poses of the parts
   std::optional<RayTables> tables_;
   std::mutex mutex_;
 };

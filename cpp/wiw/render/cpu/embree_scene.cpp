@@ -38,6 +38,7 @@ EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa is
   fixed_ = rtcNewScene(device_);
   moved_ = rtcNewScene(device_);
   rtcSetSceneFlags(moved_, RTC_SCENE_FLAG_DYNAMIC);
+  rtcSetSceneBuildQuality(moved_, RTC_BUILD_QUALITY_LOW);  // a tree for each geometry
   for (std::size_t i = 0; i < shading.parts().size(); ++i) {
     RTCGeometry geometry = make_geometry(i, scene.instances[shading.parts()[i].instance].T_world_instance);
     rtcAttachGeometryByID(fixed_, geometry, static_cast<unsigned>(i));
@@ -102,30 +103,36 @@ void EmbreeScene::pierce(const RTCFilterFunctionNArguments* arguments) {
   }
 }
 
-void EmbreeScene::move(std::size_t number, const Eigen::Affine3f& T_world_instance) {
-  const auto id = static_cast<unsigned>(number);
-  if (!in_moved_[number]) {
-    RTCGeometry geometry = make_geometry(number, T_world_instance);
-    rtcSetGeometryBuildQuality(geometry, RTC_BUILD_QUALITY_LOW);  // rebuilt at every move
-    rtcCommitGeometry(geometry);
-    rtcAttachGeometryByID(moved_, geometry, id);
-    rtcReleaseGeometry(geometry);
-    // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
-    rtcSetGeometryMask(rtcGetGeometry(fixed_, id), 0);
-    in_moved_[number] = true;
-  } else {
-    RTCGeometry geometry = rtcGetGeometry(moved_, id);
-    write_vertices(geometry, number, T_world_instance);
+void EmbreeScene::move(std::span<const Placed> parts) {
+  bool any_new = false;
+  for (const Placed& part : parts) {
+    if (!in_moved_[part.number]) adopt(part.number), any_new = true;
+  }
+  // Trees are built from the parts as the scene has them and fitted to every later pose, which is much faster than
+  // building and leaves pictures a function of the poses alone.
+  if (any_new) rtcCommitScene(moved_);
+  for (const Placed& part : parts) {
+    RTCGeometry geometry = rtcGetGeometry(moved_, static_cast<unsigned>(part.number));
+    write_vertices(geometry, part.number, *part.T_world_instance);
     rtcUpdateGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0);
     rtcCommitGeometry(geometry);
   }
+  if (parts.empty()) return;
+  rtcCommitScene(moved_);
   any_moved_ = true;
+  check("moving instances");
 }
 
-void EmbreeScene::commit_moved() {
-  if (!any_moved_) return;
-  rtcCommitScene(moved_);
-  check("moving instances");
+void EmbreeScene::adopt(std::size_t number) {
+  const auto id = static_cast<unsigned>(number);
+  RTCGeometry geometry = make_geometry(number, scene_.instances[shading_.parts()[number].instance].T_world_instance);
+  rtcSetGeometryBuildQuality(geometry, RTC_BUILD_QUALITY_REFIT);
+  rtcCommitGeometry(geometry);
+  rtcAttachGeometryByID(moved_, geometry, id);
+  rtcReleaseGeometry(geometry);
+  // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
+  rtcSetGeometryMask(rtcGetGeometry(fixed_, id), 0);
+  in_moved_[number] = true;
 }
 
 std::string EmbreeScene::version() const {

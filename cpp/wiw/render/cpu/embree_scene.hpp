@@ -4,6 +4,7 @@
 #include <embree3/rtcore.h>
 
 #include <memory>
+#include <span>
 #include <string>
 #include <vector>
 
@@ -22,9 +23,11 @@ class EmbreeScene {
   EmbreeScene(const EmbreeScene&) = delete;
   EmbreeScene& operator=(const EmbreeScene&) = delete;
 
-  /// Takes effect with the next commit_moved.
-  void move(std::size_t part, const Eigen::Affine3f& T_world_instance);
-  void commit_moved();
+  struct Placed {
+    std::size_t number;  // of the part
+    const Eigen::Affine3f* T_world_instance;
+  };
+  void move(std::span<const Placed> parts);
 
   [[nodiscard]] RTCScene fixed() const { return fixed_; }
   /// Null while nothing has moved.
@@ -38,6 +41,7 @@ class EmbreeScene {
   };
   static void pierce(const RTCFilterFunctionNArguments* arguments);
 
+  void adopt(std::size_t part);
   RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
   void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
   void check(const char* what) const;

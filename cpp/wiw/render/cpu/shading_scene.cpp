@@ -46,22 +46,31 @@ void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& tr
   }
 }
 
-float bulge_of(const Mesh& mesh, const Triangle& triangle, const Eigen::Affine3f& T_world_instance,
-               const Eigen::Matrix3f& to_world) {
-  std::array<Eigen::Vector3f, 3> corners;
-  std::array<Eigen::Vector3f, 3> normals;
-  for (std::size_t i = 0; i < 3; ++i) {
-    const std::uint32_t vertex = triangle[static_cast<Eigen::Index>(i)];
-    corners[i] = T_world_instance * mesh.positions[vertex];
-    normals[i] = (to_world * mesh.normals[vertex]).normalized();
-  }
-  return triangle_bulge(corners, normals);
+using Normals = std::vector<Eigen::Vector3f>;
+
+Normals normals_of(const Mesh& mesh, const Eigen::Matrix3f& linear) {
+  const Eigen::Matrix3f to_world = linear.inverse().transpose();
+  Normals normals;
+  normals.reserve(mesh.normals.size());
+  for (const Eigen::Vector3f& normal : mesh.normals) normals.push_back((to_world * normal).normalized());
+  return normals;
 }
 
-void write_normals(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f& to_world, float* out) {
-  const Eigen::Vector3f first = (to_world * mesh.normals[triangle[0]]).normalized();
-  const Eigen::Vector3f to_1 = (to_world * mesh.normals[triangle[1]]).normalized() - first;
-  const Eigen::Vector3f to_2 = (to_world * mesh.normals[triangle[2]]).normalized() - first;
+float bulge_of(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f& linear, const Normals& normals) {
+  std::array<Eigen::Vector3f, 3> corners;
+  std::array<Eigen::Vector3f, 3> at_corners;
+  for (std::size_t i = 0; i < 3; ++i) {
+    const std::uint32_t vertex = triangle[static_cast<Eigen::Index>(i)];
+    corners[i] = linear * mesh.positions[vertex];
+    at_corners[i] = normals[vertex];
+  }
+  return triangle_bulge(corners, at_corners);
+}
+
+void write_normals(const Triangle& triangle, const Normals& normals, float* out) {
+  const Eigen::Vector3f& first = normals[triangle[0]];
+  const Eigen::Vector3f to_1 = normals[triangle[1]] - first;
+  const Eigen::Vector3f to_2 = normals[triangle[2]] - first;
   for (int c = 0; c < 3; ++c) {
     out[c] = first[c];
     out[3 + c] = to_1[c];
@@ -81,6 +90,7 @@ ShadingScene::ShadingScene(const Scene& scene) : scene_(scene) {
     sun_.ambient = scene_.sun->ambient;
   }
   add_parts();
+  stretches_.resize(parts_.size());
   parallel_for(parts_.size(), [this](std::size_t i) {
     const Part& part = parts_[i];
     const Instance& instance = scene_.instances[part.instance];
@@ -153,27 +163,46 @@ const SampledTexture* ShadingScene::add_texture(std::int32_t index, TextureStore
 }
 
 void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_instance) {
+  place_texels(number, T_world_instance.linear());
   const Part& part = parts_[number];
   const Mesh& mesh = scene_.meshes[part.mesh];
+  if (part.first_detail == kNoDetail || mesh.normals.empty()) return;
+  const Normals normals = normals_of(mesh, T_world_instance.linear());
+  for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
+    write_normals(mesh.triangles[t], normals, details_[part.first_detail + t].normal);
+  }
+  if (scene_.sun) place_bulges(number, T_world_instance.linear());
+}
+
+void ShadingScene::place_texels(std::size_t number, const Eigen::Matrix3f& linear) {
+  const Part& part = parts_[number];
   const SampledTexture* texture = surfaces_[part.surface].texture;
-  const Eigen::Matrix3f normal_to_world = T_world_instance.linear().inverse().transpose();
+  if (texture == nullptr) return;
+  const Mesh& mesh = scene_.meshes[part.mesh];
+  const Eigen::Vector2f size(texture->width[0], texture->height[0]);
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
     const Triangle& triangle = mesh.triangles[t];
     TriangleRecord& record = records_[part.first_record + t];
-    if (texture != nullptr) {
-      const Eigen::Vector3f first = mesh.positions[triangle[0]];
-      const Eigen::Vector3f to_1 = T_world_instance.linear() * (mesh.positions[triangle[1]] - first);
-      const Eigen::Vector3f to_2 = T_world_instance.linear() * (mesh.positions[triangle[2]] - first);
-      const Eigen::Vector2f size(texture->width[0], texture->height[0]);
-      const Eigen::Vector2f uv_1 = size.cwiseProduct(Eigen::Vector2f(record.uv[2], record.uv[3]));
-      const Eigen::Vector2f uv_2 = size.cwiseProduct(Eigen::Vector2f(record.uv[4], record.uv[5]));
-      record.log2_density = std::log2(texel_density(to_1, to_2, uv_1, uv_2));
-    }
-    if (part.first_detail != kNoDetail && !mesh.normals.empty()) {
-      TriangleDetail& detail = details_[part.first_detail + t];
-      write_normals(mesh, triangle, normal_to_world, detail.normal);
-      if (scene_.sun) detail.bulge = bulge_of(mesh, triangle, T_world_instance, normal_to_world);
-    }
+    const Eigen::Vector3f first = mesh.positions[triangle[0]];
+    const Eigen::Vector3f to_1 = linear * (mesh.positions[triangle[1]] - first);
+    const Eigen::Vector3f to_2 = linear * (mesh.positions[triangle[2]] - first);
+    const Eigen::Vector2f uv_1 = size.cwiseProduct(Eigen::Vector2f(record.uv[2], record.uv[3]));
+    const Eigen::Vector2f uv_2 = size.cwiseProduct(Eigen::Vector2f(record.uv[4], record.uv[5]));
+    record.log2_density = std::log2(texel_density(to_1, to_2, uv_1, uv_2));
+  }
+}
+
+void ShadingScene::place_bulges(std::size_t number, const Eigen::Matrix3f& linear) {
+  // A turn changes no bulge: all turned poses share the one of the mesh as it is, to the last bit.
+  const Eigen::Matrix3f stretch = linear.isUnitary(1e-4f) ? Eigen::Matrix3f::Identity() : linear;
+  std::optional<Eigen::Matrix3f>& last = stretches_[number];
+  if (last == stretch) return;
+  last = stretch;
+  const Part& part = parts_[number];
+  const Mesh& mesh = scene_.meshes[part.mesh];
+  const Normals normals = normals_of(mesh, stretch);
+  for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
+    details_[part.first_detail + t].bulge = bulge_of(mesh, mesh.triangles[t], stretch, normals);
   }
 }
 

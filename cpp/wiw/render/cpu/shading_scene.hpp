@@ -2,6 +2,7 @@
 #pragma once
 
 #include <map>
+#include <optional>
 #include <span>
 #include <tuple>
 #include <vector>
@@ -39,6 +40,8 @@ class ShadingScene {
   std::uint32_t add_surface(const Mesh& mesh);
   const SampledTexture* add_texture(std::int32_t index, TextureStore::Edge edge);
   void add_parts();
+  void place_texels(std::size_t part, const Eigen::Matrix3f& linear);
+  void place_bulges(std::size_t part, const Eigen::Matrix3f& linear);
 
   const Scene& scene_;
   Sunlight sun_{};  // if the scene has one
@@ -49,6 +52,7 @@ class ShadingScene {
   std::vector<std::uint32_t> first_record_;  // by part
   std::vector<TriangleRecord> records_;
   std::vector<TriangleDetail> details_;
+  std::vector<std::optional<Eigen::Matrix3f>> stretches_;  // by part: what its bulges are of
 };
 
 }  // namespace wiw::cpu
