@@ -63,10 +63,11 @@ def collect(
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}
     _begin(folder, config)
-    jobs = [
+    paths = zip(*(shard_paths(folder, config, task) for task in names), strict=True)
+    jobs = [  # in turn, so that what a stopped collection has is of all tasks alike
         _Job(task, shard_range(number, collection.episodes), path, collection)
-        for task in names
-        for number, path in enumerate(shard_paths(folder, config, task))
+        for number, each in enumerate(paths)
+        for task, path in zip(names, each, strict=True)
     ]
     tally = _Tally(collection.episodes, names, progress)
     before = {job: job.failed_before() for job in jobs}
