@@ -18,6 +18,7 @@ from wiw.evaluation.evaluate import evaluate, resume_run
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 from wiw.evaluation.runlog import load_run
 from wiw.evaluation.store import RunStore
+from wiw.render import resolve_backend
 from wiw.tasks.manipulation import KINDS, Manipulation
 
 POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
@@ -103,7 +104,6 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
     ("flags", "said"),
     [
         (["--scenes", "apartments:val"], "scenes: this is for tasks in which an agent walks"),
-        (["--backend", "cpu"], "backend: this is for"),
         (["--motion", "slide"], "motion: this is for"),
         (["--per-scene", "2"], "per_scene: this is for"),
         (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: this is for"),
@@ -146,3 +146,8 @@ def test_gymnasium_knows_the_task() -> None:
     assert {*observation} == {"front", "pose"} and "cup" in info["instruction"]
     assert env.unwrapped.task.tasks == ("stack_cups",) and [*KINDS] == list(Manipulation().tasks)
     assert np.ptp(observation["front"]) > 100
+
+
+def test_a_run_says_which_renderer_drew_it() -> None:
+    assert Manipulation(backend="cpu").describe()["backend"] == "cpu"
+    assert Manipulation.portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}

@@ -228,3 +228,18 @@ def test_cameras_tell_where_points_are_in_their_pictures(size: tuple[int, int]) 
         rows, columns = np.nonzero(ids == ids[row, column])
         assert len(rows) < 400, "no ball is there"
         np.testing.assert_allclose([columns.mean() + 0.5, rows.mean() + 0.5], at, atol=0.7)
+
+
+def test_ids_in_pictures_have_names(bench: Workbench) -> None:
+    ids = bench.picture("front", (60, 60), ("instance",))["instance"]
+    seen = {bench.names[number - 1] for number in np.unique(ids)}
+    assert {"table", "arm", "red", "green"} <= seen <= {"table", "floor", "wall", "arm", "red", "green"}
+
+
+def test_the_wrist_camera_goes_with_the_arm(bench: Workbench) -> None:
+    before, fixed = bench.camera_pose("wrist"), bench.camera_pose("front")
+    here = bench.pose
+    bench.go(np.add(here, [0.05, 0, 0, 0, 0, 0, 0]))
+    np.testing.assert_allclose(bench.camera_pose("wrist")[:3, 3] - before[:3, 3], bench.pose[:3] - here[:3], atol=1e-3)
+    np.testing.assert_array_equal(bench.camera_pose("front"), fixed)
+    assert bench.joints.shape == (9,) and (np.abs(bench.joints[:7]) < 4).all()

@@ -40,7 +40,7 @@ class View:
 def keep_scene_maps(store: RunStore, task: Any) -> None:
     """Draws the scenes of the episodes that keep pictures, where the task's scenes can be drawn."""
     built = task.build()
-    if not hasattr(built, "backend"):
+    if not hasattr(built, "scenes"):
         return
     from wiw.datasets.worlds import world
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,9 +56,9 @@ class Setup:
     objects: tuple[str, ...] = ()
     """Names of what a policy is told the place of, by their index from 1."""
 
-    def bench(self) -> Workbench:
-        """The table with everything on it, at rest."""
-        bench = Workbench(self.things)
+    def bench(self, backend: Literal["auto", "cpu", "gpu"] = "auto") -> Workbench:
+        """The table with everything on it, at rest, its pictures drawn by a renderer."""
+        bench = Workbench(self.things, backend)
         for name, force in self.springs.items():
             bench.set_spring(name, force)
         bench.settle(60)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -136,12 +136,13 @@ class Workbench:
 
     Args:
         things: what stands on the table, and where: poses [4, 4].
+        backend: renderer, "auto", "cpu" or "gpu".
 
     Raises:
         ArgumentError: two things of one name, or impossible shapes or numbers.
     """
 
-    def __init__(self, things: Sequence[tuple[Thing, Pose]]) -> None:
+    def __init__(self, things: Sequence[tuple[Thing, Pose]], backend: Literal["auto", "cpu", "gpu"] = "auto") -> None:
         self.things = {thing.name: thing for thing, _ in things}
         if len(self.things) < len(things):
             raise ArgumentError(f"Workbench: expected a name for each thing, got {[t.name for t, _ in things]}")
@@ -162,7 +163,7 @@ class Workbench:
         self._world.set_joint_positions(PANDA_READY, self._arm)
         self._buttons = tuple(thing.name for thing, _ in things if thing.lamp is not None)
         self._pressed: tuple[str, ...] = ()
-        self._pictures = _Pictures(self)
+        self._pictures = _Pictures(self, backend)
 
     def fork(self, state: WorldState | None = None) -> Workbench:
         """The same state apart, to be run ahead; pictures are drawn with the same renderer.
@@ -190,6 +191,11 @@ class Workbench:
         tip = self._world.link_poses(self._arm)[panda().link_index(PANDA_TCP)]
         angles = Rotation.from_matrix(tip[:3, :3]).as_euler("xyz")
         return np.array([*tip[:3, 3], *angles, Gripper(self._world, self._arm).opening])
+
+    @property
+    def joints(self) -> NDArray[np.float64]:
+        """float64 [9]: positions of the arm's seven joints and the two fingers."""
+        return self._world.joint_positions(self._arm)
 
     @property
     def held(self) -> str | None:
@@ -300,10 +306,27 @@ class Workbench:
         Raises:
             ArgumentError: no such camera.
         """
+        found = self._pictures.taken(self, self.camera_pose(camera), CAMERAS[camera].hfov_deg, size, outputs, arm)
+        return {name: image[0] for name, image in found.items()}
+
+    def camera_pose(self, camera: str) -> Pose:
+        """Where a camera is now, [4, 4]: it looks along -z with +y up.
+
+        Raises:
+            ArgumentError: no such camera.
+        """
         if camera not in CAMERAS:
             raise ArgumentError(f"picture: expected a camera among {', '.join(CAMERAS)}, got {camera!r}")
-        found = self._pictures.taken(self, CAMERAS[camera], size, outputs, arm)
-        return {name: image[0] for name, image in found.items()}
+        found = CAMERAS[camera]
+        return self.link_pose(found.link) @ found.pose if found.link else found.pose
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the ids in pictures stand for, from 1: things, "arm", and what the room has ("table", "floor", "wall").
+
+        One that is made of several parts has several ids.
+        """
+        return self._pictures.names
 
     def fronts_after(self, poses: ArrayLike, size: tuple[int, int]) -> NDArray[np.uint8]:
         """uint8 [K, H, W, 3]: the front camera's view after each of the poses [K, 7], gone to one after another."""
@@ -341,7 +364,7 @@ class Workbench:
 class _Pictures:
     """The scene of a workbench and its renderer, which all its forks draw with."""
 
-    def __init__(self, bench: Workbench) -> None:
+    def __init__(self, bench: Workbench, backend: Literal["auto", "cpu", "gpu"]) -> None:
         meshes: list[dict[str, Any]] = []
         materials: list[dict[str, Any]] = []
 
@@ -366,10 +389,17 @@ class _Pictures:
         for _, mesh in looks_of(panda()):
             add(mesh, _PAINTED, next(poses), "arm")
         scene = Scene.from_arrays(meshes, name="workbench", materials=materials, sun=SUN)
-        self._renderer = Renderer(scene, samples=4)
+        self.names = tuple(mesh["name"] for mesh in meshes)
+        self._renderer = Renderer(scene, backend, samples=4)
 
     def taken(
-        self, bench: Workbench, camera: Camera, size: tuple[int, int], outputs: Sequence[Output], arm: bool
+        self,
+        bench: Workbench,
+        camera: Pose,
+        hfov_deg: float,
+        size: tuple[int, int],
+        outputs: Sequence[Output],
+        arm: bool,
     ) -> dict[str, NDArray[Any]]:
         """A batch of one picture of a state."""
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
@@ -377,10 +407,7 @@ class _Pictures:
             moved[-len(looks_of(panda())) :, 1, 3] -= FAR_BELOW
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
         self._renderer.core.set_poses(ids, moved.astype(np.float32))
-        pose = camera.pose
-        if camera.link:
-            pose = bench.link_pose(camera.link) @ pose
-        return self._renderer.perspective(Y_UP @ pose, size, camera.hfov_deg, outputs=outputs)
+        return self._renderer.perspective(Y_UP @ camera, size, hfov_deg, outputs=outputs)
 
 
 _PAINTED: Colour = (1.0, 1.0, 1.0)

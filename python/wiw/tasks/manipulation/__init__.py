@@ -3,19 +3,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
+from wiw.render import resolve_backend
 from wiw.tabletop.kind import Kind, Setup, key_of
 from wiw.tabletop.kinds import KINDS
 from wiw.tasks import presets
 from wiw.types import Episode, Goal, Wording
 
-WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "backend", "motion")
+WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
 
 
@@ -46,6 +47,7 @@ class Manipulation:
         tasks: "all", or names of `KINDS`; episodes take them in turn.
         seed: of the episodes and of the run.
         preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
+        backend: renderer, "auto", "cpu" or "gpu".
     """
 
     name = "manipulation"
@@ -57,6 +59,7 @@ class Manipulation:
         tasks: str | Sequence[str] = "all",
         seed: int = 0,
         preset: str | Path = presets.DEFAULT,
+        backend: Literal["auto", "cpu", "gpu"] = "auto",
         **rules: Any,
     ) -> None:
         if walking := [name for name in rules if name in WALKING]:
@@ -64,13 +67,15 @@ class Manipulation:
                 f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
                 "tables are set by `tasks` and `seed`"
             )
-        self.tasks, self.seed = _named(tasks), seed
+        self.tasks, self.seed, self.backend = _named(tasks), seed, backend
         self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
 
     @staticmethod
     def portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """The same options, with a preset's path that means the same in any folder."""
-        return {name: presets.absolute(value) if name == "preset" else value for name, value in options.items()}
+        """The same options, with a preset's path that means the same in any folder and the renderer of "auto"."""
+        ways: dict[str, Callable[[Any], str]] = {"preset": presets.absolute, "backend": resolve_backend}
+        given = {"backend": "auto", **options}
+        return {name: ways[name](value) if name in ways else value for name, value in given.items()}
 
     @property
     def actions(self) -> int:
@@ -89,7 +94,10 @@ class Manipulation:
 
     def describe(self) -> dict[str, Any]:
         """JSON-able identity: what must be equal for two runs to be comparable."""
-        return {"task": self.name, "tasks": list(self.tasks), "seed": self.seed, **asdict(self.rules)}
+        backend = resolve_backend(self.backend)
+        return {
+            "task": self.name, "tasks": list(self.tasks), "seed": self.seed, "backend": backend, **asdict(self.rules)
+        }  # fmt: skip
 
     def environment(self, depth: bool = False) -> ManipulationEnv:
         """An environment for the task's episodes."""
@@ -111,7 +119,7 @@ class Manipulation:
     def table(self, episode: Episode) -> Table:
         """An episode's table, at rest."""
         kind = KINDS[episode.info["task"]]
-        return Table(kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])))
+        return Table(kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend)
 
 
 def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
@@ -133,9 +141,9 @@ def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
 class Table:
     """One episode's table in the course of time."""
 
-    def __init__(self, kind: Kind, setup: Setup) -> None:
+    def __init__(self, kind: Kind, setup: Setup, backend: Literal["auto", "cpu", "gpu"] = "auto") -> None:
         self.kind, self.setup = kind, setup
-        self.bench = setup.bench()
+        self.bench = setup.bench(backend)
         self.goal = Goal(Manipulation.name, text=setup.instruction)
         self.objects = setup.objects
 
