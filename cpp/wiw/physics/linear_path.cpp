@@ -63,7 +63,10 @@ LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_w
   const int count = segments(from, to, options);
   IkOptions near = options.ik;
   near.restarts = 0;
-  LinearPath path{.joints = {world.joint_positions(articulation)}, .moved = ik.joints(), .waypoints = count + 1};
+  const JointLimits& limits = world.articulation(articulation)->limits();
+  // A motor that pushes against a limit leaves its joint some millionths beyond, where no target may be.
+  const Eigen::VectorXd start = world.joint_positions(articulation).cwiseMax(limits.lower).cwiseMin(limits.upper);
+  LinearPath path{.joints = {start}, .moved = ik.joints(), .waypoints = count + 1};
   for (int i = 1; i <= count; ++i) {
     const IkResult next = ik.solve(between(from, to, static_cast<double>(i) / count), path.joints.back(), near);
     path.reason = to_path_reason(next.reason);
