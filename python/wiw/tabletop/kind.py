@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.errors import ArgumentError
 from wiw.tabletop.workbench import TABLE, Pose, Thing, Workbench
+from wiw.types import ArmObservation
 
 PALETTE: Mapping[str, tuple[float, float, float]] = {
     "red": (0.85, 0.12, 0.12),
@@ -42,6 +44,9 @@ DOWN = (np.pi, 0.0, 0.0)
 REACH = ((0.02, -0.28), (0.32, 0.28))
 """Least and greatest x and y of where things are put, within easy reach of the arm."""
 
+GRASPED = (0.02, 0.5)
+"""How open a gripper is that has shut on a wall of something, between shut on nothing and not shut."""
+
 
 @dataclass(frozen=True)
 class Setup:
@@ -69,6 +74,8 @@ class Kind(ABC):
     """One manipulation task."""
 
     name: str
+    noun: str
+    """What its instructions speak of, and those of no other kind."""
     variations: int
     """How many combinations of colours, numbers and targets there are."""
 
@@ -81,8 +88,49 @@ class Kind(ABC):
         """Whether what the instruction asks for is done."""
 
     @abstractmethod
-    def expert(self, places: Mapping[str, Pose], target: Any) -> NDArray[np.float64]:
-        """float64 [K, 7]: actions that bring about a target (of any setup), by one who knows where objects are."""
+    def say(self, target: Any, wording: int = 0) -> str:
+        """An instruction that asks for a target."""
+
+    def target_of(self, text: str) -> Any:
+        """The target that an instruction asks for: the one colour that it names.
+
+        Raises:
+            ArgumentError: it names none, or several.
+        """
+        found = colours_in(text)
+        if len(found) != 1:
+            raise ArgumentError(f"{self.name}: expected an instruction that names one colour, got {text!r}")
+        return found[0]
+
+    @abstractmethod
+    def alternatives(self, objects: Sequence[str], target: Any) -> list[Any]:
+        """What might be asked for instead with the same objects."""
+
+    def left(self, seen: ArmObservation, target: Any) -> Any:
+        """What remains to be done of a target as things stand; None where nothing is left, or nothing helps."""
+        return target
+
+    @abstractmethod
+    def expert(
+        self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """float64 [K, 7]: actions that bring about a target (of any setup), by one who knows where objects are.
+
+        `hand` is where the gripper is, float64 [7], to go on from there with what it holds; None: high up and empty.
+        """
+
+    @abstractmethod
+    def looks_done(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
+        """How much a front view, uint8 [H, W, 3] of any size, looks as if a target were reached, from 0 to 1.
+
+        It may be imagined and blurred; what is on the way to the target lies between. `places` are those before the
+        plan whose end is looked at.
+        """
+
+
+def colours_in(text: str) -> list[str]:
+    """Colours by the names of `PALETTE`, in the order in which a text names them."""
+    return [word for word in re.findall("[a-z]+", text.lower()) if word in PALETTE]
 
 
 def key_of(seed: int, variation: int, purpose: int) -> int:
@@ -116,3 +164,18 @@ def chosen(key: int, names: Sequence[str], count: int) -> list[str]:
 def above(x: float, y: float, height: float, gripper: float, yaw: float = 0.0) -> list[float]:
     """An action: the hand points down, its finger tips so many metres above the table."""
     return [x, y, TABLE + height, DOWN[0], DOWN[1], yaw, gripper]
+
+
+def raised(hand: NDArray[np.float64] | None, height: float, gripper: float) -> list[list[float]]:
+    """No action, or one where the hand is lower than so many metres above the table: straight up."""
+    if hand is None or hand[2] > TABLE + height - 0.02:
+        return []
+    return [[float(hand[0]), float(hand[1]), TABLE + height, *map(float, hand[3:6]), gripper]]
+
+
+def holds(hand: NDArray[np.float64] | None, thing: Pose) -> bool:
+    """Whether a thing is in the gripper, as far as that can be told from where both are and how far it is shut."""
+    if hand is None or not GRASPED[0] < hand[6] < GRASPED[1]:
+        return False
+    off = hand[:3] - thing[:3, 3]
+    return bool(np.linalg.norm(off[:2]) < 0.05 and -0.02 < off[2] < 0.08)

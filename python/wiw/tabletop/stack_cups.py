@@ -3,15 +3,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from itertools import pairwise, permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.physics import ConvexHull, place
-from wiw.tabletop.kind import PALETTE, Kind, Setup, above, chosen, key_of, scattered
+from wiw.tabletop.colours import alike_at
+from wiw.tabletop.kind import PALETTE, Kind, Setup, above, chosen, holds, key_of, raised, scattered
 from wiw.tabletop.workbench import TABLE, Pose, Thing, Workbench
 
 CUPS = 3
@@ -21,6 +22,16 @@ WALL, FLOOR = 0.004, 0.006
 """Metres."""
 GRIP = TALL - 0.022
 """Metres above the table at which a cup is held by its wall."""
+CARRY = TALL + 0.13
+"""Metres above the table of the finger tips while a cup is carried."""
+RIM = LOW + (HIGH - LOW) * GRIP / TALL - WALL / 2
+"""Metres from a cup's middle to that of its wall where it is held."""
+RISE = 0.025
+"""Metres by which a cup stands higher in another once it has come to rest."""
+SURE, HUNG = 0.4, 0.6
+"""Likeness of what is seen of a cup that is enough; what a cup counts that hangs over the target."""
+SHIFTS = np.array([(x, y, 0.0) for x in (-0.015, 0.0, 0.015) for y in (-0.015, 0.0, 0.015)])
+"""Metres by which the target may have been pushed where it is looked for."""
 NEST = 0.035
 """Metres that a cup stands higher in another, at most."""
 SIDES = 8
@@ -38,6 +49,7 @@ class StackCups(Kind):
     """Three tapered cups."""
 
     name = "stack_cups"
+    noun = "cup"
     variations = 20
 
     def setup(self, seed: int, variation: int) -> Setup:
@@ -48,8 +60,15 @@ class StackCups(Kind):
             (Thing(colour, tuple(_cup()), PALETTE[colour], mass=0.06, friction=0.4), place(x, y, TABLE))
             for colour, (x, y) in zip(colours, places, strict=True)
         )
-        instruction = PHRASES[variation % len(PHRASES)].format(colours[0])
-        return Setup(things, instruction, colours[0], objects=tuple(colours))
+        return Setup(things, self.say(colours[0], variation), colours[0], objects=tuple(colours))
+
+    def say(self, target: Any, wording: int = 0) -> str:
+        """E.g. "stack the other cups on top of the green cup"."""
+        return PHRASES[wording % len(PHRASES)].format(target)
+
+    def alternatives(self, objects: Sequence[str], target: Any) -> list[Any]:
+        """The other cups as a base."""
+        return [name for name in objects if name != target]
 
     def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The others stand upright in the target, and nothing is held."""
@@ -61,23 +80,61 @@ class StackCups(Kind):
         )
         return bool(inside and bench.held is None and base[2, 2] > 0.95)
 
-    def expert(self, places: Mapping[str, Pose], target: Any) -> NDArray[np.float64]:
-        """Each by its rim, over the target, down, and let go."""
-        rim = LOW + (HIGH - LOW) * GRIP / TALL - WALL / 2
-        u, v = places[target][:2, 3] + (0, rim)
-        plan = []
-        for level, name in enumerate((name for name in places if name != target), 1):
-            x, y = places[name][:2, 3] + (0, rim)
-            carry = TALL + 0.13
-            plan += [
-                above(x, y, carry, 1),
-                above(x, y, GRIP, 0),
-                above(x, y, carry, 0),
-                above(u, v, carry, 0),
-                above(u, v, GRIP + level * NEST + 0.01, 1),
-                above(u, v, carry, 1),
-            ]
+    def expert(
+        self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Each by its rim, over the target, down, and let go; what is in it already stays."""
+        base = places[target]
+        others = [name for name in places if name != target]
+        todo = [name for name in others if not _inside(places[name], base)]
+        todo.sort(key=lambda name: (not holds(hand, places[name]), -places[name][2, 3]))
+        plan = [] if todo and holds(hand, places[todo[0]]) else raised(hand, CARRY, 1)
+        for level, name in enumerate(todo, len(others) - len(todo) + 1):
+            cup, grip = places[name], np.array([0, RIM])
+            if not plan and hand is not None and holds(hand, cup):
+                grip = hand[:2] - cup[:2, 3]
+                plan += raised(hand, CARRY, 0)
+            else:
+                x, y = cup[:2, 3] + grip
+                plan += [above(x, y, h, g) for h, g in ((CARRY, 1), (cup[2, 3] - TABLE + GRIP, 0), (CARRY, 0))]
+            u, v = base[:2, 3] + grip
+            plan += [above(u, v, h, g) for h, g in ((CARRY, 0), (GRIP + level * NEST + 0.01, 1), (CARRY, 1))]
         return np.array(plan)
+
+    def looks_done(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
+        """The others' colours are seen stacked above the target's rim, in any order; less where one hangs over it.
+
+        The target may have been pushed a little.
+        """
+        base = places[target][:3, 3]
+        others = [name for name in places if name != target]
+        return max(_stacked(front, base + shift, target, others) for shift in SHIFTS)
+
+
+def _stacked(front: NDArray[np.uint8], base: NDArray[np.float64], target: str, others: Sequence[str]) -> float:
+    """The same with the target at a place [3]."""
+    stands = min(1.0, alike_at(front, base + _WALL, PALETTE[target]) / SURE)
+    levels = [_RIM + base + np.array([0, 0, level * RISE]) for level in range(1, len(others) + 1)]
+    seen = {name: [min(1.0, alike_at(front, rim, PALETTE[name]) / SURE) for rim in levels] for name in others}
+    over = _WALL + base + np.array([0, 0, CARRY - GRIP])
+    hung = {name: HUNG * alike_at(front, over, PALETTE[name]) for name in others}
+    best = max(
+        sum(max(seen[name][level], hung[name]) for level, name in enumerate(order)) for order in permutations(others)
+    )
+    return (0.5 + 0.5 * stands) * best / len(others)
+
+
+def _inside(cup: Pose, base: Pose) -> bool:
+    """Whether a cup stands in another."""
+    off = cup[:3, 3] - base[:3, 3]
+    return bool(np.linalg.norm(off[:2]) < 0.015 and 0.01 < off[2] < CUPS * RISE + 0.01)
+
+
+def _outside(heights: Sequence[float]) -> NDArray[np.float64]:
+    """[N, 3]: points on the front of a cup's wall at some heights, from the middle of its bottom."""
+    angle, height = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.1, 1.1, 13), heights))
+    radius = LOW + (HIGH - LOW) * height / TALL
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
 
 
 def _cup() -> list[tuple[ConvexHull, Pose]]:
@@ -95,3 +152,6 @@ def _cup() -> list[tuple[ConvexHull, Pose]]:
         parts.append((ConvexHull(np.array(points)), np.eye(4)))
     floor = [[*(direction * (LOW - WALL / 2)), height] for direction in corner[:-1] for height in (0.0, FLOOR)]
     return [*parts, (ConvexHull(np.array(floor)), np.eye(4))]
+
+
+_RIM, _WALL = _outside([TALL - 0.019, TALL - 0.012, TALL - 0.006]), _outside([0.015, 0.03, 0.045])

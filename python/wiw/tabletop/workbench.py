@@ -31,6 +31,8 @@ TABLE = 0.75
 """Metres from the floor to the table's top, which is about that of RLBench."""
 TOP = (1.1, 1.4, 0.05)
 """Metres of the table's top."""
+WOOD: Colour = (0.78, 0.69, 0.57)
+"""The table's colour."""
 BASE = place(x=-0.35, z=TABLE)
 """Where the arm stands; the middle of the table's top lies half a metre in front of it."""
 MIDDLE = place(x=0.15, z=TABLE - TOP[2] / 2)
@@ -416,7 +418,7 @@ _LEG = Box((0.05, 0.05, TABLE - TOP[2]))
 _ROOM: list[tuple[str, Any, Colour, Pose]] = [
     ("floor", Box((12, 12, 0.02)), (0.5, 0.52, 0.55), place(z=-0.01)),
     ("wall", Box((0.02, 12, 3)), (0.9, 0.92, 0.93), place(x=-1.2, z=1.5)),
-    ("table", Box(TOP), (0.78, 0.69, 0.57), MIDDLE),
+    ("table", Box(TOP), WOOD, MIDDLE),
     *(
         ("table", _LEG, (0.6, 0.52, 0.43), place(x=x, y=y, z=(TABLE - TOP[2]) / 2))
         for x in (-0.35, 0.65)

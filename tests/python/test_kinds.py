@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What kinds of manipulation task know for a policy: reading, other targets, going on, and how being done looks."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from wiw.errors import ArgumentError
+from wiw.tabletop.kind import holds
+from wiw.tabletop.kinds import KINDS, kind_of
+from wiw.tabletop.workbench import Workbench
+from wiw.types import ArmObservation
+
+
+def seen(bench: Workbench, objects) -> ArmObservation:
+    return ArmObservation(bench.picture()["color"], bench.pose, None, bench.places(objects))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_instructions_are_read_as_they_are_meant(name: str) -> None:
+    kind = KINDS[name]
+    for variation in range(kind.variations):
+        setup = kind.setup(variation, variation)
+        assert kind_of(setup.instruction) is kind
+        assert kind.target_of(setup.instruction) == setup.target
+        others = kind.alternatives(setup.objects, setup.target)
+        assert others and setup.target not in others
+        for other in others:
+            assert kind.target_of(kind.say(other, variation)) == other
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("bring me the tea", "about one of button, block, ring, cup"), ("put the ring into the blue cup", "about one of")],
+)
+def test_instructions_about_nothing_here_are_refused(text: str, said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        kind_of(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("push_buttons", "push the button", "1 to 3 colours"),
+        ("push_buttons", "push the red button, then the red one", "1 to 3 colours"),
+        ("stack_cups", "stack the red cup on the blue cup", "names one colour"),
+        ("slide_block", "slide the block", "names one colour"),
+    ],
+)
+def test_unreadable_targets_are_refused(name: str, text: str, said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        KINDS[name].target_of(text)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_being_done_is_seen_also_blurred_and_small(name: str) -> None:
+    """Every end that is right looks more like it than every end that is not."""
+    kind = KINDS[name]
+    right, wrong = [], []
+    for seed in (40, 41):
+        setup = kind.setup(seed, seed)
+        for target in (setup.target, kind.alternatives(setup.objects, setup.target)[0]):
+            bench = setup.bench()
+            places = bench.places(setup.objects)
+            for pose in kind.expert(places, target):
+                bench.go(pose)
+            assert kind.succeeded(bench, setup) is (target == setup.target)
+            front = bench.picture()["color"]
+            small = cv2.GaussianBlur(cv2.resize(front, (240, 240), interpolation=cv2.INTER_AREA), (0, 0), 1.0)
+            scores = [kind.looks_done(view, places, setup.target) for view in (front, small)]
+            assert all(0 <= score <= 1 for score in scores)
+            (right if target == setup.target else wrong).extend(scores)
+    assert min(right) > max(wrong) + 0.2 and min(right) > 0.5
+
+
+@pytest.mark.parametrize(("name", "cut"), [("push_buttons", 5), ("insert_peg", 3), ("stack_cups", 5), ("stack_cups", 9)])
+def test_experts_go_on_from_where_things_stand(name: str, cut: int) -> None:
+    kind = KINDS[name]
+    setup = kind.setup(40, 41)
+    bench = setup.bench()
+    whole = kind.expert(bench.places(setup.objects), setup.target)
+    for pose in whole[:cut]:
+        bench.go(pose)
+    assert not kind.succeeded(bench, setup)
+    now = seen(bench, setup.objects)
+    rest = kind.expert(now.places, kind.left(now, setup.target), now.pose)
+    assert len(rest) <= len(whole) - cut + 1
+    for pose in rest:
+        bench.go(pose)
+    assert kind.succeeded(bench, setup)
+
+
+def test_what_is_left_of_a_row_of_buttons_shows() -> None:
+    kind = KINDS["push_buttons"]
+    setup = kind.setup(40, 41)
+    assert len(setup.target) == 3
+    bench = setup.bench()
+    first, *rest = setup.target
+    assert kind.left(seen(bench, setup.objects), setup.target) == setup.target
+    for pose in kind.expert(bench.places(setup.objects), (first,)):
+        bench.go(pose)
+    now = seen(bench, setup.objects)
+    assert kind.left(now, setup.target) == tuple(rest)
+    assert kind.left(now, (first,)) is None
+    assert kind.left(now, (rest[0], first)) is None
+
+
+def test_what_is_held_is_told_by_the_fingers() -> None:
+    ring = np.eye(4)
+    hand = np.array([0.0, 0.035, 0.0, np.pi, 0, 0, 0.17])
+    assert holds(hand, ring)
+    assert not holds(None, ring)
+    assert not holds(hand * [1, 1, 1, 1, 1, 1, 0], ring)
+    assert not holds(hand + [0, 0.05, 0, 0, 0, 0, 0], ring)
+    assert not holds(hand + [0, 0, 0, 0, 0, 0, 0.8], ring)
