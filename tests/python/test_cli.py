@@ -37,6 +37,7 @@ def test_help_teaches_by_examples(capsys):
         ([], "75 stopped by SIGTERM"),
         (["scenes"], "apartments:val:4"),
         (["demo"], "oracle, the ceiling"),
+        (["collect"], "--out demos --workers 4"),
         (["episodes"], "--out val.json.gz"),
     ):
         with pytest.raises(SystemExit) as stop:
