@@ -40,7 +40,7 @@ from wiw.training.demonstrate import FIRST_SEED, end_frames, table_seed
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs wiw[export]")
 
-SMALL: dict[str, Any] = {"episodes": 1, "size": 64, "frames": 16, "seed": 5}
+SMALL: dict[str, Any] = {"episodes": 1, "size": 64, "frames": 16, "seed": 5, "backend": "cpu"}
 TASKS = ("slide_block", "push_buttons", "insert_peg")
 
 
@@ -65,7 +65,7 @@ def test_a_demonstration_is_what_happens_at_its_table(collected: Path, task: str
     (each,) = Demonstrations(collected, task)
     kind = KINDS[task]
     setup = kind.setup(each.seed, each.variation)
-    bench = setup.bench()
+    bench = setup.bench("cpu")
     assert each.task == task and each.instruction == setup.instruction and each.success
     for name, pose in bench.places(setup.objects).items():
         np.testing.assert_array_equal(each.places[name], pose)
@@ -277,6 +277,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     out = tmp_path / "demos"
     arguments = ["collect", "manipulation", "--tasks", "slide_block", "--episodes", "1", "--frames", "16"]
     assert main([*arguments, "--size", "64", "--out", str(out)]) == 0
+    assert json.loads((out / "manifest.json").read_text())["backend"] in ("cpu", "gpu")
     printed = capsys.readouterr()
     assert "1 demonstrations of 16 frames" in printed.out and "failed at 0 tables" in printed.out
     assert "slide_block: 1/1 demonstrations" in printed.err
@@ -295,6 +296,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
         ({"size": 8}, "16 to 4096"),
         ({"frames": 15}, "over 15 frames"),
         ({"format": "webp"}, "among jpeg, png, got webp"),
+        ({"backend": "metal"}, "backend among auto, cpu, gpu, got metal"),
         ({"workers": 0}, "1 worker or more"),
         ({"tasks": "juggle"}, "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
         ({"tasks": ["slide_block"] * 2}, "different ones"),

@@ -23,6 +23,7 @@ def collect(
     format: Literal["jpeg", "png"] = "jpeg",
     depth: bool = False,
     keep_failed: bool = False,
+    backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
     """Collects demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
@@ -46,14 +47,16 @@ def collect(
         format: Of the pictures: jpeg of quality 95, or png without loss.
         depth: Writes the front view's depth too.
         keep_failed: Keeps demonstrations that fail, too; else another table takes the place of theirs.
+        backend: Renderer; pictures differ a little between them.
         workers: Processes; the files are the same for any number of them.
     """
     from wiw.training.collect import collect
 
     began = time.monotonic()
-    asked = {"episodes": episodes, "seed": seed, "size": size, "frames": frames, "format": format, "depth": depth}
+    what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
+    how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
     with _Bars() as bars:
-        made = collect(out, tasks, workers=workers, progress=bars, keep_failed=keep_failed, **asked)
+        made = collect(out, tasks, workers=workers, progress=bars, **what_of_it, **how_seen)
     megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
     failed = sum(made.failed.values())
     print(

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -26,6 +26,7 @@ import wiw
 from wiw.datasets import shards
 from wiw.datasets.demonstrations import MANIFEST, Demonstrations, read_manifest, shard_paths, shard_range
 from wiw.errors import ArgumentError, FileError, InfrastructureError
+from wiw.render import resolve_backend
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.workbench import CAMERAS
 from wiw.training.demonstrate import Collection, demonstrated
@@ -49,9 +50,11 @@ def collect(
         tasks: "all", or names of `wiw.tabletop.kinds.KINDS`.
         workers: processes; the files are the same for any number of them.
         progress: told whenever a file is done.
-        **asked: episodes, seed, size, frames, format, depth, keep_failed; see `wiw.training.demonstrate.Collection`.
+        **asked: episodes, seed, size, frames, format, depth, keep_failed, backend, as in
+            `wiw.training.demonstrate.Collection`.
 
     Raises:
+        BackendError: the renderer that is asked for does not work here.
         DependencyError: pyarrow is not installed.
         ArgumentError: something that cannot be collected, or another collection in the folder.
         FileError: the folder cannot be written.
@@ -59,6 +62,7 @@ def collect(
     """
     shards.require_pyarrow()
     collection, folder, names = Collection(**asked), Path(out), _named(tasks)
+    collection = replace(collection, backend=resolve_backend(collection.backend))
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from wiw.render import Output
 from wiw.tabletop.kind import Kind, Setup
 from wiw.tabletop.workbench import Film, Workbench
 
+Backend = Literal["auto", "cpu", "gpu"]
 POSES = 15
 """That an expert may go to, as in an episode of the evaluation."""
 ATTEMPTS = 20
@@ -44,6 +45,8 @@ class Collection:
     depth: bool = False
     keep_failed: bool = False
     """Whether a demonstration that fails is kept as such; else another table takes the place of its own."""
+    backend: Backend = "auto"
+    """Renderer; pictures differ a little between them."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.seed < 0:
@@ -54,8 +57,9 @@ class Collection:
             raise ArgumentError(
                 f"collect: expected over {POSES} frames, so that there is one for each action's end, got {self.frames}"
             )
-        if self.format not in get_args(Format):
-            raise ArgumentError(f"collect: expected a format among {', '.join(get_args(Format))}, got {self.format}")
+        for name, given, known in (("format", self.format, Format), ("backend", self.backend, Backend)):
+            if given not in get_args(known):
+                raise ArgumentError(f"collect: expected a {name} among {', '.join(get_args(known))}, got {given}")
 
 
 def demonstrated(kind: Kind, episode: int, collection: Collection) -> tuple[Demonstration, int]:
@@ -67,7 +71,8 @@ def demonstrated(kind: Kind, episode: int, collection: Collection) -> tuple[Demo
     variation = episode % kind.variations
     for attempt in range(ATTEMPTS):
         seed = table_seed(collection.seed, episode, attempt)
-        played = _Played(kind, kind.setup(seed, variation))
+        setup = kind.setup(seed, variation)
+        played = _Played(kind, setup, setup.bench(collection.backend))
         if played.success or collection.keep_failed:
             named = {"task": kind.name, "variation": variation, "seed": seed, "episode": episode}
             return played.demonstration(collection, named), attempt + (not played.success)
@@ -85,8 +90,7 @@ def table_seed(seed: int, episode: int, attempt: int) -> int:
 class _Played:
     """What an expert did at a table, every physics step of it."""
 
-    def __init__(self, kind: Kind, setup: Setup) -> None:
-        bench = setup.bench()
+    def __init__(self, kind: Kind, setup: Setup, bench: Workbench) -> None:
         self._setup, self._start = setup, bench.fork()
         self._actions: list[NDArray[np.float64]] = []
         self._films: list[Film] = []
