@@ -18,6 +18,9 @@ void bind_core(py::module_& module) {
       "num_threads", [] { return wiw::ThreadPool::shared().size(); },
       "Threads of the shared pool (the machine's cores, or WIW_NUM_THREADS).");
   module.def(
+      "run_inline", [] { wiw::run_inline(); },
+      "From now on the calling thread does all its work itself: for one of as many threads as there are cores.");
+  module.def(
       "fold_key", [](const std::vector<std::uint64_t>& parts) { return wiw::fold_key(std::span(parts)); },
       py::arg("parts"), "Mixes integers, e.g. (run seed, episode, decision, candidate), into one uint64 key.");
   module.def(

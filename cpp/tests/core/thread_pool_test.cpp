@@ -7,6 +7,7 @@
 #include <unistd.h>
 
 #include <atomic>
+#include <chrono>
 #include <fstream>
 #include <stdexcept>
 #include <thread>
@@ -87,4 +88,19 @@ TEST_CASE("callers from several threads take turns") {
   }
   for (auto& caller : callers) caller.join();
   CHECK(total == 4 * 200 * 8);
+}
+
+TEST_CASE("a thread may do without the others") {
+  ThreadPool pool(3);
+  std::atomic<int> elsewhere{0};
+  std::thread alone([&] {
+    wiw::run_inline();
+    const std::thread::id own = std::this_thread::get_id();
+    pool.parallel_for(20, [&](std::size_t) {
+      std::this_thread::sleep_for(std::chrono::milliseconds(1));
+      if (std::this_thread::get_id() != own) ++elsewhere;
+    });
+  });
+  alone.join();
+  CHECK(elsewhere == 0);
 }

@@ -113,6 +113,8 @@ ThreadPool& ThreadPool::shared() {
   return pool;
 }
 
+void run_inline() { inside_job = true; }
+
 void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body) {
   ThreadPool::shared().parallel_for(count, body);
 }

@@ -43,6 +43,10 @@ class ThreadPool {
   std::vector<std::thread> workers_;
 };
 
+/// From now on what the calling thread asks of any pool runs inline: for a thread that is one of as many as there are
+/// cores, each with work of its own.
+void run_inline();
+
 /// Shorthand for ThreadPool::shared().parallel_for.
 void parallel_for(std::size_t count, const std::function<void(std::size_t)>& body);
 
