@@ -294,12 +294,14 @@ def policy(name: Any, **options: Any) -> Any:
 def make(task_id: str, depth: bool = True, **options: Any) -> Any:
     """A gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
 
-    Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it.
+    Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it. What else an
+    environment of the task can be given to observe may be among the options (`cameras`, ... of `Manipulation-v0`).
 
     Raises:
         RegistryError: unknown task, or options that do not fit; the message says what is known.
     """
-    return _task(task_id, options).environment(depth=depth)
+    task, own = _task(task_id, options)
+    return task.environment(depth=depth, **own)
 
 
 def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) -> Any:
@@ -309,11 +311,16 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
         RegistryError: unknown task, or options that do not fit; the message says what is known.
         ArgumentError: `num_envs` below 1.
     """
-    return _task(task_id, options).vector_environment(num_envs, depth=depth)
+    task, own = _task(task_id, options)
+    return task.vector_environment(num_envs, depth=depth, **own)
 
 
-def _task(task_id: str, options: dict[str, Any]) -> Any:
-    return TASKS.make(task_name(task_id), **options)
+def _task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+    """The task, and those of the options that are its environments'."""
+    name = task_name(task_id)
+    senses = getattr(TASKS.find(name), "senses", ())
+    task = TASKS.make(name, **{key: value for key, value in options.items() if key not in senses})
+    return task, {key: value for key, value in options.items() if key in senses}
 
 
 def task_name(task_id: str) -> str:

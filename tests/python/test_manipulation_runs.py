@@ -143,7 +143,7 @@ def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypat
 def test_gymnasium_knows_the_task() -> None:
     env = wiw.make("Manipulation-v0", tasks=["stack_cups"], seed=4, depth=False)
     observation, info = env.reset(options={"episode": 1})
-    assert {*observation} == {"front", "pose"} and "cup" in info["instruction"]
+    assert {*observation} == {"front", "pose", "joints", "held"} and "cup" in info["instruction"]
     assert env.unwrapped.task.tasks == ("stack_cups",) and [*KINDS] == list(Manipulation().tasks)
     assert np.ptp(observation["front"]) > 100
 

@@ -12,13 +12,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from wiw.action import PoseGrid
+from wiw.envs.sensors import Sensors
 from wiw.errors import ArgumentError
-from wiw.render import Output
 from wiw.tabletop.workbench import Pose, Workbench
 from wiw.types import ArmObservation, Episode, Goal, Key, Truth
 
-SIZE = (480, 480)
-"""Pixels of the front view."""
+LEAST, MOST = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7.0] * 3 + [1.0])
+"""Poses between these are in the action space; none beyond can be reached."""
 
 
 class Table(Protocol):
@@ -78,27 +79,47 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
     """An arm at a table that is told in words what to do.
 
     Actions are absolute poses float64 [7] of the gripper: x, y, z in metres, roll, pitch, yaw, and how open it is. A
-    way that leads into the table or out of reach is gone as far as it is free, and recorded. Observations are dicts:
-    "front" uint8 [480, 480, 3], "pose" float64 [7], "depth" float32 [480, 480] where asked for. The reward is 1 on
-    success.
+    way that leads into the table or out of reach is gone as far as it is free, and recorded. Success is rewarded by 1.
+
+    Observations are dicts: "front" uint8 [size, size, 3]; "pose" float64 [7], "joints" float64 [9] (the arm's, then the
+    fingers') and "held" (1 while the gripper holds something). What is asked for comes on top, by each camera.
+
+    Args:
+        task: whose episodes are run.
+        depth: whether to give "depth" float32 [size, size]: planar metres, 0 where nothing is hit.
+        size: pixels of a side of all pictures; policies and world models of the loop see the front view in it too.
+        cameras: "wrist", "left_shoulder", "right_shoulder"; theirs are "wrist", "wrist_depth", "wrist_ids".
+        ids: whether to give "ids" uint8 [size, size]: 0 room, 255 arm, else the object's number in `info["objects"]`,
+            from 1.
+        cloud: whether to give "points" float32 [N, 3] and "colors" uint8 [N, 3] of all cameras' pixels, in the world's
+            frame; where nothing is hit, a point is at its camera.
+        grid: whether `step` takes whole numbers [7], as `wiw.action.PoseGrid` reads them, instead of poses.
+
+    Raises:
+        ArgumentError: no such camera, or a size below 1.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
 
-    def __init__(self, task: ManipulationTask, depth: bool = False) -> None:
-        self.task, self.depth = task, depth
+    def __init__(
+        self,
+        task: ManipulationTask,
+        depth: bool = False,
+        *,
+        size: int = 480,
+        cameras: Sequence[str] = (),
+        ids: bool = False,
+        cloud: bool = False,
+        grid: bool = False,
+    ) -> None:
+        self.task, self.sensors = task, Sensors(size, tuple(cameras), depth, ids, cloud)
+        self.grid = PoseGrid() if grid else None
         self.render_mode = "rgb_array"
-        least, most = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7.0] * 3 + [1.0])
-        self.action_space = spaces.Box(least, most, dtype=np.float64)
-        seen: dict[str, Any] = {
-            "front": spaces.Box(0, 255, (*SIZE, 3), np.uint8),
-            "pose": spaces.Box(-np.inf, np.inf, (7,), np.float64),
-        }
-        if depth:
-            seen["depth"] = spaces.Box(0, np.inf, SIZE, np.float32)
-        self.observation_space = spaces.Dict(seen)
+        self.action_space = action_space(self.grid)
+        self.observation_space = self.sensors.space()
         self._table: Table | None = None
         self._observation: ArmObservation | None = None
+        self._front: dict[str, NDArray[Any]] = {}
         self._taken = self._decisions = self._next = 0
         self._refused: list[str] = []
         self._key = Key(task.seed, 0)
@@ -113,21 +134,24 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         index = (options or {}).get("episode")
         if index is None:
             index = int(self.np_random.integers(1000)) if seed is not None else self._next
-        observation = self.begin(self.task.episode(int(index)))
+        self.begin(self.task.episode(int(index)))
         self._next, self._key = int(index) + 1, Key(self.task.seed, int(index))
-        return observation.as_dict(), {"key": self._key, "instruction": self.goal.text}
+        info = {"key": self._key, "instruction": self.goal.text, "objects": tuple(self.table.objects)}
+        return self._sensed(), info
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Goes to one pose, which is a decision of its own.
 
         Raises:
-            ArgumentError: no finite pose [7] with a gripper from 0 to 1; nothing has moved then.
+            ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; nothing
+                has moved then.
         """
-        segment = self.run(np.asarray(action, np.float64)[None])
+        pose = np.asarray(action, np.float64) if self.grid is None else self.grid.decode(action)
+        segment = self.run(pose[None])
         info: dict[str, Any] = {"key": segment.key, "refused": segment.refused}
         if segment.terminated or segment.truncated:
             info["result"] = self.result()
-        return segment.observation.as_dict(), float(segment.terminated), segment.terminated, segment.truncated, info
+        return self._sensed(), float(segment.terminated), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
         """The front view."""
@@ -143,10 +167,14 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return self._observe()
 
     def run(self, plan: ArrayLike) -> Segment:
-        """Carries out one decision's poses [K, 7], as far as the episode goes on; observes once, at the end."""
-        table, executed, refused = self.table, [], []
+        """Carries out one decision's poses [K, 7], as far as the episode goes on; observes once, at the end.
+
+        Raises:
+            ArgumentError: as `checked`; nothing has moved then.
+        """
+        table, poses, executed, refused = self.table, checked(plan), [], []
         path = [table.bench.pose[:3]]
-        for pose in np.asarray(plan, np.float64)[: self.task.actions - self._taken]:
+        for pose in poses[: self.task.actions - self._taken]:
             move = table.bench.go(pose)
             executed.append(pose)
             path.append(table.bench.pose[:3])
@@ -204,12 +232,42 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
 
     def _observe(self) -> ArmObservation:
         bench = self.table.bench
-        outputs: tuple[Output, ...] = ("color", "depth") if self.depth else ("color",)
-        seen = bench.picture("front", SIZE, outputs)
+        self._front = self.sensors.pictures(bench)
+        depth = self._front["depth"] if self.sensors.depth else None
         places: dict[str, Pose] = bench.places(self.table.objects)
-        self._observation = ArmObservation(seen["color"], bench.pose, seen.get("depth"), places)
+        self._observation = ArmObservation(self._front["color"], bench.pose, depth, places)
         return self._observation
+
+    def _sensed(self) -> dict[str, Any]:
+        """The observation as gymnasium knows it, with what the loop has no use for."""
+        return self.sensors.read(self.table.bench, self.table.objects, self._front)
 
     def _require_episode(self) -> None:
         if self._table is None:
             raise ArgumentError("the environment has no episode yet; call reset() first")
+
+
+def action_space(grid: PoseGrid | None) -> spaces.Space[Any]:
+    """Poses, or whole numbers that a grid reads."""
+    if grid is None:
+        return spaces.Box(LEAST, MOST, dtype=np.float64)
+    return spaces.MultiDiscrete([grid.bins] * 3 + [grid.turns] * 3 + [2])
+
+
+def checked(plan: ArrayLike) -> NDArray[np.float64]:
+    """A plan as poses float64 [K, 7].
+
+    Raises:
+        ArgumentError: another shape, a value that is not finite, or a gripper outside [0, 1].
+    """
+    poses = np.asarray(plan, np.float64)
+    if poses.ndim != 2 or poses.shape[1] != 7 or not len(poses):
+        raise ArgumentError(f"run: expected poses [K, 7], got {list(poses.shape)}")
+    finite, open_by = np.isfinite(poses).all(axis=1), poses[:, 6]
+    wrong = np.flatnonzero(~finite | ~((open_by >= 0) & (open_by <= 1)))
+    if len(wrong):
+        number = int(wrong[0])
+        raise ArgumentError(
+            f"run: expected finite poses with a gripper from 0 to 1, got {poses[number].tolist()} as number {number}"
+        )
+    return poses

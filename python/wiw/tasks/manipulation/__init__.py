@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from wiw.envs.manipulation import ManipulationEnv
+from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.errors import ArgumentError
 from wiw.render import resolve_backend
 from wiw.tabletop.kind import Kind, Setup, key_of
@@ -52,6 +53,8 @@ class Manipulation:
 
     name = "manipulation"
     metrics = ("success", "mean_trajectory")
+    senses = ("size", "cameras", "ids", "cloud", "grid")
+    """Options of `wiw.make` that are the environment's."""
     wording = Wording(succeeded="did what it was told", won="done", lost="not done", goal="what is left", asked="Told")
 
     def __init__(
@@ -99,9 +102,13 @@ class Manipulation:
             "task": self.name, "tasks": list(self.tasks), "seed": self.seed, "backend": backend, **asdict(self.rules)
         }  # fmt: skip
 
-    def environment(self, depth: bool = False) -> ManipulationEnv:
-        """An environment for the task's episodes."""
-        return ManipulationEnv(self, depth)
+    def environment(self, depth: bool = False, **sensors: Any) -> ManipulationEnv:
+        """An environment for the task's episodes; `ManipulationEnv` documents what it can be given to sense."""
+        return ManipulationEnv(self, depth, **sensors)
+
+    def vector_environment(self, num_envs: int, depth: bool = False, **sensors: Any) -> ManipulationVectorEnv:
+        """A gymnasium vector environment of this task, with `num_envs` tables at a time."""
+        return ManipulationVectorEnv(self, num_envs, depth, **sensors)
 
     def episodes(self, count: int) -> list[Episode]:
         """The first so many."""

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a manipulator can be given to see and feel, as gymnasium knows it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.render import Output
+from wiw.tabletop.cloud import points_of
+from wiw.tabletop.workbench import CAMERAS, Workbench
+
+ROOM, ARM = 0, 255
+"""Ids of what is no object; those are numbered from 1."""
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """Cameras and what they give; all of them have pictures of one size.
+
+    The front camera is always among them and its names are bare ("front", "depth", "ids"); another's are "wrist",
+    "wrist_depth", "wrist_ids".
+    """
+
+    size: int = 480
+    """Pixels of a side."""
+    cameras: tuple[str, ...] = ()
+    """Besides the front one, names of `wiw.tabletop.workbench.CAMERAS`."""
+    depth: bool = False
+    ids: bool = False
+    cloud: bool = False
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.cameras if name not in CAMERAS]:
+            raise ArgumentError(f"cameras: expected some of {', '.join(CAMERAS)}, got {', '.join(unknown)}")
+        if self.size < 1:
+            raise ArgumentError(f"size: expected at least one pixel, got {self.size}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the cameras, the front one first."""
+        return tuple(dict.fromkeys(["front", *self.cameras]))
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """What is drawn for each camera."""
+        depth: tuple[Output, ...] = ("depth",) if self.depth or self.cloud else ()
+        return ("color", *depth, *(("instance",) if self.ids else ()))
+
+    def space(self) -> spaces.Dict:
+        """Of observations."""
+        shape = (self.size, self.size)
+        count = len(self.names) * self.size**2
+        seen: dict[str, spaces.Space[Any]] = {
+            "pose": spaces.Box(-np.inf, np.inf, (7,), np.float64),
+            "joints": spaces.Box(-np.inf, np.inf, (9,), np.float64),
+            "held": spaces.Discrete(2),
+        }
+        for name in self.names:
+            seen[name] = spaces.Box(0, 255, (*shape, 3), np.uint8)
+            if self.depth:
+                seen[_key(name, "depth")] = spaces.Box(0, np.inf, shape, np.float32)
+            if self.ids:
+                seen[_key(name, "ids")] = spaces.Box(0, 255, shape, np.uint8)
+        if self.cloud:
+            seen["points"] = spaces.Box(-np.inf, np.inf, (count, 3), np.float32)
+            seen["colors"] = spaces.Box(0, 255, (count, 3), np.uint8)
+        return spaces.Dict(seen)
+
+    def pictures(self, bench: Workbench, camera: str = "front") -> dict[str, NDArray[Any]]:
+        """What one camera gives: those of "color", "depth" and "instance" that are asked for."""
+        return bench.picture(camera, (self.size, self.size), self.outputs)
+
+    def read(
+        self, bench: Workbench, objects: Sequence[str], front: dict[str, NDArray[Any]] | None = None
+    ) -> dict[str, Any]:
+        """An observation in `space`.
+
+        Args:
+            bench: what is looked at.
+            objects: names of what has an id of its own, from 1 on.
+            front: the front camera's `pictures`, where they are drawn already.
+        """
+        drawn = {name: self.pictures(bench, name) for name in self.names if front is None or name != "front"}
+        if front is not None:
+            drawn = {"front": front, **drawn}
+        values: dict[str, Any] = {"pose": bench.pose, "joints": bench.joints, "held": np.int64(bench.held is not None)}
+        for name, images in drawn.items():
+            values[name] = images["color"]
+            if self.depth:
+                values[_key(name, "depth")] = images["depth"]
+            if self.ids:
+                values[_key(name, "ids")] = _numbers(bench, objects)[images["instance"]]
+        if self.cloud:
+            clouds = [
+                points_of(images["depth"], CAMERAS[name].hfov_deg, bench.camera_pose(name)).reshape(-1, 3)
+                for name, images in drawn.items()
+            ]
+            values["points"] = np.concatenate(clouds)
+            values["colors"] = np.concatenate([images["color"].reshape(-1, 3) for images in drawn.values()])
+        return values
+
+
+def _key(camera: str, what: str) -> str:
+    return what if camera == "front" else f"{camera}_{what}"
+
+
+def _numbers(bench: Workbench, objects: Sequence[str]) -> NDArray[np.uint8]:
+    """By instance id, the number that observations have for it."""
+    known = {"arm": ARM, **{name: number for number, name in enumerate(objects, start=1)}}
+    return np.array([ROOM, *(known.get(name, ROOM) for name in bench.names)], np.uint8)
