@@ -41,8 +41,10 @@ REPEATED = ("task", "instruction", "places")
 
 
 def require_pyarrow() -> None:
-    """Raises:
-    DependencyError: pyarrow is not installed.
+    """Sees that files can be read and written.
+
+    Raises:
+        DependencyError: pyarrow is not installed.
     """
     from importlib.util import find_spec
 
@@ -106,8 +108,10 @@ class Shard:
         return int(self._metadata.num_row_groups)
 
     def __getitem__(self, index: int) -> Demonstration:
-        """Raises:
-        FileError: the file is damaged.
+        """A demonstration, whose pictures are not yet decoded.
+
+        Raises:
+            FileError: the file is damaged.
         """
         from pyarrow import ArrowException, parquet
 
