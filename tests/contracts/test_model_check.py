@@ -128,7 +128,7 @@ BROKEN = {
     "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
     "memory": (reusing(), {}, "An answer lies in the memory of the one before"),
     "needs": (dark, {"needs": ("history",)}, "needs history, but a model can be given"),
-    "needs, poses": (dark, {"space": "pose7"}, "plans in discrete primitives"),
+    "needs, poses": (dark, {"space": "pose7"}, "poses of a gripper move none"),
 }
 
 
@@ -152,6 +152,53 @@ def test_each_breach_is_found_and_told(name, two_rooms):
 def test_an_honest_model_is_left_in_peace(declared, two_rooms):
     assert found(spoilt(lambda *_: None, **declared), two_rooms) == {}
     assert found(Honest, two_rooms) == {}
+
+
+GRIPPER = {"control": "action", "space": "pose7", "view": "perspective", "size": (48, 48), "best_batch": 4}
+
+
+class Arm(wiw.WorldModel):
+    """Darkens the image by where the gripper goes."""
+
+    accepts = wiw.accepts(**GRIPPER, causal=True)
+
+    def rollout(self, observations, controls, seeds):
+        frames = np.repeat(observations.image[:, None], len(controls[0].ids), 1)
+        for row, control in enumerate(controls):
+            way = np.abs(control.ids[1:, :3] - control.ids[0, :3]).sum(1) + self.later(control.ids)
+            frames[row, 1:] = frames[row, 1:] // 2 + (50 * way).astype(np.uint8)[:, None, None, None]
+        return frames
+
+    def later(self, poses):
+        return 0
+
+
+class Foreseeing(Arm):
+    def later(self, poses):
+        return poses[-1, :3] @ (1, 2, 1)
+
+
+@pytest.mark.parametrize("declared", [{}, {"frames": 5}, {"frames": 14}, {"best_batch": 1}, {"needs": ("depth",)}])
+def test_models_of_grippers_are_asked_about_poses(declared):
+    class Asked(Arm):
+        accepts = wiw.accepts(**{**GRIPPER, "causal": True, **declared})
+
+    assert found(Asked, "nowhere") == {}
+    findings = found(type("Ahead", (Foreseeing,), {"accepts": Asked.accepts}), "nowhere")
+    assert set(findings) == {"causal"} and "a changed action change with it" in str(findings["causal"])
+
+
+def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
+    from wiw.evaluation import model_check
+
+    class Blind(Arm):
+        def rollout(self, observations, controls, seeds):
+            return np.repeat(observations.image[:, None], len(controls[0].ids), 1)
+
+    monkeypatch.setattr(model_check, "LONG_RUN", 0.0)
+    findings = found(Blind, "nowhere")
+    assert set(findings) == {"plan", "slow"} and not any(finding.serious for finding in findings.values())
+    assert "200 episodes of manipulation asks for about 3000 of them" in str(findings["slow"])
 
 
 def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):

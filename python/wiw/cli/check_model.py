@@ -31,7 +31,8 @@ def check_model(
     Args:
         model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        scenes: Where the observations come from: apartments:val:1, a mesh, or a Gazebo world.
+        scenes: Where the observations come from: apartments:val:1, a mesh, or a Gazebo world. Those of models that take
+            poses of a gripper come from the tables of manipulation.
         deadline: Most seconds for a call of the model, as in `wiw run`.
     """
     from rich.console import Console

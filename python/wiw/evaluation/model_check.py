@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 import sysconfig
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -21,18 +21,38 @@ from wiw.evaluation.questions import Frames, Questions, Row
 from wiw.loop.attempts import DEADLINE, LateError
 from wiw.loop.contract import check_model as check_needs
 from wiw.registry import world_model
+from wiw.types import Control, Space
 from wiw.world_models.base import WorldModel
 
-PLANS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
+PRIMITIVES = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
 """No leading turns, which the loop makes itself. The first two begin alike, for models that say they are causal."""
+
+
+def _poses(*places: tuple[float, float, float]) -> tuple[tuple[float, ...], ...]:
+    """With the hand down, open, and shut at the last."""
+    return tuple((*place, np.pi, 0.0, 0.0, float(i + 1 < len(places))) for i, place in enumerate(places))
+
+
+POSES = (
+    _poses((0.1, 0.0, 1.05), (0.15, 0.05, 1.0), (0.2, 0.15, 0.95), (0.2, 0.2, 0.85)),
+    _poses((0.1, 0.0, 1.05), (0.15, 0.05, 1.0), (0.2, -0.1, 0.95), (0.2, -0.2, 0.85)),
+    _poses((0.2, 0.0, 1.1), (0.25, 0.0, 1.05), (0.3, 0.0, 1.0), (0.3, 0.0, 0.95)),
+)
+"""Likewise of a gripper, over the table."""
+PLANS: Mapping[Space, Any] = {"discrete": PRIMITIVES, "pose7": POSES}
+LENGTH = 4
+"""Actions of each."""
 ALIKE = 2
-"""Primitives with which they begin."""
+"""Actions with which the first two begin."""
 SHORT = 2
-"""Primitives of a second length, for models that take any."""
+"""Actions of a second length, for models that take any."""
 NOISE = 8
 """Levels of 255 up to which a difference may come of the order in which a GPU adds up."""
-ROWS_OF_A_RUN = 100 * 20 * 3
-"""Episodes, decisions and plans of the paper's ImageNav, roughly."""
+RUNS: Mapping[Space, tuple[str, int]] = {
+    "discrete": ("100 episodes of ImageNav", 100 * 20 * 3),
+    "pose7": ("200 episodes of manipulation", 200 * 3 * 5),
+}
+"""The paper's, in words, and the rows that it asks for: episodes, decisions and plans, roughly."""
 LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
 """Folders of code that is nobody's own model."""
 LONG_RUN = 24.0
@@ -69,7 +89,7 @@ def check_model(
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
-        scenes: where the observations come from.
+        scenes: where the observations come from; of a model that takes poses, from the tables of manipulation.
         deadline: seconds that a call may take, after which it is not asked any more.
         options: what the model is made with.
 
@@ -89,7 +109,7 @@ def check_model(
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
-        check_needs(made, len(PLANS[0]), semantics=True)
+        check_needs(made, LENGTH, made.accepts.space, semantics=True)
     except ArgumentError as error:
         return [Finding("needs", f"{error}.")]
     return list(_Check(made, str(scenes), deadline).findings())
@@ -100,6 +120,7 @@ class _Check:
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float) -> None:
         self.model, self.accepts, self.deadline = model, model.accepts, deadline
+        self.plans = PLANS[self.accepts.space]
         self.asking = Questions(model, scenes, deadline)
         self.row_seconds = 0.0
 
@@ -122,8 +143,8 @@ class _Check:
         yield from self._speed()
 
     def _answers(self) -> Iterator[Finding]:
-        steps = min(len(PLANS[0]), self.accepts.frames - 1 if self.accepts.frames else len(PLANS[0]))
-        rows = self.asking.rows([plan[:steps] for plan in PLANS])
+        steps = min(LENGTH, self.accepts.frames - 1 if self.accepts.frames else LENGTH)
+        rows = self.asking.rows([plan[:steps] for plan in self.plans])
         self.asking.ask(rows[:1])  # the first call may load and compile
         frames = self.asking.ask(rows)
         self.row_seconds = self.asking.row_seconds
@@ -136,7 +157,7 @@ class _Check:
         yield from self._plan(rows, frames, steps)
         yield from self._inputs()
         if not self.accepts.frames:
-            self.asking.ask(self.asking.rows([plan[:SHORT] for plan in PLANS]))
+            self.asking.ask(self.asking.rows([plan[:SHORT] for plan in self.plans]))
 
     def _first_frames(self, rows: Sequence[Row], frames: Frames) -> Iterator[Finding]:
         off = np.abs(frames[:, 0].astype(np.int16) - np.stack([row.image for row in rows]))
@@ -178,8 +199,7 @@ class _Check:
         alike = [
             (one, other)
             for one, other in _pairs(rows)
-            if len(one.control.actions) >= len(PLANS[0])
-            and np.array_equal(one.control.actions[:ALIKE], other.control.actions[:ALIKE])
+            if len(one.control.actions) >= LENGTH and _begin_alike(one.control, other.control)
         ]
         if not self.accepts.causal or not alike:
             return
@@ -189,7 +209,7 @@ class _Check:
         if off.any():
             yield _differing(
                 "causal",
-                f"It declares causal=True, but frames before a changed primitive change with it, by up to {off.max()} "
+                f"It declares causal=True, but frames before a changed action change with it, by up to {off.max()} "
                 "of 255; plans that begin alike would share frames that are not theirs. Declare causal=False.",
                 off,
             )
@@ -230,15 +250,23 @@ class _Check:
                 yield Finding("fingerprint", f"It declares cacheable=True, but: {_told(error)}.")
 
     def _speed(self) -> Iterator[Finding]:
-        hours = self.row_seconds * ROWS_OF_A_RUN / 3600
+        run, rows = RUNS[self.accepts.space]
+        hours = self.row_seconds * rows / 3600
         if hours > LONG_RUN:
             yield Finding(
                 "slow",
-                f"A row takes {self.row_seconds:.3g} s. A run of 100 episodes of ImageNav asks for about "
-                f"{ROWS_OF_A_RUN} of them: {hours:.0f} hours. Fewer denoising steps, a larger best_batch or `wiw "
+                f"A row takes {self.row_seconds:.3g} s. A run of {run} asks for about {rows} of them: "
+                f"{hours:.0f} hours. Fewer denoising steps, a larger best_batch or `wiw "
                 "serve` on a faster machine make it shorter; --cache asks nothing twice.",
                 serious=False,
             )
+
+
+def _begin_alike(one: Control, other: Control) -> bool:
+    """Whether two plans have their first actions in common: primitives, or poses after that of the observation."""
+    if one.ids is None or other.ids is None or len(one.ids) == len(one.actions):
+        return np.array_equal(one.actions[:ALIKE], other.actions[:ALIKE])
+    return np.array_equal(one.ids[: 1 + ALIKE], other.ids[: 1 + ALIKE])
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:

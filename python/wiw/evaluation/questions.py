@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wiw.loop.agent import Query
 from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.clock import Clock
-from wiw.loop.imagine import imagine
+from wiw.loop.imagine_poses import IMAGINE
 from wiw.policies.base import FrameSpec
 from wiw.registry import TASKS
 from wiw.types import Conditioning, Control, Key, Proposal
@@ -42,8 +42,8 @@ class Questions:
     """What the loop would ask a model in the first moments of some episodes.
 
     Args:
-        model: who is asked.
-        scenes: where the episodes are.
+        model: who is asked: about primitives in scenes, or, if it takes poses, about poses at a table.
+        scenes: where the episodes with primitives are.
         deadline: seconds that a call may take.
 
     Raises:
@@ -52,7 +52,8 @@ class Questions:
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
         self._model, self._attempts = model, Attempts(model, deadline)
-        self._queries = _queries(scenes)
+        self._space = model.accepts.space
+        self._queries = _at_tables() if self._space == "pose7" else _in_scenes(scenes)
         self.row_seconds = 0.0
         """What a row took in the last call."""
         self.changed: set[str] = set()
@@ -62,11 +63,11 @@ class Questions:
         self._latest: Frames | None = None
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
-        """The rows of these plans of primitives, in each episode."""
+        """The rows of these plans, of primitives or poses, in each episode."""
         recorder = _Recorder(self._model)
-        proposals = [[Proposal(np.array(plan, np.int8)) for plan in plans] for _ in self._queries]
+        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._queries]
         origins = [range(len(plans)) for _ in proposals]
-        imagine(recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        IMAGINE[self._space](recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
         return [
             Row(
                 observations.image[place],
@@ -132,12 +133,23 @@ class _Recorder(Attempts):
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
 
 
-def _queries(scenes: str) -> list[Query]:
-    """The first moments of some episodes."""
+def _in_scenes(scenes: str) -> list[Query]:
+    """The first moments of some episodes of an agent that walks."""
     task = TASKS.make("imagenav", scenes=scenes)
     queries = []
     for index in range(EPISODES):
         env = task.environment(depth=True)
         observation = env.begin(task.episode(index))
         queries.append(Query(observation, env.goal, Key(0, index), env.fork(), semantic=env.semantic()))
+    return queries
+
+
+def _at_tables() -> list[Query]:
+    """The first moments of some episodes of an arm."""
+    task = TASKS.make("manipulation")
+    queries = []
+    for index in range(EPISODES):
+        env = task.environment(depth=True)
+        observation = env.begin(task.episode(index))
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
     return queries
