@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,18 @@ def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WIW_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def franka_urdf() -> Path:
+    """The maker's description of the Panda with its meshes: `WIW_PANDA_URDF`, or package example-robot-data."""
+    if named := os.environ.get("WIW_PANDA_URDF"):
+        return Path(named)
+    try:
+        files = metadata.files("example-robot-data") or []
+    except metadata.PackageNotFoundError:
+        pytest.skip("needs example-robot-data, or WIW_PANDA_URDF")
+    return Path(next(file for file in files if str(file).endswith("panda_description/urdf/panda.urdf")).locate())
 
 
 @pytest.fixture(scope="session")

@@ -5,10 +5,13 @@
 #include <pybind11/stl.h>
 #include <pybind11/stl/filesystem.h>
 
+#include <set>
+
 #include "arrays.hpp"
 #include "physics_arrays.hpp"
 #include "wiw/physics/articulation.hpp"
 #include "wiw/physics/inverse_kinematics.hpp"
+#include "wiw/physics/mesh_file.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -38,6 +41,50 @@ py::list visuals(const Articulation& articulation) {
       each["color"] = visual.color;
       all.append(each);
     }
+  }
+  return all;
+}
+
+template <class Row>
+py::array rows(const std::vector<Row>& values) {
+  using Number = typename Row::Scalar;
+  py::array_t<Number> array({static_cast<py::ssize_t>(values.size()), py::ssize_t{Row::RowsAtCompileTime}});
+  Number* out = array.mutable_data();
+  for (const Row& row : values) out = std::copy(row.begin(), row.end(), out);
+  return array;
+}
+
+py::dict read_surface(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+  const Surface surface = [&] {
+    const py::gil_scoped_release release;
+    return surface_of_file(path, scale, link);
+  }();
+  py::dict all;
+  all["positions"] = rows(surface.positions);
+  all["normals"] = rows(surface.normals);
+  all["colors"] = rows(surface.colors);
+  all["triangles"] = rows(surface.triangles);
+  return all;
+}
+
+std::vector<std::filesystem::path> mesh_files(const Articulation& articulation) {
+  std::set<std::filesystem::path> files;
+  for (const Link& link : articulation.links()) files.insert(link.meshes.begin(), link.meshes.end());
+  return {files.begin(), files.end()};
+}
+
+py::list tree(const Articulation& articulation) {
+  py::list all;
+  for (std::size_t i = 0; i < articulation.joints().size(); ++i) {
+    const Joint& joint = articulation.joints()[i];
+    const bool slides = joint.type == JointType::kPrismatic;
+    py::dict each;
+    each["name"] = joint.name;
+    each["type"] = joint.type == JointType::kFixed ? "fixed" : slides ? "prismatic" : "revolute";
+    each["parent"] = articulation.links()[static_cast<std::size_t>(joint.parent)].name;
+    each["child"] = articulation.links()[i + 1].name;
+    each["mimics"] = joint.mimic ? articulation.movable_joints()[static_cast<std::size_t>(joint.mimic->index)] : "";
+    all.append(each);
   }
   return all;
 }
@@ -97,7 +144,8 @@ void bind_physics_articulation(py::module_& module) {
   py::class_<Articulation, std::shared_ptr<Articulation>>(module, "Articulation", R"(A tree of links on a fixed base.
 
 Read from a URDF: kinematics, inertias, limits, collision shapes (meshes as their convex hulls) and looks. Joints are
-fixed, revolute, continuous or prismatic; `mimic`, damping and friction are not read. Link 0 is the base. Immutable; may be
+fixed, revolute, continuous or prismatic; the motor of a joint with `mimic` follows the target of the one it names. Damping
+and friction are not read: motors set velocities. Link 0 is the base. Immutable; may be
 shared between worlds and threads.)")
       .def(py::init([](const std::filesystem::path& path) {
              return std::const_pointer_cast<Articulation>(Articulation::load(path));
@@ -117,6 +165,9 @@ shared between worlds and threads.)")
       .def_property_readonly("links", &link_names, "Names, parents before their children.")
       .def_property_readonly("joints", &Articulation::movable_joints, "Names of the movable joints.")
       .def_property_readonly("dof", &Articulation::dof, "Number of movable joints.")
+      .def_property_readonly("tree", &tree,
+                             "All joints as dicts of name, type ('fixed', 'revolute' or 'prismatic'), parent and child "
+                             "(names of links) and mimics (a joint's name, or '').")
       .def_property_readonly("limits", &limits,
                              "dict of float64 [dof]: lower, upper (radians or metres), velocity, effort (Nm or N).")
       .def_property_readonly(
@@ -132,6 +183,7 @@ shared between worlds and threads.)")
       .def_property_readonly("visuals", &visuals,
                              "What the links look like: dicts of link (index), shape or mesh (path) with scale, "
                              "T_link_visual [4, 4] and color (RGBA).")
+      .def_property_readonly("meshes", &mesh_files, "Paths of all mesh files of shapes and looks, sorted.")
       .def("link_index", &Articulation::link_index, py::arg("name"))
       .def("joint_index", &Articulation::joint_index, py::arg("name"))
       .def(
@@ -148,5 +200,10 @@ shared between worlds and threads.)")
           py::arg("positions"), py::arg("link"),
           "float64 [6, dof]: linear above angular velocity of the link's origin, in the base frame, by joint "
           "velocity.");
+  module.def("read_surface", &read_surface, py::arg("path"), py::kw_only(),
+             py::arg("scale") = Eigen::Vector3d::Ones().eval(), py::arg("link") = "",
+             "What a mesh file (STL, OBJ, DAE, ...) shows, in its own axes, scaled: dict of positions float32 [V, 3], "
+             "normals float32 [V, 3], triangles uint32 [T, 3], and colors float32 [V, 4] of its materials, alpha 0 "
+             "where they say nothing; textures are not read. FileError names file and link.");
   bind_kinematics(module);
 }

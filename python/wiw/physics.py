@@ -42,6 +42,7 @@ from wiw._core.physics import (
     Sphere,
     World,
     WorldState,
+    read_surface,
 )
 
 __all__ = [
@@ -63,6 +64,7 @@ __all__ = [
     "WorldState",
     "panda",
     "place",
+    "read_surface",
 ]
 
 PANDA_TCP = "panda_hand_tcp"

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from concurrent.futures import ThreadPoolExecutor
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
@@ -358,13 +357,8 @@ def test_meshes_are_read_as_their_hulls(tmp_path: Path) -> None:
         Articulation(folder / "urdf/r.urdf")
 
 
-def test_the_real_description_is_the_same_arm() -> None:
-    try:
-        files = metadata.files("example-robot-data") or []
-    except metadata.PackageNotFoundError:
-        pytest.skip("needs example-robot-data")
-    path = next(file for file in files if str(file).endswith("panda_description/urdf/panda.urdf"))
-    real, rng = Articulation(path.locate()), np.random.default_rng(0)
+def test_the_real_description_is_the_same_arm(franka_urdf: Path) -> None:
+    real, rng = Articulation(franka_urdf), np.random.default_rng(0)
     assert real.joints == panda().joints
     for _ in range(20):
         q = within_limits(rng.random(9))

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/physics/articulation.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include "wiw/core/error.hpp"
@@ -66,6 +67,15 @@ void Articulation::check_within_limits(const Eigen::VectorXd& positions, const c
                         "' takes positions in [" + std::to_string(limits_.lower[i]) + ", " +
                         std::to_string(limits_.upper[i]) + "], got " + std::to_string(positions[i]));
   }
+}
+
+Eigen::VectorXd Articulation::coupled(Eigen::VectorXd positions) const {
+  for (const Joint& joint : joints_) {
+    if (!joint.mimic) continue;
+    const double wanted = joint.mimic->multiplier * positions[joint.mimic->index] + joint.mimic->offset;
+    positions[joint.index] = std::clamp(wanted, limits_.lower[joint.index], limits_.upper[joint.index]);
+  }
+  return positions;
 }
 
 std::vector<Pose> Articulation::forward_kinematics(const Eigen::VectorXd& positions) const {

@@ -24,9 +24,16 @@ struct Visual {
 
 struct Link {
   std::string name;
-  MassProperties inertial;      // in the link's frame
-  std::vector<Part> collision;  // meshes as their convex hulls
+  std::vector<std::filesystem::path> meshes;  // files of its shapes and looks
+  MassProperties inertial;                    // in the link's frame
+  std::vector<Part> collision;                // meshes as their convex hulls
   std::vector<Visual> visual;
+};
+
+/// A joint that goes where another one tells it: `multiplier` x its position + `offset`.
+struct Mimic {
+  int index = 0;  // of the other, among the movable joints
+  double multiplier = 1, offset = 0;
 };
 
 enum class JointType { kFixed, kRevolute, kPrismatic };
@@ -39,6 +46,7 @@ struct Joint {
   Pose origin = Pose::Identity();  // T_parent_child at position 0
   Eigen::Vector3d axis = Eigen::Vector3d::UnitX();
   int index = -1;  // among the movable joints; -1 for fixed ones
+  std::optional<Mimic> mimic;
 };
 
 /// Limits of the movable joints: radians or metres, per second, newton metres or newtons.
@@ -76,6 +84,9 @@ class Articulation {
   void check_positions(const Eigen::VectorXd& positions, const char* what) const;
   /// As check_positions, and within the limits up to 1e-6.
   void check_within_limits(const Eigen::VectorXd& positions, const char* what) const;
+
+  /// The same positions, but of joints that mimic, which get theirs from what they mimic, within their limits.
+  [[nodiscard]] Eigen::VectorXd coupled(Eigen::VectorXd positions) const;
 
   /// T_base_link of every link.
   [[nodiscard]] std::vector<Pose> forward_kinematics(const Eigen::VectorXd& positions) const;

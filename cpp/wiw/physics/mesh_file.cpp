@@ -5,7 +5,10 @@
 #include <assimp/postprocess.h>
 #include <assimp/scene.h>
 
+#include <algorithm>
 #include <assimp/Importer.hpp>
+#include <cctype>
+#include <cmath>
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/shape.hpp"
@@ -16,41 +19,105 @@ namespace fs = std::filesystem;
 
 namespace {
 
-constexpr std::uintmax_t kMaxBytes = 256u << 20;  // collision meshes are kilobytes
+constexpr std::uintmax_t kMaxBytes = 256u << 20;  // meshes of links are at most a few megabytes
+constexpr float kSmooth = 40;                     // degrees between faces that are one curve
 
-std::vector<Eigen::Vector3d> vertices_of(const aiScene& scene, const Eigen::Vector3d& scale) {
-  std::vector<Eigen::Vector3d> points;
-  for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
-    const aiMesh& mesh = *scene.mMeshes[m];
+/// A mesh file of a link, open for reading.
+class MeshFile {
+ public:
+  MeshFile(fs::path path, std::string link) : path_(std::move(path)), link_(std::move(link)) {}
+
+  [[nodiscard]] FileError error(const std::string& cause) const {
+    return FileError(path_.string(), cause + " (mesh of link '" + link_ + "')");
+  }
+
+  const aiScene& read(unsigned steps) {
+    std::error_code code;
+    const std::uintmax_t bytes = fs::file_size(path_, code);
+    if (code) throw error("no such file");
+    if (bytes > kMaxBytes) throw error("larger than 256 MiB, which a mesh of a link has no need of");
+    importer_.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);  // URDF knows the file's axes only
+    importer_.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_LINE | aiPrimitiveType_POINT);
+    importer_.SetPropertyInteger(AI_CONFIG_PP_RVC_FLAGS, aiComponent_NORMALS);
+    importer_.SetPropertyFloat(AI_CONFIG_PP_GSN_MAX_SMOOTHING_ANGLE, kSmooth);
+    const aiScene* scene = importer_.ReadFile(path_.string(), steps | aiProcess_PreTransformVertices);
+    if (scene == nullptr) throw error(importer_.GetErrorString());
+    for (unsigned m = 0; m < scene->mNumMeshes; ++m) check(*scene->mMeshes[m]);
+    return *scene;
+  }
+
+ private:
+  void check(const aiMesh& mesh) const {
     for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
       const aiVector3D& p = mesh.mVertices[v];
-      points.emplace_back(scale.x() * p.x, scale.y() * p.y, scale.z() * p.z);
+      if (!std::isfinite(p.x) || !std::isfinite(p.y) || !std::isfinite(p.z)) throw error("a vertex is not finite");
     }
   }
-  return points;
+
+  const fs::path path_;
+  const std::string link_;
+  Assimp::Importer importer_;
+};
+
+/// STL knows faces alone: its normals would show every curve as facets.
+bool is_stl(const fs::path& path) {
+  std::string extension = path.extension().string();
+  std::ranges::transform(extension, extension.begin(), [](unsigned char c) { return std::tolower(c); });
+  return extension == ".stl";
+}
+
+Eigen::Vector3f to_eigen(const aiVector3D& v) { return {v.x, v.y, v.z}; }
+
+/// Of the file's own materials; those that assimp makes up have no say.
+Eigen::Vector4f color_of(const aiScene& scene, const aiMesh& mesh) {
+  const aiMaterial& material = *scene.mMaterials[mesh.mMaterialIndex];
+  aiColor4D color;
+  const bool own = std::string(material.GetName().C_Str()) != AI_DEFAULT_MATERIAL_NAME;
+  if (!own || material.Get(AI_MATKEY_COLOR_DIFFUSE, color) != AI_SUCCESS) return Eigen::Vector4f::Zero();
+  return {color.r, color.g, color.b, 1.f};
+}
+
+void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& scale, Surface& surface) {
+  const auto first = static_cast<std::uint32_t>(surface.positions.size());
+  const Eigen::Vector4f color = color_of(scene, mesh);
+  for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
+    surface.positions.push_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v])));
+    surface.normals.push_back(to_eigen(mesh.mNormals[v]).cwiseQuotient(scale).normalized());
+    const aiColor4D* own = mesh.mColors[0];
+    surface.colors.push_back(own == nullptr ? color : Eigen::Vector4f(own[v].r, own[v].g, own[v].b, 1.f));
+  }
+  for (unsigned f = 0; f < mesh.mNumFaces; ++f) {
+    const unsigned* corners = mesh.mFaces[f].mIndices;
+    surface.triangles.emplace_back(first + corners[0], first + corners[1], first + corners[2]);
+  }
 }
 
 }  // namespace
 
+Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+  MeshFile file(path, link);
+  unsigned steps =
+      aiProcess_Triangulate | aiProcess_SortByPType | aiProcess_GenSmoothNormals | aiProcess_JoinIdenticalVertices;
+  if (is_stl(path)) steps |= aiProcess_RemoveComponent;
+  const aiScene& scene = file.read(steps);
+  Surface surface;
+  for (unsigned m = 0; m < scene.mNumMeshes; ++m) append(scene, *scene.mMeshes[m], scale.cast<float>(), surface);
+  if (surface.triangles.empty()) throw file.error("it has no triangles");
+  return surface;
+}
+
 std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
-  const auto fail = [&](const std::string& cause) {
-    return FileError(path.string(), cause + " (mesh of link '" + link + "')");
-  };
-  std::error_code error;
-  const std::uintmax_t bytes = fs::file_size(path, error);
-  if (error) throw fail("no such file");
-  if (bytes > kMaxBytes) throw fail("larger than 256 MiB, which a collision mesh has no need of");
-  Assimp::Importer importer;
-  importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);  // URDF knows the file's axes only
-  const aiScene* scene =
-      importer.ReadFile(path.string(), aiProcess_PreTransformVertices | aiProcess_JoinIdenticalVertices);
-  if (scene == nullptr) throw fail(importer.GetErrorString());
-  const std::vector<Eigen::Vector3d> points = vertices_of(*scene, scale);
-  for (const Eigen::Vector3d& point : points) {
-    if (!point.allFinite()) throw fail("a vertex is not finite");
+  MeshFile file(path, link);
+  const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
+  std::vector<Eigen::Vector3d> points;
+  for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
+    const aiMesh& mesh = *scene.mMeshes[m];
+    for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
+      points.push_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v]).cast<double>()));
+    }
   }
   const HullMesh hull = hull_mesh(points);
-  if (hull.vertices.empty()) throw fail("its vertices span no volume");
+  if (hull.vertices.empty()) throw file.error("its vertices span no volume");
   return hull.vertices;
 }
 

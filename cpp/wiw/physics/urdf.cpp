@@ -2,6 +2,7 @@
 #include <console_bridge/console.h>
 #include <urdf_parser/urdf_parser.h>
 
+#include <algorithm>
 #include <cmath>
 #include <fstream>
 #include <limits>
@@ -70,6 +71,7 @@ class Reader {
 
   ArticulationPtr read() {
     add(*model_.getRoot());
+    for (Joint& joint : joints_) couple(joint);
     JointLimits limits;
     const auto vector = [&](double Range::* field) {
       Eigen::VectorXd values(static_cast<Eigen::Index>(ranges_.size()));
@@ -110,6 +112,19 @@ class Reader {
     joints_.push_back(std::move(joint));
   }
 
+  /// Once all joints are known: what is mimicked may come later in the tree.
+  void couple(Joint& joint) const {
+    const auto from = model_.getJoint(joint.name)->mimic;
+    if (!from || joint.index < 0) return;
+    const auto other = std::ranges::find(joints_, from->joint_name, &Joint::name);
+    const bool leads = other != joints_.end() && other->index >= 0 && !model_.getJoint(other->name)->mimic;
+    if (!leads || !std::isfinite(from->multiplier) || !std::isfinite(from->offset)) {
+      throw ArgumentError(source_ + ": joint '" + joint.name + "' mimics '" + from->joint_name +
+                          "'; expected a movable joint that mimics none, a finite multiplier and offset");
+    }
+    joint.mimic = Mimic{other->index, from->multiplier, from->offset};
+  }
+
   [[nodiscard]] JointType type_of(const urdf::Joint& joint) const {
     if (joint.type == urdf::Joint::REVOLUTE || joint.type == urdf::Joint::CONTINUOUS) return JointType::kRevolute;
     if (joint.type == urdf::Joint::PRISMATIC) return JointType::kPrismatic;
@@ -140,11 +155,19 @@ class Reader {
       link.collision.push_back(
           {to_shape(*each->geometry, from.name), to_pose(each->origin, "collision of link '" + from.name + "'")});
       check_part(link.collision.back(), source_ + ": link '" + from.name + "'");
+      note_mesh(*each->geometry, link);
     }
     for (const urdf::VisualSharedPtr& each : from.visual_array) {
-      if (each && each->geometry) link.visual.push_back(to_visual(*each, from.name));
+      if (!each || !each->geometry) continue;
+      link.visual.push_back(to_visual(*each, from.name));
+      note_mesh(*each->geometry, link);
     }
     return link;
+  }
+
+  void note_mesh(const urdf::Geometry& from, Link& link) const {
+    const auto* mesh = dynamic_cast<const urdf::Mesh*>(&from);
+    if (mesh != nullptr) link.meshes.push_back(find_mesh(mesh->filename, folder_));
   }
 
   [[nodiscard]] MassProperties to_inertial(const urdf::Inertial& from, const std::string& name) const {

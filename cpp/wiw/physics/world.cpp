@@ -255,9 +255,10 @@ std::vector<Pose> World::simulated_link_poses(int articulation) const {
 void World::set_joint_positions(int articulation, const Eigen::VectorXd& positions) {
   Arm& arm = impl_->arm(articulation);
   arm.articulation().check_within_limits(positions, "positions");
-  arm.set_positions(positions);
-  arm.set_velocities(Eigen::VectorXd::Zero(positions.size()));
-  arm.set_targets(positions);
+  const Eigen::VectorXd coupled = arm.articulation().coupled(positions);
+  arm.set_positions(coupled);
+  arm.set_velocities(Eigen::VectorXd::Zero(coupled.size()));
+  arm.set_targets(coupled);
 }
 
 void World::set_joint_velocities(int articulation, const Eigen::VectorXd& velocities) {
@@ -269,7 +270,7 @@ void World::set_joint_velocities(int articulation, const Eigen::VectorXd& veloci
 void World::set_joint_targets(int articulation, const Eigen::VectorXd& targets) {
   Arm& arm = impl_->arm(articulation);
   arm.articulation().check_within_limits(targets, "targets");
-  arm.set_targets(targets);
+  arm.set_targets(arm.articulation().coupled(targets));
 }
 
 void World::set_joint_forces(int articulation, const Eigen::VectorXd& forces) {

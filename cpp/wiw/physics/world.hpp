@@ -80,7 +80,8 @@ struct PathCollision {
 /// Links that are fixed to the base collide with moving bodies only.
 ///
 /// Joints are driven by velocity-limited motors: each step closes `kMotorGain` of the distance to the target, at most
-/// at the joint's velocity limit and with at most its force. Targets start as the positions that were set.
+/// at the joint's velocity limit and with at most its force. Targets start as the positions that were set. A joint that
+/// mimics another has that one's target, times its multiplier, plus its offset; nothing else couples the two.
 class World {
  public:
   static constexpr double kMotorGain = 0.2;

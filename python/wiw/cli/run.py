@@ -43,6 +43,7 @@ def run(
     depth: Count = 1,
     width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
+    robot: Annotated[Path | None, arg(metavar="URDF")] = None,
     preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
@@ -97,6 +98,7 @@ def run(
         depth: Levels of the beam search; each one after the first extends the best plans by another horizon.
         width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
+        robot: For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
             categories=bed,sofa; may be given again.
@@ -125,7 +127,7 @@ def run(
 
     flags = {
         "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
-        "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder,
+        "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder, "robot": robot,
     }  # fmt: skip
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
     policy = policy or default_policy(task)

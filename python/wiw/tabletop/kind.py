@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
+from wiw.tabletop.robot import Robot
 from wiw.tabletop.workbench import TABLE, Pose, Thing, Workbench
 from wiw.types import ArmObservation
 
@@ -61,9 +62,9 @@ class Setup:
     objects: tuple[str, ...] = ()
     """Names of what a policy is told the place of, by their index from 1."""
 
-    def bench(self, backend: Literal["auto", "cpu", "gpu"] = "auto") -> Workbench:
-        """The table with everything on it, at rest, its pictures drawn by a renderer."""
-        bench = Workbench(self.things, backend)
+    def bench(self, backend: Literal["auto", "cpu", "gpu"] = "auto", robot: Robot | None = None) -> Workbench:
+        """The table with everything on it, at rest, its pictures drawn by a renderer; the own Panda if no robot."""
+        bench = Workbench(self.things, backend, robot)
         for name, force in self.springs.items():
             bench.set_spring(name, force)
         bench.settle(60)

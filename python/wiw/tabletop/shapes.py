@@ -48,10 +48,10 @@ def mesh_of(shape: Any, rounded: bool = False) -> Mesh:
 
 
 def painted(mesh: Mesh, colour: ArrayLike) -> Mesh:
-    """The same in a colour of its own, RGB or RGBA from 0 to 1: "colors" uint8 [V, 4]."""
-    rgba = np.append(np.asarray(colour, np.float64)[:3], 1.0)
-    row = np.clip(np.round(255 * rgba), 0, 255).astype(np.uint8)
-    return {**mesh, "colors": np.tile(row, (len(mesh["positions"]), 1))}
+    """The same in a colour of its own, or one for each vertex: RGB or RGBA from 0 to 1, drawn opaque."""
+    colors = np.full((len(mesh["positions"]), 4), 255, np.uint8)
+    colors[:, :3] = np.clip(np.round(255 * np.asarray(colour, np.float64)[..., :3]), 0, 255)
+    return {**mesh, "colors": colors}
 
 
 def joined(parts: Sequence[tuple[Mesh, NDArray[np.float64]]]) -> Mesh:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -16,10 +17,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from wiw.errors import ArgumentError
-from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Box, Gripper, World, WorldState, panda, place
+from wiw.physics import Articulation, Box, Gripper, World, WorldState, place
 from wiw.render import Output, Renderer
 from wiw.scenes import Scene
 from wiw.tabletop.looks import looks_of
+from wiw.tabletop.robot import Robot, own_panda
 from wiw.tabletop.shapes import joined, mesh_of
 
 Colour = tuple[float, float, float]
@@ -76,8 +78,8 @@ class Camera:
     eye: tuple[float, float, float]
     at: tuple[float, float, float]
     hfov_deg: float = 60.0
-    link: str = ""
-    """Of the arm, whose frame the places are in; empty for the table's."""
+    on_hand: bool = False
+    """Whether the places are in the frame of the arm's hand, not the table's."""
 
     @property
     def pose(self) -> Pose:
@@ -102,7 +104,7 @@ CAMERAS: Mapping[str, Camera] = {
     "front": Camera((1.0, 0.0, 1.4), (0.0, 0.0, 0.96)),
     "left_shoulder": Camera((-0.45, 0.75, 1.6), (0.2, 0.0, 0.8)),
     "right_shoulder": Camera((-0.45, -0.75, 1.6), (0.2, 0.0, 0.8)),
-    "wrist": Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, "panda_hand"),
+    "wrist": Camera((0.07, 0.0, 0.02), (0.02, 0.0, 0.3), 80.0, on_hand=True),
 }
 
 
@@ -139,18 +141,25 @@ class Workbench:
     Args:
         things: what stands on the table, and where: poses [4, 4].
         backend: renderer, "auto", "cpu" or "gpu".
+        robot: the arm; the project's own Panda if None.
 
     Raises:
         ArgumentError: two things of one name, or impossible shapes or numbers.
     """
 
-    def __init__(self, things: Sequence[tuple[Thing, Pose]], backend: Literal["auto", "cpu", "gpu"] = "auto") -> None:
+    def __init__(
+        self,
+        things: Sequence[tuple[Thing, Pose]],
+        backend: Literal["auto", "cpu", "gpu"] = "auto",
+        robot: Robot | None = None,
+    ) -> None:
+        self.robot = robot or own_panda()
         self.things = {thing.name: thing for thing, _ in things}
         if len(self.things) < len(things):
             raise ArgumentError(f"Workbench: expected a name for each thing, got {[t.name for t, _ in things]}")
         self._world = World()
         self._world.add_body(Box(TOP), T_world_body=MIDDLE, name="table", friction=0.8)
-        self._arm = self._world.add_articulation(panda(), BASE)
+        self._arm = self._world.add_articulation(self.robot.description, BASE)
         self._bodies, self._mechanisms = dict[str, int](), dict[str, int]()
         self._marks = {thing.name: pose for thing, pose in things if not thing.touched}
         for thing, pose in things:
@@ -162,7 +171,7 @@ class Workbench:
                 )
             else:
                 self._mechanisms[thing.name] = self._world.add_articulation(thing.mechanism, pose)
-        self._world.set_joint_positions(PANDA_READY, self._arm)
+        self._world.set_joint_positions(self.robot.ready, self._arm)
         self._buttons = tuple(thing.name for thing, _ in things if thing.lamp is not None)
         self._pressed: tuple[str, ...] = ()
         self._pictures = _Pictures(self, backend)
@@ -190,19 +199,24 @@ class Workbench:
     @property
     def pose(self) -> NDArray[np.float64]:
         """float64 [7]: x, y, z, roll, pitch, yaw of the point between the finger tips, and how open they are."""
-        tip = self._world.link_poses(self._arm)[panda().link_index(PANDA_TCP)]
+        tip = self._world.link_poses(self._arm)[self.robot.tcp_index]
         angles = Rotation.from_matrix(tip[:3, :3]).as_euler("xyz")
-        return np.array([*tip[:3, 3], *angles, Gripper(self._world, self._arm).opening])
+        return np.array([*tip[:3, 3], *angles, self._gripper.opening])
+
+    @property
+    def _gripper(self) -> Gripper:
+        """Has no state of its own."""
+        return self.robot.gripper(self._world, self._arm)
 
     @property
     def joints(self) -> NDArray[np.float64]:
-        """float64 [9]: positions of the arm's seven joints and the two fingers."""
+        """float64 [dof]: positions of the arm's joints and of the two fingers; of the Panda nine."""
         return self._world.joint_positions(self._arm)
 
     @property
     def held(self) -> str | None:
         """What the gripper holds."""
-        index = Gripper(self._world, self._arm).held
+        index = self._gripper.held
         return next((name for name, body in self._bodies.items() if body == index), None)
 
     def go(self, pose: ArrayLike) -> Move:
@@ -219,13 +233,13 @@ class Workbench:
         x, y, z, *angles = wanted[:6]
         path = self._world.plan_linear(
             place(x, y, z, angles),
-            PANDA_TCP,
+            self.robot.tcp,
             self._arm,
             allowed=list(self._bodies.values()),
             allowed_articulations=list(self._mechanisms.values()),
         )
         self._world.follow(path, self._arm)
-        gripper = Gripper(self._world, self._arm)
+        gripper = self._gripper
         if wanted[6] < SHUT and gripper.held is None:
             gripper.close()
         elif wanted[6] >= SHUT and (gripper.held is not None or gripper.opening < wanted[6]):
@@ -320,7 +334,7 @@ class Workbench:
         if camera not in CAMERAS:
             raise ArgumentError(f"picture: expected a camera among {', '.join(CAMERAS)}, got {camera!r}")
         found = CAMERAS[camera]
-        return self.link_pose(found.link) @ found.pose if found.link else found.pose
+        return self.hand @ found.pose if found.on_hand else found.pose
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -351,22 +365,28 @@ class Workbench:
             if thing.lamp is not None:
                 lit = self._lamp_of(name)
                 found += [self.place_of(name) if number == lit else OFF for number in range(len(LAMPS))]
-        return found + [arm[link] for link, _ in looks_of(panda())]
+        return found + [arm[link] for link, _ in self.robot.looks]
 
     def _lamp_of(self, name: str) -> int | None:
         """Which of its lamps is on: that of its latest push."""
         pushes = [number for number, other in enumerate(self._pressed) if other == name]
         return min(pushes[-1], len(LAMPS) - 1) if pushes else None
 
-    def link_pose(self, link: str) -> Pose:
-        """Of the arm, [4, 4]."""
-        return self._world.link_poses(self._arm)[panda().link_index(link)]
+    @property
+    def hand(self) -> Pose:
+        """[4, 4]: where the arm's hand is."""
+        return self._world.link_poses(self._arm)[self.robot.description.link_index(self.robot.hand)]
 
 
 class _Pictures:
-    """The scene of a workbench and its renderer, which all its forks draw with."""
+    """The scene of a workbench and its renderer, which all its forks draw with; made when first a picture is taken."""
 
     def __init__(self, bench: Workbench, backend: Literal["auto", "cpu", "gpu"]) -> None:
+        self._things, self._robot, self._start = bench.things, bench.robot, bench.poses_of_parts()
+        self._first, self._backend = len(_ROOM) + 1, backend
+
+    @cached_property
+    def _renderer(self) -> Renderer:
         meshes: list[dict[str, Any]] = []
         materials: list[dict[str, Any]] = []
 
@@ -376,9 +396,8 @@ class _Pictures:
 
         for name, shape, colour, pose in _ROOM:
             add(mesh_of(shape), colour, pose, name)
-        self._first = len(meshes) + 1
-        poses = iter(bench.poses_of_parts())
-        for thing in bench.things.values():
+        poses = iter(self._start)
+        for thing in self._things.values():
             if thing.mechanism is None:
                 whole = joined([(mesh_of(shape), pose) for shape, pose in thing.parts])
                 add(whole, thing.colour, next(poses), thing.name)
@@ -388,11 +407,15 @@ class _Pictures:
             if thing.lamp is not None:
                 for colour in LAMPS.values():
                     add(mesh_of(thing.lamp), colour, next(poses), thing.name)
-        for _, mesh in looks_of(panda()):
+        for _, mesh in self._robot.looks:
             add(mesh, _PAINTED, next(poses), "arm")
         scene = Scene.from_arrays(meshes, name="workbench", materials=materials, sun=SUN)
-        self.names = tuple(mesh["name"] for mesh in meshes)
-        self._renderer = Renderer(scene, backend, samples=4)
+        return Renderer(scene, self._backend, samples=4)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of what is drawn, in the order of ids from 1."""
+        return tuple(each["name"] for each in self._renderer.scene.instances)
 
     def taken(
         self,
@@ -406,7 +429,7 @@ class _Pictures:
         """A batch of one picture of a state."""
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
         if not arm:
-            moved[-len(looks_of(panda())) :, 1, 3] -= FAR_BELOW
+            moved[-len(self._robot.looks) :, 1, 3] -= FAR_BELOW
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
         self._renderer.core.set_poses(ids, moved.astype(np.float32))
         return self._renderer.perspective(Y_UP @ camera, size, hfov_deg, outputs=outputs)

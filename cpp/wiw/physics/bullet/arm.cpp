@@ -78,7 +78,8 @@ Arm::Arm(std::shared_ptr<const ArmModel> model, const Pose& T_world_base, btMult
   for (int group = 0; group < static_cast<int>(model_->groups.size()); ++group) make_collider(group);
   make_motors(time_step_);
   const JointLimits& limits = articulation().limits();
-  set_positions(Eigen::VectorXd::Zero(articulation().dof()).cwiseMax(limits.lower).cwiseMin(limits.upper));
+  const Eigen::VectorXd near_zero = Eigen::VectorXd::Zero(articulation().dof()).cwiseMax(limits.lower);
+  set_positions(articulation().coupled(near_zero.cwiseMin(limits.upper)));
   set_targets(positions());
   set_forces(limits.effort.cwiseMin(kUnlimitedForce));
 }

@@ -14,6 +14,7 @@ from wiw.errors import ArgumentError
 from wiw.render import resolve_backend
 from wiw.tabletop.kind import Kind, Setup, key_of
 from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.robot import Robot, own_panda, robot_of
 from wiw.tasks import presets
 from wiw.types import Episode, Goal, Wording
 
@@ -49,6 +50,8 @@ class Manipulation:
         seed: of the episodes and of the run.
         preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
         backend: renderer, "auto", "cpu" or "gpu".
+        robot: URDF file of an arm to work with in place of the project's own Panda (`wiw.tabletop.robot`).
+        robot_tcp: the link of that file between the finger tips, where its name does not tell.
     """
 
     name = "manipulation"
@@ -63,6 +66,8 @@ class Manipulation:
         seed: int = 0,
         preset: str | Path = presets.DEFAULT,
         backend: Literal["auto", "cpu", "gpu"] = "auto",
+        robot: str | Path | None = None,
+        robot_tcp: str = "",
         **rules: Any,
     ) -> None:
         if walking := [name for name in rules if name in WALKING]:
@@ -71,12 +76,17 @@ class Manipulation:
                 "tables are set by `tasks` and `seed`"
             )
         self.tasks, self.seed, self.backend = _named(tasks), seed, backend
+        self.robot = own_panda() if robot is None else robot_of(robot, robot_tcp)
         self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
 
     @staticmethod
     def portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """The same options, with a preset's path that means the same in any folder and the renderer of "auto"."""
-        ways: dict[str, Callable[[Any], str]] = {"preset": presets.absolute, "backend": resolve_backend}
+        """The same options, with paths that mean the same in any folder and the renderer of "auto"."""
+        ways: dict[str, Callable[[Any], str]] = {
+            "preset": presets.absolute,
+            "backend": resolve_backend,
+            "robot": lambda file: str(Path(file).expanduser().absolute()),
+        }
         given = {"backend": "auto", **options}
         return {name: ways[name](value) if name in ways else value for name, value in given.items()}
 
@@ -99,7 +109,8 @@ class Manipulation:
         """JSON-able identity: what must be equal for two runs to be comparable."""
         backend = resolve_backend(self.backend)
         return {
-            "task": self.name, "tasks": list(self.tasks), "seed": self.seed, "backend": backend, **asdict(self.rules)
+            "task": self.name, "tasks": list(self.tasks), "seed": self.seed, "backend": backend,
+            "robot": self.robot.identity, **asdict(self.rules),
         }  # fmt: skip
 
     def environment(self, depth: bool = False, **sensors: Any) -> ManipulationEnv:
@@ -126,7 +137,9 @@ class Manipulation:
     def table(self, episode: Episode) -> Table:
         """An episode's table, at rest."""
         kind = KINDS[episode.info["task"]]
-        return Table(kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend)
+        return Table(
+            kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend, self.robot
+        )
 
 
 def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
@@ -148,9 +161,15 @@ def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
 class Table:
     """One episode's table in the course of time."""
 
-    def __init__(self, kind: Kind, setup: Setup, backend: Literal["auto", "cpu", "gpu"] = "auto") -> None:
+    def __init__(
+        self,
+        kind: Kind,
+        setup: Setup,
+        backend: Literal["auto", "cpu", "gpu"] = "auto",
+        robot: Robot | None = None,
+    ) -> None:
         self.kind, self.setup = kind, setup
-        self.bench = setup.bench(backend)
+        self.bench = setup.bench(backend, robot)
         self.goal = Goal(Manipulation.name, text=setup.instruction)
         self.objects = setup.objects
 

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Arms from URDF files at the table: what is found in them, what they look like and do, and what is refused."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.errors import ArgumentError, FileError
+from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
+from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.robot import own_panda, robot_of
+from wiw.tabletop.workbench import TABLE, Thing, Workbench
+from wiw.tasks.manipulation import Manipulation
+
+OWN = (Path(wiw.__file__).parent / "configs/robots/panda.urdf").read_text()
+CUBE = """solid cube
+{}
+endsolid cube
+"""
+FACET = "facet normal 0 0 0 outer loop vertex {} {} {} vertex {} {} {} vertex {} {} {} endloop endfacet"
+
+
+def cube_stl(file: Path, size: float) -> None:
+    """An STL whose facets have no normals."""
+    corners = [(x, y, z) for x in (0, size) for y in (0, size) for z in (0, size)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = [(a, b, c) for a, b, c, _ in faces] + [(a, c, d) for a, _, c, d in faces]
+    facets = [FACET.format(*(number for corner in each for number in corners[corner])) for each in triangles]
+    file.write_text(CUBE.format("\n".join(facets)))
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Path:
+    """A robot of other names than the Panda's, with a mesh for a hand and a finger that mimics the other."""
+    folder = tmp_path / "acme_description"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "urdf").mkdir()
+    cube_stl(folder / "meshes/hand.stl", 100.0)
+    mesh = '<mesh filename="package://acme_description/meshes/hand.stl" scale="0.0006 0.002 0.0006"/>'
+    text = OWN.replace('<box size="0.056 0.204 0.05"/>', mesh).replace('"0.95 0.95 0.95 1"', '"0 0.6 0.6 1"')
+    text = text.replace("panda_finger_joint", "jaw").replace("panda_", "acme_").replace("hand_tcp", "tool_center")
+    end = "</joint>\n</robot>"
+    assert text.strip().endswith(end)
+    text = text.replace(end, '<mimic joint="jaw1"/>' + end)
+    (folder / "urdf/acme.urdf").write_text(text)
+    return folder / "urdf/acme.urdf"
+
+
+def test_another_robot_is_found_its_way_about(other: Path) -> None:
+    robot = robot_of(other)
+    assert (robot.tcp, robot.hand) == ("acme_tool_center", "acme_hand")
+    assert robot.fingers == ("acme_leftfinger", "acme_rightfinger") and robot.finger_joints == ("jaw1", "jaw2")
+    tip = robot.description.forward_kinematics(robot.ready)[robot.tcp_index]
+    usual = own_panda().description.forward_kinematics(PANDA_READY)[own_panda().tcp_index]
+    np.testing.assert_allclose(tip, usual, atol=2e-3)
+    assert robot.ready[-2:] == pytest.approx(0.04)
+
+
+def test_another_robot_takes_a_cube_and_is_seen(other: Path) -> None:
+    cube = Thing("cube", ((Box([0.045] * 3), np.eye(4)),), (0.8, 0.1, 0.1), mass=0.08)
+    bench = Workbench([(cube, place(0.15, 0.1, TABLE + 0.0225))], robot=robot_of(other))
+    seen = bench.picture("front", (120, 120))["color"].astype(int)
+    teal = (seen[..., 1] > seen[..., 0] + 60) & (np.abs(seen[..., 1] - seen[..., 2]) < 10)
+    assert 100 < teal.sum() < 3000
+    for height, gripper in ((0.15, 1), (0.02, 1), (0.02, 0), (0.2, 0)):
+        assert bench.go([0.15, 0.1, TABLE + height, np.pi, 0, 0, gripper]).why == "free"
+    assert bench.held == "cube" and bench.place_of("cube")[2, 3] > TABLE + 0.15
+
+
+def test_equal_descriptions_are_equal_robots(other: Path, tmp_path: Path) -> None:
+    equal, fatter = (shutil.copytree(other.parents[1], tmp_path / name / "acme_description") for name in "ab")
+    cube_stl(fatter / "meshes/hand.stl", 101.0)
+    assert robot_of(equal / "urdf/acme.urdf").identity == robot_of(other).identity != own_panda().identity
+    assert robot_of(fatter / "urdf/acme.urdf").identity != robot_of(other).identity
+
+
+def test_a_task_names_its_robot(other: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    task = Manipulation("slide_block", robot=other)
+    assert task.describe()["robot"] == robot_of(other).identity
+    assert Manipulation("slide_block").describe()["robot"] == {"name": "panda"}
+    assert task.table(task.episode(0)).bench.robot is task.robot
+    monkeypatch.chdir(other.parent)
+    assert Manipulation.portable({"robot": "acme.urdf"})["robot"] == str(other)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("prismatic", "revolute", r"two fingers slide.*acme_joint1"),
+        ("tool_center", "point", r"tcp, grasptarget.*robot_tcp=LINK.*acme_point"),
+        ('<axis xyz="0 1 0"/>', '<axis xyz="1 0 0"/>', "the fingers moving along y"),
+        ('xyz="0 0 0.1034"', 'xyz="0 0 -0.1034"', "z out of the hand"),
+        ('xyz="0 0 0.333"', 'xyz="0 0 3.33"', "where work begins"),
+        ('mimic joint="jaw1"', 'mimic joint="jaw2"', "mimics 'jaw2'.*mimics none"),
+    ],
+)
+def test_what_cannot_work_at_the_table_is_refused(other: Path, old: str, new: str, words: str) -> None:
+    other.write_text(other.read_text().replace(old, new))
+    with pytest.raises(ArgumentError, match=f"(?s){words}"):
+        robot_of(other)
+
+
+def test_a_link_may_be_named_as_the_tool(other: Path) -> None:
+    other.write_text(other.read_text().replace("tool_center", "point"))
+    robot = robot_of(other, "acme_point")
+    assert robot.tcp == "acme_point" and robot.identity["tcp"] == "acme_point"
+    with pytest.raises(ArgumentError, match="acme_elbow"):
+        robot_of(other, "acme_elbow")
+    with pytest.raises(ArgumentError, match="moving along y"):
+        robot_of(other, "acme_link8")  # turned by 45 degrees from the hand
+
+
+@pytest.mark.parametrize("damage", [lambda file: file.unlink(), lambda file: file.write_bytes(b"\0" * 200)])
+def test_a_missing_or_damaged_mesh_is_named_with_its_link(other: Path, damage) -> None:
+    damage(other.parents[1] / "meshes/hand.stl")
+    with pytest.raises(FileError, match=r"hand\.stl.*acme_hand"):
+        robot_of(other)
+
+
+def test_surfaces_of_files_keep_axes_scale_and_colours(tmp_path: Path) -> None:
+    cube_stl(tmp_path / "cube.STL", 2.0)
+    mesh = read_surface(tmp_path / "cube.STL", scale=(1, 2, -3))
+    assert np.ptp(mesh["positions"], axis=0).tolist() == [2, 4, 6] and mesh["positions"][:, 2].max() == 0
+    assert len(mesh["triangles"]) == 12 and (mesh["colors"][:, 3] == 0).all()
+    np.testing.assert_allclose(np.abs(mesh["normals"]).max(axis=1), 1, atol=1e-6)  # edges of a cube stay edges
+    (tmp_path / "a.mtl").write_text("newmtl leaf\nKd 0.1 0.5 0.2\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nusemtl leaf\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    leaf = read_surface(tmp_path / "a.obj")
+    np.testing.assert_allclose(leaf["colors"], [[0.1, 0.5, 0.2, 1]] * 3, atol=1e-6)
+    np.testing.assert_allclose(leaf["normals"], [[0, 0, 1]] * 3, atol=1e-6)
+
+
+def test_a_joint_that_mimics_goes_where_the_other_is_told_to_go(other: Path) -> None:
+    world = World(gravity=(0, 0, 0))
+    description = Articulation(other)
+    world.add_articulation(description)
+    target = world.joint_positions()
+    one, two = description.joint_index("jaw1"), description.joint_index("jaw2")
+    target[one], target[two] = 0.03, 0.0
+    world.set_joint_targets(target)
+    assert world.joint_targets()[two] == 0.03
+    world.step(240)
+    assert world.joint_positions()[[one, two]] == pytest.approx([0.03, 0.03], abs=1e-4)
+    target[one] = 0.01
+    world.set_joint_positions(target)
+    assert world.joint_positions()[two] == 0.01
+
+
+def test_the_real_description_does_the_work(franka_urdf: Path) -> None:
+    robot, kind = robot_of(franka_urdf), KINDS["insert_peg"]
+    setup = kind.setup(3, 4)
+    bench = setup.bench(robot=robot)
+    for pose in kind.expert(bench.places(setup.objects), setup.target):
+        bench.go(pose)
+    assert kind.succeeded(bench, setup)
+    assert sum(len(mesh["triangles"]) for _, mesh in robot.looks) > 50_000
