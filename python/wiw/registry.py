@@ -195,6 +195,7 @@ POLICIES = Registry(
         "geometric": "wiw.policies.geometric:Geometric",
         "recogniser": "wiw.policies.recogniser:Recognition",
         "vlm": "wiw.policies.vlm:VLM",
+        "scripted": "wiw.policies.scripted:Scripted",
     },
     "wiw.policies.base:Policy",
 )

@@ -56,6 +56,7 @@ class Manipulation:
 
     name = "manipulation"
     metrics = ("success", "mean_trajectory")
+    default_policy = "scripted"
     senses = ("size", "cameras", "ids", "cloud", "grid")
     """Options of `wiw.make` that are the environment's."""
     wording = Wording(succeeded="did what it was told", won="done", lost="not done", goal="what is left", asked="Told")
