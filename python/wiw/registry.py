@@ -244,6 +244,7 @@ METRICS = Registry(
         "success": "wiw.metrics.headlines:SUCCESS",
         "spl": "wiw.metrics.headlines:SPL",
         "mean_trajectory": "wiw.metrics.headlines:MEAN_TRAJECTORY",
+        "refused": "wiw.metrics.headlines:REFUSED",
     },
     "wiw.metrics.headlines:Headline",
 )

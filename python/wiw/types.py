@@ -155,6 +155,8 @@ class Wording:
     """Where an episode's shortest way leads."""
     asked: str = "The goal"
     """Over what the agent is shown, e.g. "The goal: find where this was taken"."""
+    steps: str = "primitives"
+    """What the length of an episode counts."""
 
 
 @dataclass(frozen=True)
@@ -329,7 +331,13 @@ class Episode:
     """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
     """ImageNav reads "ideal_primitives", the least number of primitives, and "radius", the goal's own in metres.
-    AR reads "target", an instance's id, and "category", what it is."""
+    AR reads "target", an instance's id, and "category", what it is. Manipulation reads "task", "seed" and
+    "variation", and tells reports the "instruction"."""
+
+    @property
+    def kind(self) -> str:
+        """Which of several tasks in one it is of; empty where there is one."""
+        return str(self.info.get("task", ""))
 
 
 @dataclass(frozen=True)
@@ -347,6 +355,10 @@ class DecisionRecord:
     after: Truth
     path: NDArray[np.float64]
     """float64 [len(executed) + 1, 3]: world positions from before the first to after the last primitive."""
+    refused: tuple[str, ...] = ()
+    """Why ways of a gripper were not gone to their ends, one for each that was not."""
+    end: Observation | ArmObservation | None = None
+    """What is seen when the episode has ended with this decision."""
 
 
 @dataclass(frozen=True)

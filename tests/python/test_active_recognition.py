@@ -22,7 +22,7 @@ from wiw.datasets import ar
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, ContractError
-from wiw.evaluation.report.episodes import Attempt
+from wiw.evaluation.report.story import Attempt
 from wiw.evaluation.rows import decode_jpeg
 from wiw.loop.scheduler import run_episodes
 from wiw.tasks.ar import AR

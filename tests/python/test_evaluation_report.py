@@ -6,9 +6,10 @@ import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.evaluation.evaluate import run_arms
-from wiw.evaluation.report.episodes import glyphs, stories
+from wiw.evaluation.report.episodes import stories
 from wiw.evaluation.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
 from wiw.evaluation.report.page import render, sentence
+from wiw.evaluation.report.plans import glyphs
 from wiw.evaluation.summary import summarise
 from wiw.types import Episode
 
@@ -18,7 +19,7 @@ EVIL = "<script>alert(1)</script>"
 class Page(HTMLParser):
     """Tags with attributes, text, and whether tags close in order."""
 
-    VOID = ("meta", "img", "br", "link", "path", "circle", "rect", "use", "image", "polyline", "text")
+    VOID = ("meta", "img", "br", "link", "path", "circle", "rect", "use", "image", "polyline", "text", "source")
 
     def __init__(self, html):
         super().__init__()

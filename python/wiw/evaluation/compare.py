@@ -92,6 +92,7 @@ def compare(
         adjusted([one for one in found if one is not None]),
         both.same_episodes,
         tuple(one for log, labels in sides for one in _utilities(log, labels)),
+        both.kinds,
         names,
         tuple(line for pair in pairs for line in _changed(first, second, pair)),
     )

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from wiw.errors import ArgumentError, Error, InfrastructureError, StoreError
+from wiw.evaluation.films import keep_films
 from wiw.evaluation.platform import describe_platform
 from wiw.evaluation.progress import Tracker, make_board
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_recipes, task_recipe
@@ -67,7 +68,8 @@ def evaluate(
             "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
             mapping gives the arms names of their own. None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
-        keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one.
+        keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one. Where a
+            task has several kinds, one of each does at least, unless it is 0.
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
             300 unless it was given another.
@@ -267,8 +269,9 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
-            "pictures": _spread(options.episodes, options.pictures),
+            "pictures": _with_pictures(episodes, options.pictures),
             "scenes": used,
+            "stage": getattr(built, "stage", None),
             "wording": asdict(getattr(built, "wording", Wording())),
             "live": options.live,
             "workers": options.workers,
@@ -307,10 +310,14 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
     store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
 
 
-def _spread(episodes: int, count: int) -> list[int]:
-    """`count` indices spread evenly over the episodes."""
-    count = min(count, episodes)
-    return sorted({round(i * (episodes - 1) / max(1, count - 1)) for i in range(count)})
+def _with_pictures(episodes: Sequence[Episode], count: int) -> list[int]:
+    """`count` indices spread evenly over the episodes, and the first of each kind of task that has none among them."""
+    count, last = min(count, len(episodes)), len(episodes) - 1
+    kept = {round(i * last / max(1, count - 1)) for i in range(count)}
+    for index, episode in enumerate(episodes):
+        if count and episode.kind not in {episodes[other].kind for other in kept}:
+            kept.add(index)
+    return sorted(kept)
 
 
 def _finish(
@@ -347,6 +354,7 @@ def run_pending(
         desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
         _run_jobs(plan, episodes, pending, desk, workers)
         keep_scene_maps(store, task)
+        keep_films(store, task)
     finally:
         board.close()
         store.close()

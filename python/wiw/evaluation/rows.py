@@ -18,6 +18,8 @@ from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fid
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
+MOST_FRAMES = 20
+"""Of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for fewer."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class DecisionRow:
     values: dict[str, Any]
     """The other columns by name."""
     images: dict[str, bytes]
-    """JPEG by name: "panorama" ("front" of a manipulator), "goal", "imagined/0" and so on."""
+    """JPEG by name: "panorama" (of a manipulator "front", at last "end"), "goal", "imagined/0" and so on."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,10 @@ def _plain(value: Any) -> Any:
 def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> DecisionRow:
     """The row of a decision; pictures only where they are wanted, for they are most of the bytes."""
     decision = record.decision
-    proposals = [{"actions": p.actions, "prior": p.prior, "note": p.note} for p in decision.proposals]
+    proposals = [
+        {"actions": p.actions, "prior": p.prior, "note": p.note} | ({"text": p.text} if p.text else {})
+        for p in decision.proposals
+    ]
     real = None if decision.rollouts is None else [rollout.real for rollout in decision.rollouts]
     values: dict[str, Any] = {
         "actions": to_json(decision.actions),
@@ -107,6 +112,7 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
         "exchanges": to_json([asdict(exchange) for exchange in decision.exchanges]),
         "note": decision.note,
         "path": to_json(record.path),
+        "refused": to_json(record.refused),
         "seconds": to_json(dict(decision.seconds)),
         "calls": to_json(dict(decision.calls)),
         "spent": to_json(dict(decision.spent)),
@@ -154,12 +160,19 @@ def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     if decision.observation is not None:
         name = "front" if isinstance(decision.observation, ArmObservation) else "panorama"
         yield name, encode_jpeg(decision.observation.as_dict()[name])
+    if isinstance(record.end, ArmObservation):
+        yield "end", encode_jpeg(record.end.front)
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:
         yield "goal", encode_jpeg(decision.goal.image)
     for index, rollout in enumerate(decision.rollouts or ()):
-        yield f"imagined/{index}", encode_jpeg(strip(rollout.frames))
+        yield f"imagined/{index}", encode_jpeg(strip(rollout.frames[kept_frames(len(rollout.frames))]))
     for index, rollout in enumerate(decision.fidelity.rollouts if decision.fidelity else ()):
-        yield f"true/{index}", encode_jpeg(strip(rollout.frames))
+        yield f"true/{index}", encode_jpeg(strip(rollout.frames[kept_frames(len(rollout.frames))]))
+
+
+def kept_frames(count: int) -> NDArray[np.int64]:
+    """Which of so many frames are kept: all where they are few, else evenly spread ones with the last."""
+    return np.round(np.linspace(count - 1, 0, min(count, MOST_FRAMES))).astype(np.int64)[::-1]
 
 
 def strip(frames: NDArray[np.uint8], height: int = STRIP_HEIGHT) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 6 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 7 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -32,18 +32,19 @@ CREATE TABLE decision (
     arm TEXT NOT NULL,
     episode INTEGER NOT NULL REFERENCES episode (episode),
     decision INTEGER NOT NULL,      -- 0, 1, ... within the episode
-    actions TEXT NOT NULL,          -- JSON: primitive ids of the plan chosen or written anew
+    actions TEXT NOT NULL,          -- JSON: of the plan chosen or written anew: primitive ids, or poses [x, y, z, r, p, y, gripper]
     execute INTEGER NOT NULL,       -- how many of them were to be carried out
-    executed TEXT NOT NULL,         -- JSON: primitive ids that were
+    executed TEXT NOT NULL,         -- JSON: those that were
     chosen INTEGER,                 -- index into proposals; NULL: written anew
     scores TEXT,                    -- JSON: one a proposal
-    proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note}]
+    proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note[, text]}]
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
     answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
     fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim[, lpips]}; NULL: not measured
     exchanges TEXT NOT NULL,        -- JSON: [{purpose, model, said, result, problem, instead}]: a language model's part
     note TEXT NOT NULL,
     path TEXT NOT NULL,             -- JSON: [[x, y, z]] world metres, before the first to after the last primitive
+    refused TEXT NOT NULL,          -- JSON: why ways of a gripper ended early, one for each that did
     seconds TEXT NOT NULL,          -- JSON: wall time by stage
     calls TEXT NOT NULL,            -- JSON: consultations, rows and frames asked of the world model
     spent TEXT NOT NULL,            -- JSON: share of calls, rows, frames, retries, cached_rows, vlm_tokens
@@ -65,9 +66,17 @@ CREATE TABLE image (
     arm TEXT NOT NULL,
     episode INTEGER NOT NULL,
     decision INTEGER NOT NULL,
-    name TEXT NOT NULL,             -- panorama | goal (with decision 0) | imagined/<proposal> | true/<proposal>
+    name TEXT NOT NULL,             -- panorama | front | end (with the last) | goal (with decision 0) |
+                                    -- imagined/<proposal> | true/<proposal>
     jpeg BLOB NOT NULL,
     PRIMARY KEY (arm, episode, decision, name)
+);
+
+CREATE TABLE film (                 -- an episode from begin to end, in motion, where the task can show it
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL,
+    webp BLOB NOT NULL,             -- animated
+    PRIMARY KEY (arm, episode)
 );
 
 CREATE TABLE scene_map (            -- how a scene looks from above, for the episodes with pictures

@@ -24,7 +24,7 @@ from wiw.evaluation.faults import explained, remedy
 from wiw.evaluation.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 DECISION_JSON = (
     "actions",
     "executed",
@@ -35,6 +35,7 @@ DECISION_JSON = (
     "proposals",
     "real_frames",
     "path",
+    "refused",
     "seconds",
     "calls",
     "spent",
@@ -214,12 +215,14 @@ class RunStore:
         return [_episode(row) for row in self._rows("SELECT * FROM episode ORDER BY episode")]
 
     def outcomes(self) -> list[dict[str, Any]]:
-        """Ended episodes of all arms."""
+        """Ended episodes of all arms; those of a task with several kinds say of which ("task")."""
         rows = self._rows(
-            "SELECT o.*, e.episode_id, e.scene, e.geodesic FROM outcome o JOIN episode e USING (episode) "
+            "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
+            "FROM outcome o JOIN episode e USING (episode) "
             "ORDER BY arm, episode"
         )
-        return [{**row, "metrics": json.loads(row["metrics"])} for row in rows]
+        named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
+        return [{**row, "metrics": json.loads(row["metrics"])} for row in named]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Decisions of ended episodes, of one arm or episode if named, in order."""
@@ -262,6 +265,11 @@ class RunStore:
             (arm, episode, decision),
         )
         return {row["name"]: row["jpeg"] for row in rows}
+
+    def film(self, arm: str, episode: int) -> bytes | None:
+        """Animated WebP of an episode, if one was kept."""
+        found = self._rows("SELECT webp FROM film WHERE arm = ? AND episode = ?", (arm, episode))
+        return found[0]["webp"] if found else None
 
     def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
         """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
@@ -350,6 +358,11 @@ class RunStore:
             connection.execute(
                 "INSERT OR REPLACE INTO scene_map VALUES (?, ?, ?)", (scene, webp, to_json(world_to_pixel))
             )
+
+    def write_film(self, arm: str, episode: int, webp: bytes) -> None:
+        """Keeps how an episode went."""
+        with self._writing() as connection:
+            _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def close(self) -> None:
         """Closes the file and lets others write."""
@@ -473,14 +486,14 @@ _ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
 
 
 def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
-    """Deletes decisions and pictures `d` that meet a condition; what they cost is booked as lost."""
+    """Deletes decisions, pictures and films `d` that meet a condition; what they cost is booked as lost."""
     for column, name in (("spent", "key"), ("seconds", "'seconds'")):
         connection.execute(
             f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "
             f"WHERE ({condition}) AND key != 'replay' GROUP BY arm, {name} {_ADD}",
             values,
         )
-    for table in ("decision", "image"):
+    for table in ("decision", "image", "film"):
         connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
 
 

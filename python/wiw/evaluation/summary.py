@@ -7,14 +7,14 @@ import math
 import sys
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, reduce
 from typing import Any
 
 from wiw.errors import RegistryError
 from wiw.evaluation.statistics import Difference, Estimate, adjusted, compare, estimate_mean
 from wiw.evaluation.utility import CEILING, FLOOR, Utility, utility
-from wiw.metrics.headlines import Headline
+from wiw.metrics.headlines import SUCCESS, Headline
 from wiw.registry import METRICS
 
 ROLES = {
@@ -89,6 +89,8 @@ class Summary:
     """Whether all arms have finished the same episodes, so that their lines can be compared as they stand."""
     utilities: tuple[Utility, ...] = ()
     """Where each arm stands between "copy" and "oracle", if the run has both."""
+    kinds: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
+    """Success rates by kind of episode, then by arm, where a task has several kinds."""
 
     def groups(self) -> tuple[Group, ...]:
         """The differences as tables, one for each base."""
@@ -167,7 +169,7 @@ def summarise(
 
     Args:
         arms: names in the order of the table.
-        outcomes: ended episodes with "arm", "episode", "scene", "status", "metrics".
+        outcomes: ended episodes with "arm", "episode", "scene", "status", "metrics", and "task" where there are kinds.
         episodes: how many the run has.
         seed: of the bootstrap.
         policies: arms that have no world model and differ from "none" by their policy.
@@ -178,7 +180,7 @@ def summarise(
         difference for base in ("none", FLOOR) if base in arms for difference in _against(base, arms, done, seed)
     )
     same = len({frozenset(ended) for ended in done.values()}) == 1
-    return Summary(lines, differences, same, _utilities(lines, done))
+    return Summary(lines, differences, same, _utilities(lines, done), _kinds(done, seed))
 
 
 def finished(
@@ -219,6 +221,17 @@ def _utilities(lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapp
     others = [line for line in lines if line.name not in (FLOOR, CEILING)]
     found = [utility(line.name, done, reference=not under_test(line.name, line.role)) for line in others]
     return tuple(one for one in found if one is not None)
+
+
+def _kinds(done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int) -> dict[str, dict[str, Estimate]]:
+    found: dict[str, dict[str, Estimate]] = {}
+    for arm, ended in done.items():
+        judged = [o for o in ended.values() if "task" in o and "success" in o["metrics"]]
+        for kind in dict.fromkeys(o["task"] for o in judged):
+            own = [o for o in judged if o["task"] == kind]
+            values, scenes = [o["metrics"]["success"] for o in own], [o["scene"] for o in own]
+            found.setdefault(kind, {})[arm] = estimate_mean(values, scenes, SUCCESS, seed=seed)
+    return found
 
 
 def under_test(arm: str, role: str) -> bool:

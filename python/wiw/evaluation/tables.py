@@ -24,11 +24,14 @@ from wiw.evaluation.summary import (
     show_utility,
     shown_headlines,
 )
+from wiw.metrics.headlines import SUCCESS
 
 COUNTS = (("n", "judged", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
 
 
+NARROW = 3
+"""Arms that fit beside each other with their intervals on one line."""
 ROOMY = 96
 """Columns that a table of differences takes with an estimate and its interval on one line."""
 
@@ -51,6 +54,8 @@ def summary_tables(summary: Summary, width: int) -> Any:
     parts: list[Any] = [_arms(summary)]
     if summary.utilities:
         parts.append(_utilities(summary))
+    if len(summary.kinds) > 1:
+        parts.append(_kinds(summary, "\n" if len(summary.arms) > NARROW else " "))
     parts += [_differences(summary, group, " " if width >= ROOMY else "\n") for group in summary.groups()]
     styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
     return Lines(*parts, *styled)
@@ -96,6 +101,20 @@ def _utilities(summary: Summary) -> Table:
         style = "" if found.identifiable and not found.reference else "dim"
         shown = Text(show_utility(found), style=style)
         table.add_row(found.arm, shown, str(found.n), Text("reference" if found.reference else "", style="dim"))
+    return table
+
+
+def _kinds(summary: Summary, gap: str) -> Table:
+    """`gap` stands between an estimate and its interval."""
+    table = _table(f"{column_title(SUCCESS)} by kind of task")
+    table.add_column("task", style="bold")
+    for line in summary.arms:
+        table.add_column(line.name, justify="right")
+    table.add_column("n", justify="right")
+    for kind, found in summary.kinds.items():
+        cells = [show_estimate(found[line.name]) if line.name in found else "–" for line in summary.arms]
+        count = max(estimate.n for estimate in found.values())
+        table.add_row(kind, *(cell.replace(" ", gap, 1) for cell in cells), str(count))
     return table
 
 

@@ -65,10 +65,10 @@ class Trial:
         outcome = self.env.run(plan) if decision.answer is None else self.env.run(plan, decision.answer)
         seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
         decision = replace(decision, seconds=seconds)
-        record = DecisionRecord(
-            self.index, self.decisions, decision, outcome.executed, before, self.env.truth(), outcome.path
-        )
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
+        facts = outcome.executed, before, self.env.truth(), outcome.path, getattr(outcome, "refused", ())
+        end = self.observation if self.done else None
+        record = DecisionRecord(self.index, self.decisions, decision, *facts, end)
         self.decisions += 1
         return record
 

@@ -67,5 +67,13 @@ class Headline:
 SUCCESS = Headline("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
 SPL = Headline("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
 MEAN_TRAJECTORY = Headline(
-    "actions", "Mean Traj", "length", False, about="Mean number of executed primitives.", least=0.0
+    "actions",
+    "Mean Traj",
+    "length",
+    False,
+    about="Mean number of executed primitives; of a manipulator's decisions.",
+    least=0.0,
+)
+REFUSED = Headline(
+    "refused", "Refused", "length", False, about="Mean number of a gripper's ways that ended early.", least=0.0
 )

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.report.episodes import BAND, FRONT, glyphs
+from wiw.evaluation.report.cuts import BAND, FRONT
+from wiw.evaluation.report.plans import glyphs
 from wiw.types import Decision, Rollout
 
 CHOSEN, OTHER = "#2e9e6b", "#9a9ea8"

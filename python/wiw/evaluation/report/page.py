@@ -17,9 +17,11 @@ from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories, wording
+from wiw.evaluation.report.story import Album
 from wiw.evaluation.report.templating import environment, signed
 from wiw.evaluation.statistics import Difference
 from wiw.evaluation.summary import Summary, notes, shown_headlines
+from wiw.types import Wording
 
 if TYPE_CHECKING:
     from wiw.evaluation.runlog import RunLog
@@ -53,7 +55,8 @@ def render(log: RunLog) -> str:
             created=log.store.created,
             version=log.store.wiw_version,
             words=wording(log.store),
-            sentence=sentence(summary),
+            whole=Album.whole,
+            sentence=sentence(summary, wording(log.store)),
             plots=_plots(log, summary, truths, blamed),
             stories=told,
             pictures=pictures,
@@ -79,7 +82,7 @@ def summary_html(summary: Summary) -> str:
     return environment().get_template("summary.html.j2").render(**_common(summary))
 
 
-def sentence(summary: Summary) -> str:
+def sentence(summary: Summary, words: Wording | None = None) -> str:
     """What the run shows, in a few sentences that claim no more than the intervals bear."""
     judged = [line for line in summary.arms if "success" in line.estimates and line.name != "none"]
     shown = [line for line in judged if line.role == "world model"] or judged[-1:]
@@ -88,7 +91,7 @@ def sentence(summary: Summary) -> str:
         share = line.estimates["success"].value
         rate = f"With {line.name}, the agent succeeded in {share:.1f} % of {line.judged} episodes"
         found = (_found(summary, line.name, "none", metric) for metric in ("success", "actions"))
-        parts.append(rate + _verdict(next(found)) + _way(next(found)))
+        parts.append(rate + _verdict(next(found)) + _way(next(found), words or Wording()))
     return " ".join(parts)
 
 
@@ -103,13 +106,13 @@ def _verdict(difference: Difference | None) -> str:
     return f", {against}; with so few episodes that may be chance ({interval})."
 
 
-def _way(difference: Difference | None) -> str:
+def _way(difference: Difference | None, words: Wording) -> str:
     """What it took, if it differs."""
     if difference is None or not difference.estimate.excludes_zero:
         return ""
     found = difference.estimate
     kind = "more" if found.value > 0 else "fewer"
-    return f" It took {abs(found.value):.1f} primitives {kind} ({signed(found.low)} to {signed(found.high)})."
+    return f" It took {abs(found.value):.1f} {words.steps} {kind} ({signed(found.low)} to {signed(found.high)})."
 
 
 def _found(summary: Summary, arm: str, base: str, metric: str) -> Difference | None:

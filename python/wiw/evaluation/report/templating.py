@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import cache
 from importlib.resources import files
@@ -29,7 +30,7 @@ def environment(*packages: str) -> Environment:
     )
     made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how, "number": _number}
     made.filters["asset"] = lambda name: _asset(homes, name)
-    made.tests["binding"] = _binding
+    made.tests |= {"binding": _binding, "known": _known}
     return made
 
 
@@ -53,6 +54,10 @@ def _how(estimate: Estimate) -> str:
 
 def _binding(estimate: Estimate) -> bool:
     return estimate.excludes_zero
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
 
 
 def _asset(homes: Sequence[str], name: str) -> Markup:

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 from wiw._core import core
 from wiw.evaluation.faults import whole_folder
-from wiw.evaluation.report.episodes import Album, Story, outcomes_by_episode, place, taken_for, tell, wording
+from wiw.evaluation.report.episodes import outcomes_by_episode, tell, wording
 from wiw.evaluation.report.plots import arm_colors
+from wiw.evaluation.report.story import Album, Story, place, taken_for, where
 from wiw.evaluation.report.templating import environment
 from wiw.types import Episode, Wording
 
@@ -28,6 +29,7 @@ class Beside(Album):
     """Pictures as files of a folder, each written once; those that are to be made are made by a pool's threads."""
 
     panorama_width, frame_height, quality = 1024, 132, 76
+    front_side, end_side, whole = 480, 160, True
 
     def __init__(self, folder: Path, pool: Executor) -> None:
         self._folder, self._pool = folder, pool
@@ -79,6 +81,8 @@ class Cell:
     text: str
     about: str
     """What the text says."""
+    short: bool = False
+    """Whether it says how far from the goal the episode ended."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,16 @@ class Line:
     place: str
     cells: tuple[Cell, ...]
     pictures: bool
+
+    @property
+    def group(self) -> str:
+        """What the list can be narrowed to: its kind where its task has several, else its scene."""
+        return self.episode.kind or self.episode.scene
+
+    @property
+    def told_to(self) -> str:
+        """What was asked for in words, where the task does so."""
+        return str(self.episode.info.get("instruction", ""))
 
     @property
     def file(self) -> str:
@@ -150,7 +164,7 @@ def is_view(folder: Path) -> bool:
 
 def _index(log: RunLog, lines: list[Line], common: Mapping[str, Any]) -> str:
     template = environment("wiw.evaluation.view").get_template("index.html.j2")
-    return template.render(**common, lines=lines, scenes=list(dict.fromkeys(line.episode.scene for line in lines)))
+    return template.render(**common, lines=lines, groups=list(dict.fromkeys(line.group for line in lines)))
 
 
 def _episode(story: Story, scenes: Mapping[str, str], values: Mapping[str, Any]) -> str:
@@ -166,6 +180,7 @@ def _common(log: RunLog) -> dict[str, Any]:
         "colors": arm_colors(log.arms),
         "radius": task.get("radius"),
         "place": place,
+        "whole": Beside.whole,
         "words": wording(log.store),
         "choices": task.get("categories", ()),
     }
@@ -178,7 +193,7 @@ def _lines(log: RunLog, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]
         Line(
             index,
             episode,
-            place(episode.scene),
+            where(episode),
             tuple(_cell(arm, outcomes.get(index, {}).get(arm), words, choices) for arm in log.arms),
             index in pictures,
         )
@@ -198,5 +213,5 @@ def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: 
     if choices:
         return Cell(arm, "missed", taken_for(metrics, choices) or "no answer", f"{words.lost}; what it was taken for")
     if "distance_to_goal" in metrics:
-        return Cell(arm, "missed", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; metres short")
+        return Cell(arm, "missed", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; metres short", True)
     return Cell(arm, "missed", count, f"{words.lost}; decisions taken")

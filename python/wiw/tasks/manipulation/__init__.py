@@ -15,6 +15,7 @@ from wiw.render import resolve_backend
 from wiw.tabletop.kind import Kind, Setup, key_of
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import Robot, own_panda, robot_of
+from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks import presets
 from wiw.types import Episode, Goal, Wording
 
@@ -59,7 +60,7 @@ class Manipulation:
     default_policy = "scripted"
     senses = ("size", "cameras", "ids", "cloud", "grid")
     """Options of `wiw.make` that are the environment's."""
-    wording = Wording(succeeded="did what it was told", won="done", lost="not done", goal="what is left", asked="Told")
+    wording = Wording("did what it was told", "done", "not done", "what is left", asked="Told", steps="decisions")
 
     def __init__(
         self,
@@ -106,6 +107,11 @@ class Manipulation:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
 
+    @property
+    def stage(self) -> dict[str, Any]:
+        """Where reports draw plans on front views: the "camera" that takes them, and "ground", the table's height."""
+        return {"camera": asdict(CAMERAS["front"]), "ground": TABLE}
+
     def describe(self) -> dict[str, Any]:
         """JSON-able identity: what must be equal for two runs to be comparable."""
         backend = resolve_backend(self.backend)
@@ -133,6 +139,7 @@ class Manipulation:
         variation = index // len(self.tasks) % KINDS[name].variations
         here = (0.0, 0.0, 0.0)
         info = {"task": name, "seed": seed, "variation": variation}
+        info["instruction"] = KINDS[name].setup(seed, variation).instruction
         return Episode(f"{index:04d}", f"{name}/{seed}", here, 0.0, here, 0.0, float("nan"), info)
 
     def table(self, episode: Episode) -> Table:
