@@ -30,6 +30,8 @@ RISE = 0.025
 """Metres by which a cup stands higher in another once it has come to rest."""
 SURE, HUNG = 0.4, 0.6
 """Likeness of what is seen of a cup that is enough; what a cup counts that hangs over the target."""
+STILL = 0.5
+"""By how much less a cup counts that is seen where it was."""
 SHIFTS = np.array([(x, y, 0.0) for x in (-0.015, 0.0, 0.015) for y in (-0.015, 0.0, 0.015)])
 """Metres by which the target may have been pushed where it is looked for."""
 NEST = 0.035
@@ -71,14 +73,11 @@ class StackCups(Kind):
         return [name for name in objects if name != target]
 
     def succeeded(self, bench: Workbench, setup: Setup) -> bool:
-        """The others stand upright in the target, and nothing is held."""
+        """The others stand upright in the target, that on the table, and nothing is held."""
         base = bench.place_of(setup.target)
         others = [bench.place_of(name) for name in setup.objects if name != setup.target]
-        inside = all(
-            np.linalg.norm(cup[:2, 3] - base[:2, 3]) < 0.015 and cup[2, 2] > 0.95 and cup[2, 3] > TABLE + 0.01
-            for cup in others
-        )
-        return bool(inside and bench.held is None and base[2, 2] > 0.95)
+        inside = all(_inside(cup, base) and cup[2, 2] > 0.95 for cup in others)
+        return bool(inside and bench.held is None and base[2, 2] > 0.95 and base[2, 3] < TABLE + 0.01)
 
     def expert(
         self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None
@@ -104,30 +103,39 @@ class StackCups(Kind):
     def looks_done(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
         """The others' colours are seen stacked above the target's rim, in any order; less where one hangs over it.
 
-        The target may have been pushed a little.
+        What is still seen where it was counts half: there are cups of nearly the same colour. The target may have been
+        pushed a little.
         """
-        base = places[target][:3, 3]
-        others = [name for name in places if name != target]
-        return max(_stacked(front, base + shift, target, others) for shift in SHIFTS)
+        base = places[target]
+        counts = {name: 1 - STILL * _stays(front, name, cup, base) for name, cup in places.items() if name != target}
+        return max(_stacked(front, base[:3, 3] + shift, target, counts) for shift in SHIFTS)
 
 
-def _stacked(front: NDArray[np.uint8], base: NDArray[np.float64], target: str, others: Sequence[str]) -> float:
-    """The same with the target at a place [3]."""
+def _stacked(front: NDArray[np.uint8], base: NDArray[np.float64], target: str, counts: Mapping[str, float]) -> float:
+    """The same with the target at a place [3], and what each of the others counts at most."""
     stands = min(1.0, alike_at(front, base + _WALL, PALETTE[target]) / SURE)
-    levels = [_RIM + base + np.array([0, 0, level * RISE]) for level in range(1, len(others) + 1)]
-    seen = {name: [min(1.0, alike_at(front, rim, PALETTE[name]) / SURE) for rim in levels] for name in others}
+    levels = [_RIM + base + np.array([0, 0, level * RISE]) for level in range(1, len(counts) + 1)]
+    seen = {name: [min(1.0, alike_at(front, rim, PALETTE[name]) / SURE) for rim in levels] for name in counts}
     over = _WALL + base + np.array([0, 0, CARRY - GRIP])
-    hung = {name: HUNG * alike_at(front, over, PALETTE[name]) for name in others}
+    hung = {name: HUNG * alike_at(front, over, PALETTE[name]) for name in counts}
     best = max(
-        sum(max(seen[name][level], hung[name]) for level, name in enumerate(order)) for order in permutations(others)
+        sum(counts[name] * max(seen[name][level], hung[name]) for level, name in enumerate(order))
+        for order in permutations(counts)
     )
-    return (0.5 + 0.5 * stands) * best / len(others)
+    return (0.5 + 0.5 * stands) * best / len(counts)
+
+
+def _stays(front: NDArray[np.uint8], name: str, before: Pose, base: Pose) -> float:
+    """How much a cup is seen where it was; 0 for one that was in the target already."""
+    if _inside(before, base):
+        return 0.0
+    return min(1.0, alike_at(front, before[:3, 3] + _WALL, PALETTE[name]) / SURE)
 
 
 def _inside(cup: Pose, base: Pose) -> bool:
     """Whether a cup stands in another."""
     off = cup[:3, 3] - base[:3, 3]
-    return bool(np.linalg.norm(off[:2]) < 0.015 and 0.01 < off[2] < CUPS * RISE + 0.01)
+    return bool(np.linalg.norm(off[:2]) < 0.015 and 0.01 < off[2] < CUPS * RISE)
 
 
 def _outside(heights: Sequence[float]) -> NDArray[np.float64]:
