@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import csv
 import io
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from browser import COMMAND, WHY, Browser
 from PIL import Image, ImageSequence
 from pressing_policy import Pressing
 from test_evaluation_report import Page
+from test_export import contents_of
 
 import wiw
 from wiw.errors import ArgumentError
@@ -137,6 +140,19 @@ def test_the_report_shows_plans_beside_their_ends(log: Any, html: str) -> None:
     shared = {attributes["id"] for tag, attributes in tags if tag == "image"}
     used = {attributes["href"][1:] for tag, attributes in tags if tag == "use" and "href" in attributes}
     assert used == shared and len(shared) == decisions + 2 * len(ARMS)
+
+
+def test_exports_hold_poses_and_pictures(log: Any, tmp_path: Path) -> None:
+    log.export(csv=tmp_path / "csv")
+    with (tmp_path / "csv" / "decisions.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [json.loads(row["executed"]) for row in rows] == [row["executed"] for row in log.decisions]
+    pytest.importorskip("rerun")
+    log.export(rerun=tmp_path / "run.rrd")
+    entities, images = contents_of(tmp_path / "run.rrd")
+    assert {"/episode_0001/none/front", "/episode_0001/none/end", "/episode_0000/oracle/planned"} <= entities
+    assert not any(entity.endswith("world") or "distance" in entity for entity in entities)
+    assert images == sum(len(log.store.images(r["arm"], r["episode"], r["decision"])) for r in log.decisions)
 
 
 def test_success_is_told_by_kind(log: Any) -> None:

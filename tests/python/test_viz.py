@@ -8,7 +8,7 @@ from wiw.evaluation.scene_map import HFOV_DEG, draw, look_down, to_pixels
 from wiw.nav import NavMesh
 from wiw.render import Renderer
 from wiw.scenes import load
-from wiw.types import Decision, Goal, Observation, Proposal, Rollout
+from wiw.types import ArmObservation, Decision, Goal, Key, Observation, Proposal, Rollout
 
 
 def decision(frames=(5, 60, 60, 3), observation=True):
@@ -33,6 +33,20 @@ def test_show_draws_every_frame_and_marks_the_choice(frames):
     assert titles.count("real, turned") == 1 and sum(title.startswith("imagined") for title in titles) == 9
     assert sum("chosen" in text.get_text() for axes in figure.axes for text in axes.texts) == 1
     assert figure._repr_png_()[:4] == b"\x89PNG"
+
+
+def test_show_draws_plans_of_poses():
+    pose = np.array([0.2, 0.0, 1.0, np.pi, 0, 0, 1.0])
+    plan = np.array([[0, 0, -0.1, 0, 0, 0, -1.0], [0, 0.1, -0.1, 0, 0, 0, -1.0]]) + pose
+    seen = ArmObservation(np.full((48, 48, 3), 90, np.uint8), pose)
+    rollout = Rollout(np.full((2, 48, 48, 3), 40, np.uint8), np.zeros(2, bool))
+    one = Decision(plan, 2, (Proposal(plan),), (rollout,), np.zeros(1), 0, seen, Goal("dot", text="go there"))
+    figure = wiw.show(one)
+    assert "↧● →" in {text.get_text() for axes in figure.axes for text in axes.texts}
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles.count("seen from the front") == 1 and sum(title.startswith("imagined") for title in titles) == 2
+    with pytest.raises(ArgumentError, match=r"env\.unwrapped\.observation"):
+        wiw.Agent("scripted").decide(seen.as_dict(), Goal("dot"), Key(0, 0))
 
 
 def test_show_needs_an_observation():

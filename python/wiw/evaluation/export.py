@@ -20,7 +20,7 @@ Table = list[dict[str, Any]]
 
 NUMBERED = ("seconds", "calls", "spent")
 """Columns of decisions with named numbers, each of which becomes a column such as seconds_propose."""
-NESTED = ("actions", "executed", "answer", "real_frames", "path")
+NESTED = ("actions", "executed", "answer", "real_frames", "path", "refused")
 """Columns of decisions that stay lists in Parquet and become JSON in CSV."""
 
 

@@ -209,9 +209,12 @@ class Agent:
         """One decision for one episode; `observation` is an Observation or the environment's dict.
 
         Raises:
-            ArgumentError: a dict whose images have boxes drawn on them, which no world model is to see.
+            ArgumentError: a dict whose images have boxes drawn on them, which no world model is to see, or a
+                manipulator's, which lacks what policies are told.
         """
         if isinstance(observation, dict):
+            if "pose" in observation:
+                raise ArgumentError("decide: this dict does not say where things are; pass env.unwrapped.observation")
             if "panorama_box" in observation:
                 raise ArgumentError("decide: these images have the target's box drawn on them; pass env.observation")
             observation = Observation(**observation)

@@ -12,13 +12,16 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.report.cuts import BAND, FRONT
+from wiw.evaluation.report.cuts import BAND, FRONT, part
 from wiw.evaluation.report.plans import glyphs
-from wiw.types import Decision, Rollout
+from wiw.evaluation.report.stage import signs
+from wiw.evaluation.rows import kept_frames
+from wiw.tabletop.workbench import SHUT
+from wiw.types import ArmObservation, Decision, Observation, Rollout
 
 CHOSEN, OTHER = "#2e9e6b", "#9a9ea8"
 WIDTH, TOP, ROW = 11.0, 2.7, 1.15
-"""Inches: of the figure, of the panorama's row, of a candidate's row."""
+"""Inches: of the figure, of the row of what was seen, of a candidate's row."""
 
 
 class DecisionFigure(Figure):
@@ -55,17 +58,27 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     goal = decision.goal
     has_image = goal is not None and goal.image is not None
     columns = place.subgridspec(1, 2, width_ratios=[4, 1]) if has_image else place.subgridspec(1, 1)
-    panorama = decision.observation.as_dict()["panorama"]
-    height = len(panorama)
-    _picture(
-        figure.add_subplot(columns[0, 0]),
-        panorama[round(BAND[0] * height) : round(BAND[1] * height)],
-        "seen, all around",
-    )
+    _picture(figure.add_subplot(columns[0, 0]), *_seen(decision.observation))
     if goal is not None and goal.image is not None:
         _picture(figure.add_subplot(columns[0, 1]), goal.image, "goal")
     if goal is not None and goal.text:
         figure.suptitle(goal.text)
+
+
+def _seen(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
+    """A picture of where the agent is, and what it is."""
+    if isinstance(observation, ArmObservation):
+        return observation.front, "seen from the front"
+    panorama = observation.as_dict()["panorama"]
+    return part(panorama, BAND, (0, 1)), "seen, all around"
+
+
+def _told(decision: Decision, index: int) -> str:
+    """A plan in signs."""
+    actions, here = decision.proposals[index].actions.tolist(), decision.observation
+    if isinstance(here, ArmObservation):
+        return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
+    return " ".join(glyphs(actions))
 
 
 def _candidate(figure: Figure, place: Any, decision: Decision, index: int, scores: NDArray[np.float64]) -> None:
@@ -76,7 +89,7 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
     label = figure.add_subplot(columns[0, 0])
     label.axis("off")
     label.set(xlim=(0, 1), ylim=(0, 1))
-    label.text(0, 0.68, " ".join(glyphs(decision.proposals[index].actions.tolist())), fontsize=12, weight="bold")
+    label.text(0, 0.68, _told(decision, index), fontsize=12, weight="bold")
     low, high = np.nanmin(scores), np.nanmax(scores)
     share = 1.0 if high <= low else (scores[index] - low) / (high - low)
     label.barh([0.42, 0.42], [1, share], height=0.08, color=["#e4e2db", color])
@@ -86,10 +99,11 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
 
 
 def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) -> None:
-    cells = place.subgridspec(1, len(rollout.frames), wspace=0.02)
-    for k, frame in enumerate(rollout.frames):
-        axes = figure.add_subplot(cells[0, k])
-        _picture(axes, _front(frame), "real, turned" if rollout.real[k] else f"imagined {k + 1}", size=7)
+    kept = kept_frames(len(rollout.frames))
+    cells = place.subgridspec(1, len(kept), wspace=0.02)
+    for column, k in enumerate(kept):
+        axes = figure.add_subplot(cells[0, column])
+        _picture(axes, _front(rollout.frames[k]), "real, turned" if rollout.real[k] else f"imagined {k + 1}", size=7)
         if border is not None:
             axes.spines[:].set(visible=True, color=border, linewidth=2.5)
 
@@ -98,9 +112,7 @@ def _front(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The first of several views; of a panorama the part towards which the agent looks."""
     view = frame[0] if frame.ndim == 4 else frame
     height, width = view.shape[:2]
-    if width <= 1.6 * height:
-        return view
-    return view[round(BAND[0] * height) : round(BAND[1] * height), round(FRONT[0] * width) : round(FRONT[1] * width)]
+    return view if width <= 1.6 * height else part(view, BAND, FRONT)
 
 
 def _picture(axes: Axes, image: NDArray[np.uint8], title: str, size: int = 9) -> None:
