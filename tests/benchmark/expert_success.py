@@ -24,7 +24,7 @@ GRID = PoseGrid()
 def solved(kind: Kind, seed: int, on_grid: bool, robot: Robot | None) -> bool:
     """Whether the expert does what the table of a seed asks."""
     setup = kind.setup(seed, seed % kind.variations)
-    bench, left = setup.bench(robot), POSES
+    bench, left = setup.bench(robot=robot), POSES
     while left and not kind.succeeded(bench, setup):
         plan = kind.expert(bench.places(setup.objects), setup.target)
         for pose in (GRID.decode(GRID.encode(plan)) if on_grid else plan)[:left]:
