@@ -12,7 +12,7 @@ help:       ## this list
 setup:      ## Debian packages, .venv, the package in editable mode
 	@scripts/setup
 
-demo:       ## the main job: ImageNav on generated apartments with five world models, table and report
+demo:       ## the main job: navigation with five world models and an arm at a table with three, tables and reports
 	@scripts/setup torch
 	$(BIN)/wiw demo
 

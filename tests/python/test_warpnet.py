@@ -252,10 +252,11 @@ def test_constants_made_for_a_rollout_serve_training_too() -> None:
 def test_the_demo_leaves_it_out_where_torch_is_missing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from wiw.cli.demo import ARMS, _arms
+    from wiw.cli.demo import PARTS, _arms
 
-    assert _arms() == list(ARMS)
+    names = PARTS[0].arms
+    assert _arms(names) == list(names)
     assert not capsys.readouterr().out
     monkeypatch.setattr("wiw.world_models.base.importlib.util.find_spec", lambda name: None)
-    assert _arms() == ["none", "copy", "warp", "oracle"]
+    assert _arms(names) == ["none", "copy", "warp", "oracle"]
     assert "warpnet is left out: torch" in capsys.readouterr().out

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,56 +13,89 @@ from tyro.conf import arg
 
 from wiw.world_models.base import Requirements
 
-ARMS = ("none", "copy", "warpnet", "warp", "oracle")
-SCENES, PER_SCENE = 2, 2
+
+@dataclass(frozen=True)
+class Part:
+    """One task of the demo."""
+
+    task: str
+    policy: str
+    arms: tuple[str, ...]
+    episodes: int
+    about: str
+    """What happens, in a sentence that goes on with the number of world models."""
+    more: str
+    """A command for more of the same."""
+    options: dict[str, Any] = field(default_factory=dict)
+    """Of the task."""
+
+
+PARTS = (
+    Part(
+        "imagenav",
+        "matcher",
+        ("none", "copy", "warpnet", "warp", "oracle"),
+        4,
+        "An agent looks for the place where a photograph was taken: 4 episodes in 2 generated apartments",
+        "wiw run imagenav --arms none,copy,warpnet,warp,oracle --episodes 100",
+        {"scenes": "apartments:val:2", "per_scene": 2},
+    ),
+    Part(
+        "manipulation",
+        "scripted",
+        ("none", "copy", "oracle"),
+        6,
+        "A robot arm pushes buttons in the order that it is told: 6 episodes",
+        "wiw run manipulation --arms none,copy,oracle",
+        {"tasks": "push_buttons"},
+    ),
+)
 
 
 def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
-    """Image-Goal Navigation in generated apartments, with five world models on the same few episodes.
+    """Image-Goal Navigation in generated apartments and a robot arm at a table, with several world models each.
 
-    An agent sees a photograph and looks for the place where it was taken. Before each decision it imagines where its
-    candidate plans would lead: not at all (none), into a world where nothing moves (copy, the floor), into what a
-    small network makes of its view (warpnet; needs torch), into its view warped by true depth (warp), or into the true
-    future (oracle, the ceiling).
+    Before each decision an agent imagines where its candidate plans would lead: not at all (none), into a world where
+    nothing moves (copy, the floor), into what a small network makes of its view (warpnet; needs torch), into its view
+    warped by true depth (warp), or into the true future (oracle, the ceiling).
 
     $ wiw demo
 
     Args:
-        out: Folder of the run; runs/demo-TIME if not given.
+        out: Folder of the runs, one a task; runs/demo-TIME if not given.
     """
+    begin = time.perf_counter()
+    folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
+    codes = [_run(part, folder / part.task) for part in PARTS]
+    print(f"\ntook    {time.perf_counter() - begin:.0f} s. More episodes say more:")
+    for part in PARTS:
+        print(f"        {part.more}")
+    return max(codes)
+
+
+def _run(part: Part, folder: Path) -> int:
+    """One part, with its table and report; its exit code."""
     from wiw.cli.run import finish
     from wiw.cli.stop import stoppable
     from wiw.evaluation.evaluate import evaluate
     from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 
-    begin = time.perf_counter()
-    arms = _arms()
-    print(
-        f"An agent looks for the place where a photograph was taken: {SCENES * PER_SCENE} episodes in {SCENES} "
-        f"generated apartments, {len(arms)} world models.\n"
-    )
-    task = TaskRecipe("imagenav", {"scenes": f"apartments:val:{SCENES}", "per_scene": PER_SCENE})
-    folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
+    arms = _arms(part.arms)
+    print(f"\n{part.about}, {len(arms)} world models.\n")
+    task, agent = TaskRecipe(part.task, part.options), AgentRecipe(part.policy)
 
     def work() -> Any:
-        return evaluate(
-            task, AgentRecipe("matcher"), SCENES * PER_SCENE, out=folder, arms=arms, live=SCENES * PER_SCENE
-        )
+        return evaluate(task, agent, part.episodes, out=folder, arms=arms, live=part.episodes)
 
-    code = finish(stoppable(work, folder), report=True)
-    print(
-        f"took    {time.perf_counter() - begin:.0f} s. More episodes say more:  "
-        f"wiw run imagenav --arms {','.join(arms)} --episodes 100"
-    )
-    return code
+    return finish(stoppable(work, folder), report=True)
 
 
-def _arms() -> list[str]:
+def _arms(names: tuple[str, ...]) -> list[str]:
     """Those that can run here; says which is left out, and why."""
     from wiw.registry import WORLD_MODELS
 
     arms = []
-    for name in ARMS:
+    for name in names:
         requires = getattr(WORLD_MODELS.find(name), "requires", Requirements())
         if missing := requires.missing():
             print(f"{name} is left out: {', '.join(missing)} not installed (pip install 'wiw[{requires.extra}]')\n")
