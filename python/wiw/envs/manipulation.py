@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wiw.action import PoseGrid
 from wiw.envs.sensors import Sensors
+from wiw.envs.table_guide import TableGuide
 from wiw.errors import ArgumentError
 from wiw.tabletop.workbench import Pose, Workbench
 from wiw.types import ArmObservation, Episode, Goal, Key, Truth
@@ -55,8 +56,14 @@ class ManipulationTask(Protocol):
     def episode(self, index: int) -> Episode:
         """An episode by its number."""
 
-    def table(self, episode: Episode) -> Table:
-        """An episode's table, as it begins."""
+    def table(self, episode: Episode) -> Any:
+        """An episode's `Table`, as it begins."""
+
+    def progress(self, table: Any, bench: Workbench) -> float:
+        """How good it would be if a table stood as a fork of it does, the higher the better."""
+
+    def expert(self, table: Any, bench: Workbench) -> NDArray[np.float64]:
+        """float64 [K, 7]: what is left to do for who knows what is asked; nothing where nothing helps."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +219,10 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
     def fork(self) -> Workbench:
         """The physics as they stand, to be run ahead by the oracle; this environment does not move."""
         return self.table.bench.fork()
+
+    def guide(self) -> TableGuide:
+        """The truth about plans from here, for stages of the loop that an experiment tells it."""
+        return TableGuide(self.task, self.table, self.fork())
 
     def truth(self) -> Truth:
         """Where the gripper is, for records and reports alone; no distance leads to what is asked for."""

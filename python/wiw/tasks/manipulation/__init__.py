@@ -8,6 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.errors import ArgumentError
@@ -15,12 +18,14 @@ from wiw.render import resolve_backend
 from wiw.tabletop.kind import Kind, Setup, key_of
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import Robot, own_panda, robot_of
-from wiw.tabletop.workbench import CAMERAS, TABLE
+from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
-from wiw.types import Episode, Goal, Wording
+from wiw.types import ArmObservation, Episode, Goal, Wording
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
+HOPELESS = -1000.0
+"""Progress where nothing helps any more, such as after a wrong button."""
 
 
 @dataclass(frozen=True)
@@ -148,6 +153,20 @@ class Manipulation:
         return Table(
             kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend, self.robot
         )
+
+    def progress(self, table: Table, bench: Workbench) -> float:
+        """0 where what is asked for is done, else less by each pose that an expert would need."""
+        if table.kind.succeeded(bench, table.setup):
+            return 0.0
+        return float(-len(self.expert(table, bench)) or HOPELESS)
+
+    def expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
+        """float64 [K, 7]: what is left to do, as a bench stands; nothing where nothing helps."""
+        kind, setup = table.kind, table.setup
+        places = bench.places(setup.objects)
+        front = bench.picture(arm=False)["color"]
+        left = kind.left(ArmObservation(front, bench.pose, places=places), setup.target)
+        return np.empty((0, 7)) if left is None else kind.expert(places, left, bench.pose)
 
 
 def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
