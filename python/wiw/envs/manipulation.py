@@ -16,6 +16,7 @@ from wiw.action import PoseGrid
 from wiw.envs.sensors import Sensors
 from wiw.envs.table_guide import TableGuide
 from wiw.errors import ArgumentError
+from wiw.tabletop.robot import Robot
 from wiw.tabletop.workbench import Pose, Workbench
 from wiw.types import ArmObservation, Episode, Goal, Key, Truth
 
@@ -53,6 +54,10 @@ class ManipulationTask(Protocol):
     def actions(self) -> int:
         """K: poses an episode may take."""
 
+    @property
+    def robot(self) -> Robot:
+        """The arm."""
+
     def episode(self, index: int) -> Episode:
         """An episode by its number."""
 
@@ -88,7 +93,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
     Actions are absolute poses float64 [7] of the gripper: x, y, z in metres, roll, pitch, yaw, and how open it is. A
     way that leads into the table or out of reach is gone as far as it is free, and recorded. Success is rewarded by 1.
 
-    Observations are dicts: "front" uint8 [size, size, 3]; "pose" float64 [7], "joints" float64 [9] (the arm's, then the
+    Observations are dicts: "front" uint8 [size, size, 3]; "pose" float64 [7], "joints" float64 [9] (the Panda's and its
     fingers') and "held" (1 while the gripper holds something). What is asked for comes on top, by each camera.
 
     Args:
@@ -119,7 +124,8 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         cloud: bool = False,
         grid: bool = False,
     ) -> None:
-        self.task, self.sensors = task, Sensors(size, tuple(cameras), depth, ids, cloud)
+        joints = len(task.robot.description.joints)
+        self.task, self.sensors = task, Sensors(size, tuple(cameras), depth, ids, cloud, joints)
         self.grid = PoseGrid() if grid else None
         self.render_mode = "rgb_array"
         self.action_space = action_space(self.grid)

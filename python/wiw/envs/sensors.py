@@ -35,6 +35,8 @@ class Sensors:
     depth: bool = False
     ids: bool = False
     cloud: bool = False
+    joints: int = 9
+    """Of the arm and its fingers."""
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.cameras if name not in CAMERAS]:
@@ -59,7 +61,7 @@ class Sensors:
         count = len(self.names) * self.size**2
         seen: dict[str, spaces.Space[Any]] = {
             "pose": spaces.Box(-np.inf, np.inf, (7,), np.float64),
-            "joints": spaces.Box(-np.inf, np.inf, (9,), np.float64),
+            "joints": spaces.Box(-np.inf, np.inf, (self.joints,), np.float64),
             "held": spaces.Discrete(2),
         }
         for name in self.names:
