@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from wiw.errors import ArgumentError
+from wiw.physics import place
 from wiw.tabletop.kind import holds
 from wiw.tabletop.kinds import KINDS, kind_of
-from wiw.tabletop.workbench import Workbench
+from wiw.tabletop.workbench import TABLE, Workbench
 from wiw.types import ArmObservation
 
 
@@ -112,7 +113,15 @@ def test_what_is_held_is_told_by_the_fingers() -> None:
     hand = np.array([0.0, 0.035, 0.0, np.pi, 0, 0, 0.17])
     assert holds(hand, ring)
     assert not holds(None, ring)
-    for place, value in ((6, 0.0), (6, 1.0), (1, 0.085), (2, 0.1)):
+    for index, value in ((6, 0.0), (6, 1.0), (1, 0.085), (2, 0.1)):
         elsewhere = hand.copy()
-        elsewhere[place] = value
+        elsewhere[index] = value
         assert not holds(elsewhere, ring)
+
+
+def test_cups_that_are_stacked_are_left() -> None:
+    kind = KINDS["stack_cups"]
+    setup = kind.setup(40, 41)
+    places = dict(zip(setup.objects, [place(0.1, 0.1, TABLE + 0.025 * level) for level in range(3)], strict=True))
+    plan = kind.expert(places, setup.target)
+    assert plan.shape == (1, 7) and plan[0, 2] > TABLE + 0.15 and plan[0, 6] == 1

@@ -28,6 +28,8 @@ LAMP = Cylinder(RING + 0.0005, HIGH + 0.001)
 """Over the ring when it is lit."""
 DARK = (0.2, 0.2, 0.22)
 """Of the ring that is not lit."""
+PLAIN = 0.3
+"""Likeness of all rings together to those of a stage, below which they show another push; three may be hidden."""
 DOUBT = 0.1
 """Squared likeness of a pixel to what is expected nowhere, so that the hand before a ring says nothing."""
 SURE = 0.3
@@ -85,7 +87,7 @@ class PushButtons(Kind):
         """The pushes to come, by the rings that are lit; None also where they show another push."""
         alike = _stages(seen.front, seen.places, target)
         pushed = int(np.argmax(alike))
-        return tuple(target[pushed:]) if alike[pushed] > 0.5 and pushed < len(target) else None
+        return tuple(target[pushed:]) if alike[pushed] > PLAIN and pushed < len(target) else None
 
     def succeeded(self, bench: Workbench, setup: Setup) -> bool:
         """The pushes so far are those that are asked for."""

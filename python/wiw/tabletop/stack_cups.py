@@ -76,13 +76,13 @@ class StackCups(Kind):
         """The others stand upright in the target, that on the table, and nothing is held."""
         base = bench.place_of(setup.target)
         others = [bench.place_of(name) for name in setup.objects if name != setup.target]
-        inside = all(_inside(cup, base) and cup[2, 2] > 0.95 for cup in others)
+        inside = all(_inside(cup, base, 0.015) and cup[2, 2] > 0.95 for cup in others)
         return bool(inside and bench.held is None and base[2, 2] > 0.95 and base[2, 3] < TABLE + 0.01)
 
     def expert(
         self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Each by its rim, over the target, down, and let go; what is in it already stays."""
+        """Each by its rim, over the target, down, and let go; what is in it already stays. With all in it, up."""
         base = places[target]
         others = [name for name in places if name != target]
         todo = [name for name in others if not _inside(places[name], base)]
@@ -98,7 +98,7 @@ class StackCups(Kind):
                 plan += [above(x, y, h, g) for h, g in ((CARRY, 1), (cup[2, 3] - TABLE + GRIP, 0), (CARRY, 0))]
             u, v = base[:2, 3] + grip
             plan += [above(u, v, h, g) for h, g in ((CARRY, 0), (GRIP + level * NEST + 0.01, 1), (CARRY, 1))]
-        return np.array(plan)
+        return np.array(plan or [above(base[0, 3], base[1, 3], CARRY, 1)])
 
     def looks_done(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
         """The others' colours are seen stacked above the target's rim, in any order; less where one hangs over it.
@@ -132,10 +132,10 @@ def _stays(front: NDArray[np.uint8], name: str, before: Pose, base: Pose) -> flo
     return min(1.0, alike_at(front, before[:3, 3] + _WALL, PALETTE[name]) / SURE)
 
 
-def _inside(cup: Pose, base: Pose) -> bool:
-    """Whether a cup stands in another."""
+def _inside(cup: Pose, base: Pose, off_axis: float = 0.03) -> bool:
+    """Whether a cup stands in another, their axes at most so many metres apart."""
     off = cup[:3, 3] - base[:3, 3]
-    return bool(np.linalg.norm(off[:2]) < 0.015 and 0.01 < off[2] < CUPS * RISE)
+    return bool(np.linalg.norm(off[:2]) < off_axis and 0.01 < off[2] < CUPS * RISE)
 
 
 def _outside(heights: Sequence[float]) -> NDArray[np.float64]:
