@@ -260,6 +260,8 @@ def test_a_function_and_a_served_model_are_checked_as_any(two_rooms):
     assert found(rollout, two_rooms, accepts=Honest.accepts) == {}
     with served(Honest) as server:
         assert found(f"remote:{server.address}", two_rooms) == {}
+    with served(Arm) as server:
+        assert found(f"remote:{server.address}", "nowhere") == {}
     with served(spoilt(by_chance)) as server:
         assert set(found(f"remote:{server.address}", two_rooms)) == {"random"}
     with served(spoilt(lambda frames, *_: frames[:, 1:])) as server:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from pressing_policy import Pressing
 
 import wiw
 from wiw.cli import main
@@ -18,7 +19,9 @@ from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 from wiw.evaluation.runlog import load_run
 from wiw.evaluation.store import RunStore
 from wiw.render import resolve_backend
+from wiw.tabletop.kind import above
 from wiw.tasks.manipulation import KINDS, Manipulation
+from wiw.types import Proposal
 
 POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
 SHORT = {"tasks": "push_buttons,slide_block", "actions": 3, "candidates": 2, "horizon": 3}
@@ -179,3 +182,26 @@ def test_a_guide_knows_what_plans_are_worth() -> None:
     assert not env.run(wrong).terminated
     assert env.guide().worth(env.table.bench.pose[None]) < -100
     assert len(env.guide().plan(5)) == 1
+
+
+class Sinking(Pressing):
+    """Into the table, and up again."""
+
+    def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
+        ways = np.array([above(0.2, 0.35, height, 1.0) for height in (-0.2, 0.2, -0.2)])
+        return [[Proposal(ways)] for _ in situations]
+
+
+def test_refused_ways_are_on_record(tmp_path: Path) -> None:
+    task = Manipulation("slide_block", actions=6)
+    log = evaluate(task, wiw.Agent(Sinking()), 1, out=tmp_path, progress=False)
+    assert [decision["refused"] for decision in log.decisions] == [["collision"] * 2] * 2
+    (episode,) = log.episodes
+    assert episode["metrics"]["refused"] == 4.0 and episode["metrics"]["poses"] == 6.0
+
+
+def test_intervals_say_that_every_episode_has_a_table_of_its_own(run: Path) -> None:
+    summary = load_run(run).summary()
+    assert "over 4 episodes, each in a scene of its own" in str(summary)
+    assert set(summary.kinds) == {"push_buttons", "slide_block"}
+    assert all(estimate.n == 2 for found in summary.kinds.values() for estimate in found.values())

@@ -315,6 +315,8 @@ def _about_intervals(summary: Summary) -> list[str]:
         return []
     if first.scenes == 1:
         return [f"95 % intervals over episodes of one scene ({first.method}); they say nothing about other scenes."]
+    if first.scenes == first.n:
+        return [f"95 % intervals: Student's t over {first.n} episodes, each in a scene of its own."]
     few = " So few leave them wide: add scenes, not episodes of the same." if first.scenes < 5 else ""
     return [f"95 % intervals: Student's t over {first.scenes} scenes.{few}"]
 
