@@ -14,6 +14,8 @@ Choose = Callable[[str, Sequence[str]], int]
 PHRASES = ("the way ahead is clear", "something is in the way", "it is on the left", "it is on the right")
 MOST_ITEMS = 8
 """Of an array whose schema names no limit."""
+MOST_NUMBERS = 1000
+"""From the least that a whole number may be."""
 
 
 def instance(schema: Mapping[str, Any], choose: Choose) -> str:
@@ -37,6 +39,8 @@ def _value(part: Mapping[str, Any], root: Mapping[str, Any], before: str, choose
         names = [json.dumps(option, sort_keys=True) for option in options]
         return _value(options[choose(before, names)], root, before, choose)
     kind = part.get("type")
+    if kind == "integer" and "enum" not in part and "const" not in part:
+        return _integer(part, before, choose)
     if kind in ("object", "array"):
         return (_object if kind == "object" else _array)(part, root, before, choose)
     texts = _texts(part)
@@ -76,10 +80,19 @@ def _strings(part: Mapping[str, Any]) -> list[str]:
     return [json.dumps(phrase[:most]) for phrase in PHRASES]
 
 
-def _integers(part: Mapping[str, Any]) -> list[str]:
+def _integer(part: Mapping[str, Any], before: str, choose: Choose) -> str:
+    """Written character by character, so that a wide range is not many ways at once."""
     low = int(part.get("minimum", part.get("exclusiveMinimum", -1) + 1))
     high = int(part.get("maximum", part.get("exclusiveMaximum", low + 10) - 1))
-    return [str(value) for value in range(low, min(high, low + 100) + 1)]
+    whole = [str(value) for value in range(low, min(high, low + MOST_NUMBERS) + 1)]
+    text = ""
+    while True:
+        begun = [value for value in whole if value.startswith(text)]
+        options = sorted({value[len(text) : len(text) + 1] for value in begun})
+        found = options[choose(before + text, options)] if len(options) > 1 else options[0]
+        if not found:
+            return text
+        text += found
 
 
 def _numbers(part: Mapping[str, Any]) -> list[str]:
@@ -90,7 +103,6 @@ def _numbers(part: Mapping[str, Any]) -> list[str]:
 
 _SCALARS: dict[Any, Callable[[Mapping[str, Any]], list[str]]] = {
     "string": _strings,
-    "integer": _integers,
     "number": _numbers,
     "boolean": lambda _: ["true", "false"],
     "null": lambda _: ["null"],

@@ -169,11 +169,13 @@ class TransformersClient(Client):
         ways = [self._inputs(messages, before + option) for option in options]
         tokens = [way["input_ids"][0].tolist() for way in ways]
         begin = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, zip(*tokens, strict=False)))
-        chances = []
+        chances, told = [], None
         for way, own in zip(ways, tokens, strict=True):
-            with torch.inference_mode():
-                told = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
-            chances.append(_chance(told, own, tokens, begin))
+            goes_on = sum(each[: begin + 1] == own[: begin + 1] for each in tokens) > 1  # as another does
+            if told is None or goes_on:
+                with torch.inference_mode():
+                    told = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
+            chances.append(_chance(told if goes_on else told[:1], own, tokens, begin))
         return torch.tensor(chances)
 
 
