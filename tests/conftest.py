@@ -82,12 +82,14 @@ def world_model_options(
 ) -> Iterator[Callable[[str], dict[str, Any]]]:
     """What a built-in world model is made with in tests: tiny random weights, saved once, or a service on the loopback.
 
+    Those that are trained for actions follow primitives, or with kind="pose7" poses of a gripper.
+
     Skips a model whose packages are not installed.
     """
     folder, saved = tmp_path_factory.mktemp("weights"), set()
     stack = ExitStack()
 
-    def options(name: str) -> dict[str, Any]:
+    def options(name: str, kind: str = "discrete") -> dict[str, Any]:
         requires = wiw.registry.WORLD_MODELS.find(name).requires
         if missing := requires.missing():
             pytest.skip(f"no {', '.join(missing)}: pip install 'wiw[{requires.extra}]'")
@@ -102,7 +104,9 @@ def world_model_options(
         if name not in saved:
             tiny_pipelines.save(name, folder / name)
             saved.add(name)
-        trained = {"checkpoint": str(folder / name / "trained")} if name.endswith("-action") else {}
+        trained = (
+            {"checkpoint": tiny_pipelines.checkpoint(name, folder / name, kind)} if name.endswith("-action") else {}
+        )
         return {"weights": str(folder / name), "device": "cpu", **tiny_pipelines.OPTIONS[name], **trained}
 
     @cache

@@ -91,6 +91,20 @@ def save(name: str, folder: Path) -> Path:
     return folder
 
 
+def checkpoint(name: str, folder: Path, kind: str) -> str:
+    """Of a model in `folder`: the one that `save` has made, or for poses another."""
+    if kind == "discrete":
+        return str(folder / "trained")
+    import tiny_actions
+
+    poses = folder / "poses"
+    if not poses.exists():
+        torch.manual_seed(0)
+        box = {"low": (-0.3, -0.5, 0.6), "high": (0.7, 0.5, 1.6)}
+        tiny_actions.save(name, BUILDERS[name.removesuffix("-action")](), poses, kind=kind, **box)
+    return str(poses)
+
+
 def _t5_tokenizer() -> Any:
     return T5TokenizerFast(vocab=[(piece, -float(i)) for i, piece in enumerate(PIECES)], extra_ids=10)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Both tasks from end to end, with every registered world model: a vision-language model behind a server writes plans,
+"""The tasks from end to end, with every registered world model: a vision-language model behind a server writes plans,
 looks at what the world model imagines of them, answers and decides."""
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ pytest.importorskip("json_repair")
 import wiw
 from recognition_file import CHOICES, a_file
 from wiw import panorama
+from wiw.errors import ArgumentError
 from wiw.policies.vlm import VLM
 from wiw.policies.vlm.looks import VIEW
 from wiw.serving.background import served
@@ -31,14 +32,34 @@ from wiw.vlm.mock import MockClient
 NAMES = wiw.registry.list_world_models()
 TASKS = ("imagenav", "ar")
 PLANS = (["forward", "turn_left"], ["turn_left", "forward"])
+POSES = ([[50, 40, 40, 0, 60, 60, 1], [50, 40, 30, 0, 60, 60, 0]], [[50, 60, 40, 0, 60, 60, 1]])
+MOVES_A_CAMERA = ("warp", "sana-wm", "nwm", "pathdreamer", "se3ds", "warpnet", "remote:")
+"""World models that know nothing of poses of a gripper."""
 
 
 def script(call: Call) -> Any:
     """The same two plans at every decision, and a doubtful liking for whatever comes first."""
     if call.schema is None:
         return {label: 0.5 / 2**k for k, label in enumerate(call.labels)}
-    plans = [{"reason": "free floor", "actions": plan} for plan in PLANS]
+    plans = (
+        [_at_the_table(plan) for plan in POSES]
+        if "Step" in call.schema.get("$defs", {})
+        else [_in_a_home(plan) for plan in PLANS]
+    )
     return json.dumps({"plans": plans} if "plans" in call.schema["properties"] else plans[0])
+
+
+def _in_a_home(plan: list[str]) -> Any:
+    return {"reason": "free floor", "actions": plan}
+
+
+def _at_the_table(plan: list[list[int]]) -> Any:
+    return {
+        "visual_state_description": "a block",
+        "reasoning_and_reflection": "it is there",
+        "language_plan": f"Go to it in {len(plan)} steps.",
+        "executable_plan": [{"action": action} for action in plan],
+    }
 
 
 @pytest.fixture(scope="module")
@@ -49,11 +70,15 @@ def server() -> Iterator[VlmServer]:
 
 @pytest.fixture
 def options(two_rooms: str, tmp_path: Path) -> Callable[[str], dict[str, Any]]:
-    """What a task is made with: two decisions in the two rooms."""
-    return lambda task: {
-        "decisions": 2,
-        **({"episode_file": a_file(tmp_path, two_rooms)} if task == "ar" else {"scenes": two_rooms}),
-    }
+    """What a task is made with: two decisions in the two rooms, or at a table."""
+    return lambda task: (
+        {"tasks": "slide_block", "actions": 4}
+        if task == "manipulation"
+        else {
+            "decisions": 2,
+            **({"episode_file": a_file(tmp_path, two_rooms)} if task == "ar" else {"scenes": two_rooms}),
+        }
+    )
 
 
 @pytest.fixture
@@ -64,21 +89,22 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
         server.client.asked.clear()
         policy = VLM(server.url, "scripted", dialect="vllm", proposals="listed", cache="off")
         labels = {"semantics": "simulator"} if model is not None and "semantic" in model.accepts.needs else {}
-        agent = wiw.Agent(policy, model, candidates=2, horizon=2, cache="off", **labels)
+        space: Any = {"space": "pose7"} if task == "manipulation" else {}
+        agent = wiw.Agent(policy, model, candidates=2, horizon=2, cache="off", **space, **labels)
         return wiw.evaluate(task, agent, 1, 0, tmp_path / "run", progress=False, keep_images=0, **options(task))
 
     return run
 
 
 @pytest.fixture
-def made(world_model_options: Any) -> Iterator[Callable[[str], Any]]:
+def made(world_model_options: Any) -> Iterator[Callable[..., Any]]:
     """A world model by its registered name; one that is elsewhere is served."""
     with ExitStack() as stack:
 
-        def make(name: str) -> Any:
+        def make(name: str, kind: str = "discrete") -> Any:
             if name == "remote:":
                 return wiw.world_model(name + stack.enter_context(served("copy")).address)
-            return wiw.world_model(name, **({} if name == "none" else world_model_options(name)))
+            return wiw.world_model(name, **({} if name == "none" else world_model_options(name, kind)))
 
         yield make
 
@@ -117,6 +143,25 @@ def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made:
     assert [len(call) for call in shown] == [2] * len(decisions)
     for strip in (strip for call in shown for strip in call):
         assert [np.ptp(view) > 0 for view in views(strip)] == [True, True]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_arm_with_every_world_model(name: str, run: Any, made: Any, server: VlmServer) -> None:
+    model = made(name, "pose7")
+    if name in MOVES_A_CAMERA:
+        with pytest.raises(ArgumentError, match=r"poses of a gripper|imagines panoramas"):
+            run("manipulation", model)
+        return
+    log = run("manipulation", model)
+    (episode,) = log.episodes
+    assert episode["status"] == "done", episode["error"]
+    decisions = list(log.store.decisions(episode["arm"]))
+    assert len(decisions) == 2 and all(row["exchanges"] for row in decisions)
+    shown = [strips(call) for call in server.client.asked if strips(call)]
+    assert [len(call) for call in shown] == ([] if name == "none" else [2, 2])
+    for strip, plan in ((strip, plan) for call in shown for strip, plan in zip(call, POSES, strict=True)):
+        assert strip.shape[1] // VIEW == len(plan)
+        assert all(np.ptp(view) > 0 for view in ([strip] if len(plan) == 1 else views(strip)))
 
 
 def colours(rays: Any) -> Any:

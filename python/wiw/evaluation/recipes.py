@@ -95,7 +95,8 @@ class AgentRecipe:
         made = {name: POLICIES.make(name, **own) for name, own in given.pop("policy_options").items()}
         for part in ("policy", "revision"):
             given |= {part: made[given[part]]} if given.get(part) in made else {}
-        return Agent(**given, **limits).settled(defaults)
+        space = {"space": defaults["space"]} if "space" in defaults else {}
+        return Agent(**given, **space, **limits).settled(defaults)
 
     def with_model(self, model: str) -> AgentRecipe:
         """The same agent with another world model."""

@@ -36,7 +36,7 @@ from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
 from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
 from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.types import ArmObservation, Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout
+from wiw.types import ArmObservation, Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout, Space
 from wiw.world_models.base import WorldModel
 
 _CONSULT = 0x636F6E73
@@ -114,12 +114,14 @@ class Agent:
         swaps: stages that are told the truth, of "imagination", "scoring" and "proposals" (`wiw.loop.swaps`).
         semantics: what tells world models that need it what each pixel is: "simulator", "rednet" or another source
             (`wiw.perception.semantics`); left alone where the model needs none.
+        space: what plans are made of, "discrete" primitives or "pose7" poses of a gripper, for a policy that can make
+            both; None means the task's own, else the policy's.
 
     Raises:
         WeightsError: those of LPIPS are not there.
-        ArgumentError: a number out of range; a model that would not be given what it needs; with depth > 1, a model
-            that shows no panorama or a policy that needs depth, which no imagined place has, and does not say how to
-            extend.
+        ArgumentError: a number out of range; a policy that makes plans of another kind; a model that would not be given
+            what it needs; with depth > 1, a model that shows no panorama or a policy that needs depth, which no
+            imagined place has, and does not say how to extend.
     """
 
     def __init__(
@@ -142,6 +144,7 @@ class Agent:
         imagine_fraction: float = 1.0,
         swaps: Collection[str] = (),
         semantics: Any = None,
+        space: Space | None = None,
     ) -> None:
         self.swaps = checked_swaps(swaps)
         if "imagination" in self.swaps:
@@ -149,7 +152,8 @@ class Agent:
         numbers = {"candidates": candidates, "horizon": horizon, "execute": execute, "depth": depth, "width": width}
         self.given = {name: value for name, value in numbers.items() if value is not None}
         """The numbers that were not left to the task."""
-        self.policy: Policy = POLICIES.make(policy)
+        self._given_space = space
+        self.policy: Policy = _of_space(POLICIES.make(policy), space)
         self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model).for_space(self.policy.space)
         self._given_revision = revision
         self.revision: Policy = self._reviser(revision)
@@ -252,7 +256,7 @@ class Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""
         parts = {"policy": self.policy, "model": self.model, "revision": self._given_revision}
         parts |= {"placebo": self.placebo, "pool": self._given_pool, "imagine_fraction": self.imagine_fraction}
-        parts |= {"swaps": self.swaps, "semantics": self.semantics}
+        parts |= {"swaps": self.swaps, "semantics": self.semantics, "space": self._given_space}
         return Agent(**{**parts, **self._limits, **self.given, **changes})
 
     def settled(self, defaults: Mapping[str, Any]) -> Agent:
@@ -399,14 +403,14 @@ class Agent:
 
     def _reviser(self, revision: Any) -> Policy:
         if revision is not None:
-            return POLICIES.make(revision)
+            return POLICIES.make(revision).for_space(self.policy.space)
         if self.policy.can_revise or self.model is None:
             return self.policy
         if self.policy.default_revision is None:
             raise ArgumentError(
                 f"Agent: policy {type(self.policy).__name__} only proposes; give `revision=` a policy that scores"
             )
-        return POLICIES.make(self.policy.default_revision)
+        return POLICIES.make(self.policy.default_revision).for_space(self.policy.space)
 
     def _situations(self, queries: Sequence[Query]) -> tuple[list[Situation], list[Situation]]:
         """Each episode as its proposer and as its reviser know it; the same object where one policy is both."""
@@ -472,6 +476,19 @@ class Agent:
 def consults(key: Key, fraction: float) -> bool:
     """Whether a world model that is consulted for a share of all decisions is consulted for this one."""
     return bool(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _CONSULT]), 1)[0] < fraction)
+
+
+def _of_space(policy: Policy, space: Space | None) -> Policy:
+    """The policy for plans of the kind that is asked for, if any is."""
+    if space is None:
+        return policy
+    made = policy.for_space(space)
+    if made.space != space:
+        raise ArgumentError(
+            f"Agent: plans are asked for in {PLANS[space]}, but policy {type(policy).__name__} makes them of "
+            f"{PLANS[made.space]}"
+        )
+    return made
 
 
 def _described(semantics: Any) -> Any:

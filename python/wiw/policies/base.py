@@ -60,6 +60,10 @@ class Policy(ABC):
     tokens: int = 0
     """Tokens that the policy's language model has read and written so far; 0 without one."""
 
+    def for_space(self, space: Space) -> Policy:
+        """The policy for plans of primitives or of poses, where it can make both. Default: itself."""
+        return self
+
     def begin(self, goal: Goal, key: Key) -> Any:
         """Memory for a new episode; None for a policy that keeps none."""
         return None

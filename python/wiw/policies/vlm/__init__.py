@@ -8,7 +8,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,19 +18,25 @@ from wiw.errors import ArgumentError, DependencyError
 from wiw.perception.tracking import Track, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import looks, plans, presets
-from wiw.policies.vlm.prompts import Prompts, tasks
+from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.base import Part
 from wiw.vlm.cache import reply_cache
 from wiw.vlm.prices import Prices
 
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
 SEEN = "front view (90 degrees wide) and panorama (360 degrees)"
 """Slot `obs_key`."""
 OUT_OF_SIGHT = "the target is neither in sight nor in an imagined view, nothing was asked"
-_DRAW, _ANSWER, _MOVE, _REVISE = 0x64726177, 0x616E7377, 0x6D6F7665, 0x72657669
+DRAW, _ANSWER, _MOVE, REVISE = 0x64726177, 0x616E7377, 0x6D6F7665, 0x72657669
 """Keep the seeds of a decision's questions apart."""
+DRAWN = "drawn: no answer could be used"
+TOKENS = 1024
+"""Of a plan at most."""
 MOVES = list(plans.PRIMITIVES.values())
 
 
@@ -39,10 +45,10 @@ class Memory:
     """What is kept of one episode."""
 
     horizon: int = 1
-    """Primitives that a plan may have."""
+    """Primitives, or poses, that a plan may have."""
     believed: NDArray[np.float64] | None = None
     """The last answer."""
-    decided: tuple[Key, NDArray[np.int8]] | None = None
+    decided: tuple[Key, NDArray[Any]] | None = None
     """The plan written, or the primitive chosen, at the latest decision."""
     tracks: tuple[Any, list[Track]] | None = None
     """Where the target is in the plans imagined last, under their name."""
@@ -53,7 +59,8 @@ class VLM(Policy):
 
     Image-Goal Navigation: plans are written from front view, panorama and goal image; with a world model a second
     question shows the goal image and what each plan is imagined to lead to. Active Recognition: two multiple-choice
-    questions a decision, for the category, from views centred on the boxed target, and for the next primitive.
+    questions a decision, for the category, from views centred on the boxed target, and for the next primitive. Robotic
+    Manipulation, where plans are poses: `wiw.policies.vlm.arm`.
 
     An answer that cannot be used after `tries` is an outcome of the policy: a plan is left out; where none is left, a
     primitive is drawn; a category is the last one, else none is preferred. Note and `exchanges` of the decision say so.
@@ -65,7 +72,7 @@ class VLM(Policy):
         prompts: folder of templates that replace the shipped ones; see `wiw.policies.vlm.prompts`.
         proposals: "sampled", one question for each plan, or "listed", one question for all of them.
         revision: "write" lets it write the plan to follow after it has seen the futures, as the paper's prompt does;
-            "select" lets it choose one of the proposals, with the probabilities as scores. For navigation.
+            "select" lets it choose one of the proposals, with the probabilities as scores. Not for recognition.
         temperature: of sampled plans; everything else is asked at 0.
         tries: times a question is put before its answer counts as unusable.
         tracker: finds the target in imagined frames; name or instance.
@@ -80,6 +87,10 @@ class VLM(Policy):
     """
 
     frames = FrameSpec("panorama", (576, 1024))
+    tasks: tuple[str, ...] = ("ar", "imagenav")
+    """That it has prompts for."""
+    drawn = "a primitive was drawn"
+    """What is done where no plan can be used."""
 
     def __init__(
         self,
@@ -115,6 +126,12 @@ class VLM(Policy):
         self.needs = tuple(self.tracker.needs)
         self._journal: dict[tuple[int, int], list[Exchange]] = {}
 
+    def for_space(self, space: Space) -> Policy:
+        """The same model asked for poses of a gripper."""
+        from wiw.policies.vlm.arm import ArmVLM
+
+        return self if space == "discrete" else ArmVLM(self)
+
     def describe(self) -> dict[str, Any]:
         """With the model and a digest of the prompts."""
         return {
@@ -143,8 +160,8 @@ class VLM(Policy):
         Raises:
             ArgumentError: a task that there are no prompts for.
         """
-        if goal.task not in tasks():
-            raise ArgumentError(f"policy vlm: expected a task among {', '.join(tasks())}, got '{goal.task}'")
+        if goal.task not in self.tasks:
+            raise ArgumentError(f"policy vlm: expected a task among {', '.join(self.tasks)}, got '{goal.task}'")
         return Memory()
 
     def observe(self, situations: Sequence[Situation]) -> None:
@@ -174,40 +191,51 @@ class VLM(Policy):
         situation.memory.horizon = horizon
         count = candidates if situation.imagines else 1
         shared = count if self.proposals == "listed" else 1
-        words = self._words(situation, "planner", horizon)
+        asked = user(*self._before(situation, horizon), self._words(situation, "output", horizon, shared))
+        options: dict[str, Any] = {
+            "schema": self._schema(horizon, shared),
+            "temperature": self.temperature,
+            "max_tokens": TOKENS * shared,
+            "tries": self.tries,
+        }
+        seeds = [seed_of(situation.key, number) for number in range(count if shared == 1 else 1)]
+        return "propose", [Request((asked,), seed=seed, **options) for seed in seeds]
+
+    def _before(self, situation: Situation, horizon: int) -> list[Part]:
+        """What is told and shown before plans are asked for."""
         front, panorama = looks.now(situation.observation)
+        words = self._words(situation, "planner", horizon)
         parts: list[Part] = [words, "Front view:", front, "Panorama:", panorama]
-        if situation.goal.image is not None:
-            parts += ["Goal image:", situation.goal.image]
-        parts.append(self._words(situation, "output", horizon, shared))
-        schema = plans.plan_schema(horizon, shared)
-        requests = [
-            Request((user(*parts),), schema=schema, temperature=self.temperature, seed=seed, tries=self.tries)
-            for seed in (_seed(situation.key, number) for number in range(count if shared == 1 else 1))
-        ]
-        return "propose", requests
+        return parts if situation.goal.image is None else [*parts, "Goal image:", situation.goal.image]
+
+    def _schema(self, longest: int, count: int = 1) -> type[BaseModel]:
+        return plans.plan_schema(longest, count)
+
+    def _plans_in(self, value: Any) -> list[Proposal]:
+        """The plans of a validated answer."""
+        return [Proposal(actions, note=cut(reason)) for actions, reason in plans.plans_in(value)]
 
     def _proposed(self, situation: Situation, purpose: str, replies: Sequence[Reply], horizon: int) -> list[Proposal]:
         """Different plans of an episode, in the order in which they were written."""
         if purpose == "move":
-            probabilities = self._move_probabilities(situation, replies[0], "a primitive was drawn")
+            probabilities = self._move_probabilities(situation, replies[0], self.drawn)
             if probabilities is None:
                 return [self._drawn(situation)]
             best = int(probabilities.argmax())
             return [Proposal(np.array([MOVES[best]], np.int8), prior=float(probabilities[best]))]
         usable = [reply for reply in replies if reply.problem is None]
-        instead = "the plan was left out" if usable else "a primitive was drawn"
+        instead = "the plan was left out" if usable else self.drawn
         found: dict[bytes, Proposal] = {}
         for number, reply in enumerate(replies):
             self._note(situation.key, f"propose/{number}", reply, instead)
-            for actions, reason in [] if reply.problem else plans.plans_in(reply.value):
-                found.setdefault(actions.tobytes(), Proposal(actions, prior=float(-len(found)), note=_cut(reason)))
+            for plan in [] if reply.problem else self._plans_in(reply.value):
+                found.setdefault(plan.actions.tobytes(), replace(plan, prior=float(-len(found))))
         return list(found.values()) or [self._drawn(situation)]
 
     def _drawn(self, situation: Situation) -> Proposal:
         key = situation.key
-        draw = core.uniform(core.fold_key([key.seed, key.episode, key.decision, _DRAW]), 1)[0]
-        return Proposal(np.array([MOVES[int(draw * len(MOVES))]], np.int8), note="drawn: no answer could be used")
+        draw = core.uniform(core.fold_key([key.seed, key.episode, key.decision, DRAW]), 1)[0]
+        return Proposal(np.array([MOVES[int(draw * len(MOVES))]], np.int8), note=DRAWN)
 
     # -- judging futures -----------------------------------------------------------------------------------------------
 
@@ -231,7 +259,7 @@ class VLM(Policy):
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int8], int | None]:
+    ) -> tuple[NDArray[Any], int | None]:
         """What was decided on; the first proposal that begins so, if one does."""
         decided = situation.memory.decided
         if decided is None or decided[0] != situation.key:
@@ -251,15 +279,23 @@ class VLM(Policy):
             tracks = self._tracked(situation, proposals, rollouts)
             strips = [looks.plan_strip(*row) for row in zip(proposals, rollouts, tracks, strict=True)]
             return self._move_request(situation, _captioned(proposals, strips))
-        if self.revision == "select" and len(proposals) == 1:
+        if self._selects(proposals) and len(proposals) == 1:
             return None
+        return self._revising(situation, proposals, rollouts)
+
+    def _selects(self, proposals: Sequence[Proposal]) -> bool:
+        """Whether one of the proposals is chosen, rather than a plan written."""
+        return self.revision == "select"
+
+    def _revising(self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]) -> Request:
+        """Which of the proposals is to be followed, or what else."""
         assert situation.goal.image is not None
         strips = [looks.plan_strip(plan, rollout) for plan, rollout in zip(proposals, rollouts, strict=True)]
         horizon = max(situation.memory.horizon, *(len(plan.actions) for plan in proposals))
         name = "chooser" if self.revision == "select" else "planner_imagined"
         parts: list[Part] = [self._words(situation, name, horizon), "Goal image:", situation.goal.image]
         parts += _captioned(proposals, strips)
-        seed = _seed(situation.key, _REVISE)
+        seed = seed_of(situation.key, REVISE)
         if self.revision == "select":
             choices = tuple(f"plan {k + 1}: {', '.join(plans.named(p.actions))}" for k, p in enumerate(proposals))
             return Request((user(*parts),), choices=choices, seed=seed, tries=self.tries)
@@ -284,9 +320,9 @@ class VLM(Policy):
             return fallback
         if reply.probabilities is not None:
             return reply.probabilities
-        ((written, _),) = plans.plans_in(reply.value)
-        memory.decided = situation.key, written
-        return np.array([_agreement(plan.actions, written) for plan in proposals])
+        (written,) = self._plans_in(reply.value)
+        memory.decided = situation.key, written.actions
+        return np.array([_agreement(plan.actions, written.actions) for plan in proposals])
 
     def _move_request(self, situation: Situation, imagined: Sequence[Part]) -> Request:
         """Which primitive comes next."""
@@ -295,7 +331,7 @@ class VLM(Policy):
         if imagined:
             parts += [self._words(situation, "planner_imagined", 1), *imagined]
         choices = tuple(plans.MEANINGS.values())
-        return Request((user(*parts),), choices=choices, seed=_seed(situation.key, _MOVE), tries=self.tries)
+        return Request((user(*parts),), choices=choices, seed=seed_of(situation.key, _MOVE), tries=self.tries)
 
     def _move_probabilities(self, situation: Situation, reply: Reply, instead: str) -> NDArray[np.float64] | None:
         self._note(situation.key, "move", reply, instead)
@@ -335,7 +371,7 @@ class VLM(Policy):
         if strips:
             parts += [self._words(situation, "answerer_imagined", 1), *strips]
         choices = situation.goal.choices
-        return Request((user(*parts),), choices=choices, seed=_seed(situation.key, _ANSWER), tries=self.tries)
+        return Request((user(*parts),), choices=choices, seed=seed_of(situation.key, _ANSWER), tries=self.tries)
 
     def _answered(self, situation: Situation, reply: Reply | None) -> Answer:
         memory, choices = situation.memory, situation.goal.choices
@@ -371,19 +407,17 @@ class VLM(Policy):
             actions=plans.MEANINGS,
         )
 
+    def _read(self, reply: Reply) -> dict[str, Any]:
+        """How an answer was read; what is empty is left out."""
+        return {"by": reply.by, "mass": reply.mass, "doubtful": reply.doubtful, "repaired": reply.repaired}
+
     def _note(self, key: Key, purpose: str, reply: Reply, instead: str) -> None:
         """Writes down what came of a question."""
-        read = {
-            "by": reply.by,
-            "mass": reply.mass,
-            "doubtful": reply.doubtful or None,
-            "repaired": reply.repaired or None,
-        }
         exchange = Exchange(
             purpose,
             self.client.model,
             tuple({"call": said.call, **said.completion.to_json()} for said in reply.said),
-            {name: value for name, value in read.items() if value},
+            {name: value for name, value in self._read(reply).items() if value},
             "" if reply.problem is None else str(reply.problem),
             "" if reply.problem is None else instead,
         )
@@ -396,7 +430,7 @@ def _require_packages() -> None:
         raise DependencyError(f"policy vlm needs {', '.join(missing)}: pip install 'wiw[vlm]'")
 
 
-def _seed(key: Key, number: int) -> int:
+def seed_of(key: Key, number: int) -> int:
     return int(core.fold_key([key.seed, key.episode, key.decision, number]))
 
 
@@ -408,10 +442,10 @@ def _captioned(proposals: Sequence[Proposal], strips: Sequence[looks.Image]) -> 
     return parts
 
 
-def _agreement(plan: NDArray[np.int8], written: NDArray[np.int8]) -> float:
-    """Share of the longer one's primitives that both begin with."""
+def _agreement(plan: NDArray[Any], written: NDArray[Any]) -> float:
+    """Share of the longer one's actions that both begin with."""
     same = 0
-    while same < min(len(plan), len(written)) and plan[same] == written[same]:
+    while same < min(len(plan), len(written)) and np.array_equal(plan[same], written[same]):
         same += 1
     return same / max(len(plan), len(written))
 
@@ -422,6 +456,6 @@ def _no_belief(key: Key, count: int) -> NDArray[np.float64]:
     return np.asarray(weights / weights.sum(), np.float64)
 
 
-def _cut(reason: str, most: int = 300) -> str:
+def cut(reason: str, most: int = 300) -> str:
     text = " ".join(reason.encode("utf-8", "replace").decode().split())
     return text if len(text) <= most else text[: most - 1] + "…"

@@ -110,7 +110,9 @@ class Manipulation:
     @property
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
-        return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
+        rules = self.rules
+        numbers = {"candidates": rules.candidates, "horizon": rules.horizon, "execute": rules.execute}
+        return {**numbers, "space": "pose7"}
 
     @property
     def stage(self) -> dict[str, Any]:

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prompt templates: one folder a task, one Jinja file a question, with the paper's slots. A user's own may stand in.
 
-Slots: `obs_key` (what is seen now, in words), `look_ahead_action_num` (actions of a plan), `plan_num` (plans asked for
-at once) and `actions` (name to meaning).
+Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (plans asked for at once). Where agents
+walk: `obs_key` (what is seen now, in words) and `actions` (name to meaning). Of manipulation: `position_bins`,
+`rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of its top), `colours` (names),
+`instruction`, `objects` (index to [X, Y, Z]), `gripper` (where it is) and `executed` (actions so far).
 """
 
 from __future__ import annotations
@@ -21,7 +23,21 @@ SLOTS: dict[str, Any] = {
     "plan_num": 1,
     "actions": {"forward": "go straight for 0.20 m"},
 }
-"""Every slot, with a value to try a template on."""
+"""Every slot where agents walk, with a value to try a template on."""
+ARM_SLOTS: dict[str, Any] = {
+    "look_ahead_action_num": 5,
+    "plan_num": 1,
+    "position_bins": 100,
+    "rotation_bins": 120,
+    "rotation_degrees": 3,
+    "table_height": 15,
+    "colours": ["red", "lime"],
+    "instruction": "push the red button",
+    "objects": {1: [50, 50, 15]},
+    "gripper": [50, 50, 40, 0, 60, 60, 1],
+    "executed": [[50, 50, 40, 0, 60, 60, 1]],
+}
+"""The same of manipulation."""
 
 
 def tasks() -> list[str]:
@@ -85,14 +101,15 @@ def _parsed(path: Path) -> tuple[str, Any]:
     from jinja2 import StrictUndefined, TemplateError, meta
     from jinja2.sandbox import SandboxedEnvironment
 
+    slots = ARM_SLOTS if path.parent.name == "manipulation" else SLOTS
     environment = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     try:
         source = path.read_text(encoding="utf-8")
-        unknown = sorted(meta.find_undeclared_variables(environment.parse(source)) - set(SLOTS))
+        unknown = sorted(meta.find_undeclared_variables(environment.parse(source)) - set(slots))
         if unknown:
-            raise PromptError(f"{path}: unknown slot '{unknown[0]}'; the slots are {', '.join(SLOTS)}")
+            raise PromptError(f"{path}: unknown slot '{unknown[0]}'; the slots are {', '.join(slots)}")
         template = environment.from_string(source)
-        template.render(**SLOTS)
+        template.render(**slots)
     except (OSError, UnicodeDecodeError, TemplateError, TypeError, ValueError, ArithmeticError, LookupError) as error:
         raise PromptError(f"{path}: {type(error).__name__}: {error}") from error
     return source, template

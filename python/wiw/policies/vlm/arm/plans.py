@@ -1,0 +1,104 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of gripper poses as a language model writes them: whole numbers of `wiw.action.PoseGrid`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import PoseGrid
+from wiw.tabletop.workbench import TABLE
+from wiw.types import Proposal
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+GRID = PoseGrid()
+SURFACE = int(GRID.encode([0, 0, TABLE, 0, 0, 0, 0])[2])
+"""Z of the table's top."""
+FARTHEST = 1_000_000
+"""Numbers beyond it are no slips of a bin or two, but nonsense."""
+SHOWN = 5
+"""Poses of a plan that are shown at most."""
+SCENE = "A robot arm works at a table. "
+"""What world models read before a plan in words."""
+
+
+@lru_cache(maxsize=32)
+def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
+    """The paper's four fields with 1 to `longest` actions; {plans: [...]} of up to `count` of them where count > 1.
+
+    Servers are told the range of the numbers; those that do not keep to it are understood as `PoseGrid` does.
+    """
+    from pydantic import ConfigDict, Field, WithJsonSchema, create_model
+
+    strict: Any = ConfigDict(extra="forbid")
+    told = WithJsonSchema({"type": "integer", "minimum": 0, "maximum": max(GRID.bins, GRID.turns)})
+    number = Annotated[int, Field(ge=-FARTHEST, le=FARTHEST), told]
+    numbers: Any = (list[number], Field(min_length=7, max_length=7))
+    step = create_model("Step", __config__=strict, action=numbers)
+    steps: Any = (list[step], Field(min_length=1, max_length=longest))  # type: ignore[valid-type]
+    plan = create_model(
+        "Plan",
+        __config__=strict,
+        visual_state_description=(str, ...),
+        reasoning_and_reflection=(str, ...),
+        language_plan=(str, ...),
+        executable_plan=steps,
+    )
+    if count == 1:
+        return plan
+    plans: Any = (list[plan], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
+    return create_model("Plans", __config__=strict, plans=plans)
+
+
+def plans_in(value: Any) -> list[Proposal]:
+    """The plans of a validated answer, with their reasons and words."""
+    return [
+        Proposal(GRID.decode(_numbers(plan)), note=plan.reasoning_and_reflection, text=SCENE + plan.language_plan)
+        for plan in getattr(value, "plans", None) or [value]
+    ]
+
+
+def out_of_range(value: Any) -> int:
+    """How many numbers of a validated answer were clamped or wrapped."""
+    written = [_numbers(plan) for plan in getattr(value, "plans", None) or [value]]
+    most = np.array([GRID.bins] * 3 + [GRID.turns] * 3 + [1])
+    return sum(int(((numbers < 0) | (numbers > most)).sum()) for numbers in written)
+
+
+def on_grid(poses: NDArray[np.float64]) -> bool:
+    """Whether poses [K, 7] are such as can be written in whole numbers."""
+    return np.array_equal(GRID.decode(GRID.encode(poses)), poses)
+
+
+def named(poses: NDArray[np.float64]) -> str:
+    """Poses [K, 7] as they are written, those of `shown` of a longer plan."""
+    return str(GRID.encode(poses[shown(len(poses))]).tolist())
+
+
+def shown(count: int) -> NDArray[np.int64]:
+    """Which poses of a plan are shown: all of a short one, else the ends of equal parts."""
+    parts = min(count, SHOWN)
+    return np.arange(1, parts + 1) * count // parts - 1
+
+
+def indexed(places: Mapping[str, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
+    """Positions [3] by the objects' indices from 1.
+
+    They are numbered by their names' alphabet: a task may name first what it asks for.
+    """
+    return {index: places[name][:3, 3] for index, name in enumerate(sorted(places), 1)}
+
+
+def dictionary(places: Mapping[str, NDArray[np.float64]]) -> dict[int, list[int]]:
+    """Whole numbers [X, Y, Z] by the objects' indices."""
+    return {index: GRID.encode([*spot, 0, 0, 0, 0])[:3].tolist() for index, spot in indexed(places).items()}
+
+
+def _numbers(plan: Any) -> NDArray[np.int64]:
+    return np.array([step.action for step in plan.executable_plan], np.int64)
