@@ -24,8 +24,8 @@ from wiw.tasks.manipulation import KINDS, Manipulation
 from wiw.types import Proposal
 
 POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
-SHORT = {"tasks": "push_buttons,slide_block", "actions": 3, "candidates": 2, "horizon": 3}
-FLAGS = ["--tasks", "push_buttons,slide_block", "--task-option", "actions=3", "--candidates", "2", "--horizon", "3"]
+SHORT = {"tasks": "push_buttons,slide_block", "actions": 2}
+FLAGS = ["--tasks", "push_buttons,slide_block", "--task-option", "actions=2", "--candidates", "2", "--horizon", "2"]
 ARMS = ["none", "copy", "oracle", "placebo-swapped:oracle"]
 
 
@@ -34,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes of each of two tasks, by all reference arms, with fidelity."""
     out = tmp_path_factory.mktemp("runs") / "first"
     command = ["run", "manipulation", *FLAGS, "--policy", POLICY, "--episodes", "4", "--arms", ",".join(ARMS)]
-    assert main([*command, "--fidelity", "--no-report", "--out", str(out)]) == 0
+    assert main([*command, "--fidelity", "--keep-images", "0", "--no-report", "--out", str(out)]) == 0
     return out
 
 
@@ -51,7 +51,7 @@ def test_a_run_has_all_arms_and_episodes_of_each_task_in_turn(run: Path) -> None
     assert log.arms == ARMS and len(log.episodes) == 16 and all(e["status"] == "done" for e in log.episodes)
     with RunStore.read(run) as store:
         assert [episode.info["task"] for episode in store.episodes()] == ["push_buttons", "slide_block"] * 2
-    assert all(e["metrics"]["poses"] <= 3 and e["metrics"]["actions"] == 1 for e in log.episodes)
+    assert all(e["metrics"]["poses"] <= 2 and e["metrics"]["actions"] == 1 for e in log.episodes)
     lines = log.summary().arms
     assert [line.done for line in lines] == [4] * 4
     assert all(line.estimates["success"].scenes == 4 for line in lines)
@@ -75,8 +75,19 @@ def test_a_run_is_verified_compared_and_exported(run: Path, tmp_path: Path, caps
 
 
 def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
-    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=3)
-    evaluate(TaskRecipe("manipulation", SHORT), agent, 4, 0, tmp_path / "two", 2, progress=False, live=1, fidelity=True)
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=2)
+    evaluate(
+        TaskRecipe("manipulation", SHORT),
+        agent,
+        4,
+        0,
+        tmp_path / "two",
+        2,
+        progress=False,
+        live=1,
+        fidelity=True,
+        keep_images=0,
+    )
     one = {key: value for key, value in told(run).items() if key[0] == "oracle"}
     assert told(tmp_path / "two") == one and len(one) == 8
 
@@ -90,10 +101,20 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
             raise KeyboardInterrupt
         write(store, row)
 
-    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=3)
+    agent = AgentRecipe(POLICY, "oracle", candidates=2, horizon=2)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(RunStore, "write", stopping)
-        evaluate(TaskRecipe("manipulation", SHORT), agent, 4, 0, tmp_path, progress=False, live=1, fidelity=True)
+        evaluate(
+            TaskRecipe("manipulation", SHORT),
+            agent,
+            4,
+            0,
+            tmp_path,
+            progress=False,
+            live=1,
+            fidelity=True,
+            keep_images=0,
+        )
     with RunStore.read(tmp_path) as store:
         assert 0 < len(store.outcomes()) < 4
     resume_run(tmp_path, progress=False)
@@ -157,7 +178,7 @@ def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     """One push is within four poses of one who is told the truth; two are not, whoever is told."""
     agent = AgentRecipe(POLICY, "copy", candidates=2)
     options = {"tasks": "push_buttons", "actions": 4, "seed": 3}
-    log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False)
+    log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False, keep_images=0)
     assert [episode["metrics"]["success"] for episode in log.episodes] == [0.0, 0.0]
     found = wiw.attribute(tmp_path, progress=False)["copy"]
     assert found.verdicts["beyond"] == 1 and sum(found.verdicts.values()) == 2
