@@ -78,7 +78,8 @@ def run(
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
         world_model_option: An option of --world-model, such as weights=FOLDER or steps=30; may be given again.
-        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser.
+        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar
+            recogniser, for manipulation scripted.
         revision: Scores imagined futures; the policy's own choice if not given.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but

@@ -57,7 +57,8 @@ def scale(
         task: See `wiw list`.
         world_model: Name, path.py:Class or package.module:Class. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser.
+        policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar
+            recogniser, for manipulation scripted.
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
         imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
