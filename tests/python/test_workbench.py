@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from test_render_gpu import needs_egl
 
 from wiw.action import PoseGrid
 from wiw.errors import ArgumentError
@@ -171,6 +172,15 @@ def test_a_picture_without_the_arm_shows_what_is_behind_it(bench: Workbench) -> 
     white = (bare.min(axis=-1) > 190) & (color.min(axis=-1) > 190)
     assert (np.abs(color.astype(int) - bare).max(axis=-1) > 8).mean() > 0.03 and white.mean() < 0.005
     np.testing.assert_array_equal(bench.picture("front", (240, 240))["color"], color)
+
+
+@needs_egl
+@pytest.mark.gpu
+@pytest.mark.parametrize("arm", [True, False])
+def test_shadows_are_as_fine_on_the_gpu(arm: bool) -> None:
+    benches = [Workbench([(cube("red"), on_table(0.1, -0.15))], backend) for backend in ("cpu", "gpu")]
+    rays, raster = (bench.picture("front", (240, 240), arm=arm)["color"].astype(int) for bench in benches)
+    assert np.abs(rays - raster).mean() < 0.08 and (np.abs(rays - raster).max(axis=-1) > 15).sum() < 40
 
 
 def test_names_are_told_apart() -> None:

@@ -40,8 +40,8 @@ BASE = place(x=-0.35, z=TABLE)
 MIDDLE = place(x=0.15, z=TABLE - TOP[2] / 2)
 Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
 SUN = {"direction": (0.45, 1.0, 0.45), "strength": 0.5, "ambient": 0.66}
-FAR_BELOW = 1e3
-"""Metres under the floor, where nobody sees what is left out of a picture."""
+FAR_BELOW = 3.0
+"""Metres down to where nobody sees what is left out of a picture; no further, as maps of shadows span all things."""
 SHUT = 0.5
 """A gripper value below it closes the fingers."""
 PUSHED = 0.003
@@ -440,7 +440,7 @@ _PAINTED: Colour = (1.0, 1.0, 1.0)
 _LEG = Box((0.05, 0.05, TABLE - TOP[2]))
 _ROOM: list[tuple[str, Any, Colour, Pose]] = [
     ("floor", Box((12, 12, 0.02)), (0.5, 0.52, 0.55), place(z=-0.01)),
-    ("wall", Box((0.02, 12, 3)), (0.9, 0.92, 0.93), place(x=-1.2, z=1.5)),
+    ("wall", Box((0.02, 4, 2.6)), (0.9, 0.92, 0.93), place(x=-1.2, z=1.3)),
     ("table", Box(TOP), WOOD, MIDDLE),
     *(
         ("table", _LEG, (0.6, 0.52, 0.43), place(x=x, y=y, z=(TABLE - TOP[2]) / 2))
