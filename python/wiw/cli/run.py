@@ -105,7 +105,8 @@ def run(
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.
         live: Episodes kept live at a time in a process, so that model calls are batched.
-        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`; all: every one, at 0.2 MB a decision.
+        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, of manipulation one of each kind at
+            least; all: every one, at 0.2 MB a decision.
         deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
