@@ -61,7 +61,7 @@ def test_it_errs_at_its_rates() -> None:
         )[0]
     ]
     right = [plan for plan in plans if kind.target_of(plan.text) == setup.target]
-    assert 0.35 < len(right) / len(plans) < 0.65
+    assert 0.33 < len(right) / len(plans) < 0.57
     exact = kind.expert(situation.observation.places, setup.target)
     off = np.array([plan.actions[2, :2] - exact[2, :2] for plan in right])
     assert 0.003 < off.std() < 0.02 and np.abs(off).max() < 0.05
@@ -100,7 +100,7 @@ def test_choosing_by_true_futures_pays(tmp_path: Path) -> None:
     for name in ("none", "copy", "oracle"):
         task = Manipulation("slide_block", seed=5, actions=5)
         agent = wiw.Agent("scripted", None if name == "none" else name, candidates=4)
-        log = evaluate(task, agent, 6, out=tmp_path / name, progress=False)
+        log = evaluate(task, agent, 4, out=tmp_path / name, progress=False)
         assert all(episode["status"] == "done" for episode in log.episodes)
         rates[name] = np.mean([episode["metrics"]["success"] for episode in log.episodes])
     assert rates["copy"] == rates["none"]
