@@ -5,9 +5,9 @@
 of 4 cm at rest; one second of 240 steps a repeat. All load the same URDF (links without mass get a milligram for the
 peers, which would otherwise refuse them or weigh a kilogram). pybullet: 50 solver iterations and its own residual
 threshold (1e-7), which are ours too, position control with its default gains, no sleeping; with and without fixed links
-merged, as ours are. Both: steps of 1/240 s; arm, table and cubes all meet each other, links of the arm do not. Broadphase:
-ours compares all pairs of boxes, pybullet has its dynamic trees. MuJoCo: Newton solver with its defaults, implicitfast, position actuators; links of the arm do not
-meet each other, as ours do not. A contact model of another kind, so only an orientation.
+merged, as ours are. Both take steps of 1/240 s; arm, table and cubes all meet each other, links of the arm do not. Our
+broadphase compares all pairs of boxes, pybullet's keeps trees. MuJoCo: Newton solver with its defaults, implicitfast,
+position actuators; links of the arm do not meet each other. A contact model of another kind, so only an orientation.
 
 **Inverse kinematics**: position and rotation of the hand to 0.1 mm and 1 mrad, from the ready pose to random reachable
 poses, and to poses near by, as along a path. pybullet: residual threshold 1e-4, at most 100 iterations and 20 restarts
