@@ -196,6 +196,7 @@ POLICIES = Registry(
         "recogniser": "wiw.policies.recogniser:Recognition",
         "vlm": "wiw.policies.vlm:VLM",
         "scripted": "wiw.policies.scripted:Scripted",
+        "diffuser": "wiw.policies.diffuser:Diffuser",
     },
     "wiw.policies.base:Policy",
 )

@@ -59,6 +59,17 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
     return parsed(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
 
 
+def policy_options(
+    policy: str, pairs: Sequence[str], beside: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Mapping[str, Any]]:
+    """What policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
+    from wiw.registry import POLICIES
+
+    if not pairs:
+        return dict(beside)
+    return {**beside, policy: {**beside.get(policy, {}), **parsed(pairs, POLICIES.find(policy), "--policy-option")}}
+
+
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
     """What `--semantics-option` gives a source of semantics.
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, default_policy, model_options, semantics_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
 from wiw.cli.stop import stoppable
 
 Name = Annotated[str, arg(metavar="NAME")]
@@ -27,6 +27,7 @@ def run(
     world_model: Name = "none",
     world_model_option: Options = (),
     policy: MaybeName = None,
+    policy_option: Options = (),
     revision: MaybeName = None,
     arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
@@ -80,6 +81,7 @@ def run(
         world_model_option: An option of --world-model, such as weights=FOLDER or steps=30; may be given again.
         policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar
             recogniser, for manipulation scripted.
+        policy_option: An option of --policy, such as weights=FILE; may be given again.
         revision: Scores imagined futures; the policy's own choice if not given.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
@@ -135,12 +137,13 @@ def run(
     policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)
     names = _arms(arms, world_model)
+    speaking = [policy, revision or "", *(name.partition("+")[0] for name in names or [])]
     given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
         model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
         semantics_options=semantics_options(semantics, semantics_option),
-        policy_options=vlm_options(given, [policy, revision or "", *(name.partition("+")[0] for name in names or [])]),
+        policy_options=policy_options(absolute(policy), policy_option, vlm_options(given, speaking)),
     )  # fmt: skip
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
 

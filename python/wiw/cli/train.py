@@ -12,13 +12,14 @@ from tyro.conf import Positional, arg
 
 
 def train(
-    what: Positional[Annotated[Literal["recogniser", "warpnet"], arg(metavar="WHAT")]] = "recogniser",
+    what: Positional[Annotated[Literal["recogniser", "warpnet", "diffuser"], arg(metavar="WHAT")]] = "recogniser",
     /,
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:train:80",
     val: Annotated[str, arg(metavar="SPEC")] = "apartments:val:20",
     categories: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
+    demonstrations: Annotated[Path | None, arg(metavar="DIR")] = None,
     epochs: Annotated[int | None, arg(metavar="N")] = None,
     minutes: Annotated[float | None, arg(metavar="MIN")] = None,
     places: Annotated[int | None, arg(metavar="N")] = None,
@@ -26,15 +27,18 @@ def train(
     workers: Annotated[int, arg(metavar="N")] = 2,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Trains a network on generated apartments or on scenes of your own.
+    """Trains a network on generated apartments or on scenes of your own, or on demonstrations.
 
     recogniser: the policy of Active Recognition, which tells what is in a red box from any number of real and imagined
-    views. warpnet: a world model that shows what a panorama would look like from near by.
+    views. warpnet: a world model that shows what a panorama would look like from near by. diffuser: the 3D diffusion
+    policy of manipulation.
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
     $ wiw train warpnet --out warpnet.safetensors
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
+    $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
+    $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
     Looks around all scenes first, which a command that was stopped does not do again, then trains: about a quarter of
     an hour on two idle cores. Recipe and figures on the val scenes are kept in the file: the recogniser's accuracy and
@@ -47,7 +51,9 @@ def train(
         scenes: To learn from: apartments:train[:N], a mesh or a Gazebo world.
         val: To measure on, and for the recogniser to calibrate with: it halves them, or the looks of a single one.
         categories: What there is to recognise; the built-in list if none is given.
-        epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet if not given.
+        demonstrations: Of `wiw collect manipulation`, with depth, for diffuser to learn from.
+        epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet, 400 for
+            diffuser if not given.
         minutes: Fewer epochs where so many would take longer than this to train.
         places: From which a scene is looked at, or that it is walked through from; 16 and 24 if not given.
         seed: The looks are a function of it and the scenes, the weights of it, the looks and the epochs.
@@ -59,7 +65,13 @@ def train(
 
     out = out or Path(f"{what}.safetensors")
     _require_torch(what)
-    _check(out, scenes, val)
+    _check_out(out)
+    if what == "diffuser":
+        _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
+        return 0
+    if demonstrations is not None:
+        raise ArgumentError(f"--demonstrations: {what} learns from scenes; leave it out")
+    _check_scenes(scenes, val)
     asked = _Asked(scenes, val, seed, cache or folder().parent / "looks", workers)
     if what == "recogniser":
         _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
@@ -88,6 +100,10 @@ class _Asked:
 def _require_torch(what: str) -> None:
     if what == "recogniser":
         from wiw.perception.recogniser import require_torch
+
+        require_torch()
+    elif what == "diffuser":
+        from wiw.policies.diffuser import require_torch
 
         require_torch()
     else:
@@ -141,18 +157,49 @@ def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, An
     _report_warpnet(card, out)
 
 
+def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how: dict[str, Any]) -> None:
+    from wiw.datasets.demonstrations import Demonstrations
+    from wiw.errors import ArgumentError
+    from wiw.networks import one_thread
+    from wiw.policies.diffuser.sight import Lens
+    from wiw.policies.diffuser.weights import save
+    from wiw.training import diffuser as training
+    from wiw.training.checkpoint import Checkpoint
+
+    if demonstrations is None:
+        raise ArgumentError("diffuser learns from demonstrations: give a folder of `wiw collect` with --demonstrations")
+    shown, recipe = Demonstrations(demonstrations), training.Recipe(**how)
+    lens = Lens(shown.camera.intrinsics, shown.camera.T_world_camera)
+    moments = training.moments(_bar(shown, "looking", len(shown)), lens)
+    card: dict[str, Any] = {"demonstrations": shown.config, "moments": len(moments)}
+    asked = {**card, "recipe": asdict(recipe), "minutes": minutes}
+    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), asked)
+    with one_thread(), _Steps() as steps:
+        network, recipe = training.train(moments, recipe, minutes, steps, checkpoint)
+    save(out, network, {**card, "recipe": asdict(recipe)})
+    checkpoint.remove()
+    print(f"{len(shown)} demonstrations, {len(moments)} paths, {recipe.epochs} epochs")
+    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
+
+
 def _given(**options: Any) -> dict[str, Any]:
     """Those that are not None."""
     return {name: value for name, value in options.items() if value is not None}
 
 
-def _check(out: Path, scenes: str, val: str) -> None:
+def _check_out(out: Path) -> None:
     """What would otherwise be found out after minutes."""
-    from wiw.errors import ArgumentError, FileError
-    from wiw.scenes import resolve
+    from wiw.errors import FileError
 
     if not out.absolute().parent.is_dir() or out.is_dir():
         raise FileError(f"{out}: cannot be written there; choose a file in a folder that exists with --out")
+
+
+def _check_scenes(scenes: str, val: str) -> None:
+    """Likewise."""
+    from wiw.errors import ArgumentError
+    from wiw.scenes import resolve
+
     shared = sorted(set(resolve(scenes)) & set(resolve(val)))
     if shared:
         raise ArgumentError(f"--val: expected scenes that are not learnt from, got {shared[0]} in both; choose others")

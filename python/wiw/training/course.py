@@ -6,9 +6,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
+
+from wiw.training.checkpoint import Checkpoint, Kept
 
 
 class Lesson(Protocol):
@@ -28,6 +30,7 @@ def taught(
     minutes: float | None,
     pace: Callable[[float], float],
     show: Callable[[int, int, float], None],
+    checkpoint: Checkpoint | None = None,
 ) -> tuple[L, Any]:
     """A lesson at its end, and the recipe that would give the same one again.
 
@@ -38,16 +41,25 @@ def taught(
         minutes: if given, epochs are left out so that training takes about as long, by the speed of some trial steps.
         pace: factor of the learning rate after a part of all steps, 0 to 1.
         show: called after each step with its number, how many there are, and a running mean of the loss.
+        checkpoint: where a lesson that has a state is kept now and then, and gone on from.
     """
-    if minutes is not None:
+    stand = checkpoint.stand() if checkpoint else None
+    if stand is not None:
+        recipe = replace(recipe, epochs=stand.epochs)
+    elif minutes is not None:
         seconds = _seconds_a_step(begin())
         recipe = replace(recipe, epochs=max(1, min(recipe.epochs, int(60 * minutes / (seconds * an_epoch)))))
     lesson = begin()
-    steps, mean = recipe.epochs * an_epoch, float("nan")
-    for step in range(steps):
+    steps, mean, first = recipe.epochs * an_epoch, float("nan"), 0
+    if stand is not None:
+        cast(Kept, lesson).restore(stand.state)
+        first = stand.step
+    for step in range(first, steps):
         loss = lesson.step(recipe.rate * pace(step / steps))
-        mean = loss if step == 0 else 0.98 * mean + 0.02 * loss
+        mean = loss if step == first else 0.98 * mean + 0.02 * loss
         show(step + 1, steps, mean)
+        if checkpoint:
+            checkpoint.keep(cast(Kept, lesson), recipe.epochs, step + 1)
     return lesson, recipe
 
 

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 3D diffusion policy: its geometry, its attention, its paths, what it proposes, and its training."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+import wiw
+from wiw.cli.app import main
+from wiw.datasets.demonstrations import Demonstration
+from wiw.errors import ArgumentError, FileError, WeightsError
+from wiw.policies.base import Situation
+from wiw.policies.diffuser import paths
+from wiw.policies.diffuser.sight import CELL, NOWHERE, WORKSPACE, Lens
+from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.workbench import CAMERAS, TABLE
+from wiw.training.demonstrate import Collection, demonstrated
+from wiw.types import ArmObservation, Goal, Key
+
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+from wiw.policies.diffuser import Diffuser  # noqa: E402
+from wiw.policies.diffuser.attention import LONGEST, SHORTEST, UNIT, RelativeAttention  # noqa: E402
+from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised, sampled  # noqa: E402
+from wiw.policies.diffuser.network import Network, Scene, Shape  # noqa: E402
+from wiw.policies.diffuser.weights import load, save  # noqa: E402
+from wiw.training.checkpoint import Checkpoint  # noqa: E402
+from wiw.training.diffuser import Moments, Recipe, moments, train  # noqa: E402
+
+SMALL = Shape(width=24, heads=2, layers=2)
+LENS = Lens.of(CAMERAS["front"], (480, 480))
+HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Threads that wait for each other spin: on a busy machine two are slower than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def shown() -> list[Demonstration]:
+    """A block slid, and a ring put on a peg."""
+    return [
+        demonstrated(KINDS[name], 3, Collection(frames=16, depth=True))[0] for name in ("slide_block", "insert_peg")
+    ]
+
+
+@pytest.fixture(scope="module")
+def seen(shown: list[Demonstration]) -> Moments:
+    return moments(shown, LENS)
+
+
+def untrained(seed: int = 0) -> Diffuser:
+    torch.manual_seed(seed)
+    return Diffuser.of(Network(SMALL), steps=4)
+
+
+def situation(each: Demonstration, key: Key, imagines: bool = True) -> Situation:
+    observation = ArmObservation(each.images[0], each.poses[0], each.depths[0])  # type: ignore[index]
+    return Situation(observation, Goal("manipulation", text=each.instruction), key, None, imagines=imagines)
+
+
+# -- where things are --------------------------------------------------------------------------------------------------
+
+
+def test_points_are_where_the_renderer_has_them() -> None:
+    """The pixels of a square that lies on the table, by its id, against where it was put; and back into the picture."""
+    setup = KINDS["slide_block"].setup(1, 0)
+    bench = setup.bench()
+    picture = bench.picture("front", (480, 480), ("depth", "instance"))
+    points = LENS.points(picture["depth"])
+    for name in ("green", "blue"):
+        ids = [number for number, other in enumerate(bench.names, 1) if other == name]
+        found = points[np.isin(picture["instance"], ids)]
+        assert len(found) > 100
+        np.testing.assert_allclose(
+            (found[:, :2].min(0) + found[:, :2].max(0)) / 2, bench.place_of(name)[:2, 3], atol=4e-3
+        )
+        np.testing.assert_allclose(found[:, 2], TABLE + 0.002, atol=2e-3)
+    rows, columns = np.nonzero(points[..., 2] > 0)
+    back = CAMERAS["front"].pixels_of(points[rows, columns], (480, 480))
+    np.testing.assert_allclose(back, np.stack([columns, rows], axis=1) + 0.5, atol=1e-6)
+
+
+def test_the_window_shows_the_whole_workspace_and_knows_where_it_is() -> None:
+    rows, columns = LENS.window((480, 480))
+    assert all(each.start % CELL == each.stop % CELL == 0 for each in (rows, columns))
+    depth = np.full((480, 480), 0.9, np.float32)
+    depth[:, :240] = 0
+    points = LENS.points(depth)
+    outside = np.ones((480, 480), bool)
+    outside[rows, columns] = False
+    assert (points[outside] == NOWHERE).all() and (points[:, :240] == NOWHERE).all()
+    assert ((points == NOWHERE) | ((points > WORKSPACE[0]) & (points < WORKSPACE[1]))).all()
+    np.testing.assert_allclose(
+        LENS.within(rows, columns).points(depth[rows, columns]), points[rows, columns], atol=1e-9
+    )
+    sight = LENS.sight(np.zeros((480, 480, 3), np.uint8), depth)
+    np.testing.assert_allclose(sight.places, points[rows, columns][CELL // 2 :: CELL, CELL // 2 :: CELL], atol=1e-6)
+    assert sight.image.shape[:2] == sight.height.shape == tuple(CELL * side for side in sight.places.shape[:2])
+    away = np.eye(4)
+    away[2, 3] = 0.5
+    with pytest.raises(ArgumentError, match="not in view"):
+        Lens(LENS.intrinsics, away).window((480, 480))
+
+
+# -- attention ---------------------------------------------------------------------------------------------------------
+
+
+def slow_attention(layer: RelativeAttention, queries: Any, places: Any, context: Any, others: Any) -> Any:
+    """[N, width]: one query, head and pair of channels after another, from differences of places alone."""
+    heads, width = layer.heads, queries.shape[-1]
+    size = width // heads
+    count = size // 6
+    waves = SHORTEST * (LONGEST / SHORTEST) ** (1 - np.arange(count) / max(1, count - 1)) if count > 1 else [LONGEST]
+    query, key, value = (part(each).detach().numpy() for part, each in (
+        (layer.query, queries), (layer.key, context), (layer.value, context)
+    ))  # fmt: skip
+    made = []
+    for n, here in enumerate(places):
+        read, off = [], []
+        for head in range(heads):
+            own = slice(head * size, (head + 1) * size)
+            likeness = np.zeros(len(others))
+            for m, there in enumerate(others):
+                a, b = query[n, own], key[m, own]
+                for axis in range(3):
+                    for wave in range(count):
+                        i = axis * count + wave
+                        j = i + size // 2
+                        angle = 2 * np.pi / waves[wave] * (there - here)[axis]
+                        likeness[m] += np.cos(angle) * (a[i] * b[i] + a[j] * b[j])
+                        likeness[m] += np.sin(angle) * (a[j] * b[i] - a[i] * b[j])
+            weights = np.exp(likeness / size**0.5)
+            weights /= weights.sum()
+            read.append(weights @ value[:, own])
+            off.append(weights @ (others - here) / UNIT)
+        made.append(np.concatenate([np.concatenate([r, o]) for r, o in zip(read, off, strict=True)]))
+    return layer.out(torch.tensor(np.array(made), dtype=torch.float32)).detach().numpy()
+
+
+@pytest.mark.parametrize("width", [12, 48])
+def test_attention_is_that_of_its_slow_twin(width: int) -> None:
+    torch.manual_seed(1)
+    layer = RelativeAttention(width, 2)
+    queries, context = torch.randn(1, 3, width), torch.randn(1, 5, width)
+    places, others = torch.rand(1, 3, 3), torch.rand(1, 5, 3)
+    found = layer(queries, places, context, others)[0].detach().numpy()
+    twin = slow_attention(layer, queries[0], places[0].numpy(), context[0], others[0].numpy())
+    np.testing.assert_allclose(found, twin, atol=1e-5)
+    hidden = torch.tensor([[False, False, False, True, True]])
+    np.testing.assert_allclose(
+        layer(queries, places, context, others, hidden).detach().numpy(),
+        layer(queries, places, context[:, :3], others[:, :3]).detach().numpy(),
+        atol=1e-6,
+    )
+
+
+@settings(max_examples=20, deadline=None)
+@given(arrays(np.float32, 3, elements=st.floats(-2, 2, width=32)), st.integers(0, 99))
+def test_what_is_denoised_moves_with_the_scene(shift: Any, level: int) -> None:
+    """All points and the path elsewhere: the same path there, to a tenth of a millimetre."""
+    torch.manual_seed(2)
+    network = Network(SMALL).eval()
+    tokens, places = torch.randn(2, 9, SMALL.width), torch.rand(2, 9, 3)
+    hand, hidden = torch.randn(2, SMALL.width), torch.rand(2, 9) < 0.2
+    path, levels = torch.randn(2, 3, SMALL.poses, 9), torch.full((2, 3), level)
+    there = path.clone()
+    there[..., :3] += torch.tensor(shift) / paths.SCALE
+    with torch.inference_mode():
+        found, gripper = network.denoise(Scene(tokens, places, hidden, hand), path, levels)
+        moved, gripper_there = network.denoise(Scene(tokens, places + torch.tensor(shift), hidden, hand), there, levels)
+    off = (moved - found)[..., :3] * paths.SCALE - torch.tensor(shift)
+    assert off.abs().max() < 1e-4
+    assert (moved - found)[..., 3:].abs().max() < 1e-3
+    assert (gripper_there - gripper).abs().max() < 1e-3
+
+
+# -- noise -------------------------------------------------------------------------------------------------------------
+
+
+def test_noise_takes_all_and_can_be_taken_away() -> None:
+    assert (KEPT[1:] <= KEPT[:-1]).all()
+    assert KEPT[0].min() > 0.98 and KEPT[-1].max() < 0.02
+    clean, noise = torch.randn(2, 5, 6, 9), torch.randn(2, 5, 6, 9)
+    spread = noised(torch.zeros(2000, 6, 9), torch.randn(2000, 6, 9), torch.full((2000,), 50)).std(dim=0)
+    np.testing.assert_allclose(spread, (1 - KEPT[50]).sqrt().expand(6, 9), rtol=0.1)
+    np.testing.assert_allclose(noised(clean, noise, torch.zeros(2, 5, dtype=torch.long)), clean, atol=0.7)
+    asked: list[int] = []
+
+    def denoise(now: Any, level: Any) -> Any:
+        asked.append(int(level[0, 0]))
+        return clean, torch.zeros(now.shape[:-1])
+
+    found, gripper = sampled(denoise, noise, 10)
+    assert torch.equal(found, clean) and (gripper == 0.5).all()
+    assert asked[0] == STEPS - 1 and asked[-1] == 0 and asked == sorted(asked, reverse=True) and len(asked) == 10
+
+
+# -- paths -------------------------------------------------------------------------------------------------------------
+
+POSES = arrays(np.float64, (5, 7), elements=st.floats(-1.5, 1.5)).map(lambda raw: np.c_[raw[:, :6], raw[:, 6:] > 0])
+
+
+@settings(max_examples=50, deadline=None)
+@given(POSES)
+def test_vectors_are_poses(poses: Any) -> None:
+    again = paths.to_poses(paths.to_vectors(poses))
+    np.testing.assert_allclose(again[:, :3], poses[:, :3], atol=1e-5)
+    turned = Rotation.from_euler("xyz", again[:, 3:6]) * Rotation.from_euler("xyz", poses[:, 3:6]).inv()
+    assert turned.magnitude().max() < 1e-3
+    np.testing.assert_array_equal(again[:, 6], poses[:, 6])
+    stretched = paths.to_vectors(poses) * np.float32([1, 1, 1, 2, 2, 2, 3, 3, 3, 1])
+    np.testing.assert_allclose(paths.to_poses(stretched)[:, :6], again[:, :6], atol=1e-3)
+
+
+def test_a_dense_path_leads_through_its_poses_and_is_thinned_to_them() -> None:
+    """For each kind's expert; the gripper changes where it gets to, no sooner."""
+    for kind in KINDS.values():
+        setup = kind.setup(5, 1)
+        plan = kind.expert(setup.bench().places(setup.objects), setup.target)[:6]
+        path = paths.dense(HERE, plan, 50)
+        assert path.shape == (50, 7)
+        ends = np.rint(50 * np.arange(1, len(plan) + 1) / len(plan)).astype(int) - 1
+        np.testing.assert_allclose(path[ends][:, [0, 1, 2, 6]], plan[:, [0, 1, 2, 6]], atol=1e-9)
+        before = np.r_[1.0, plan[:-1, 6]]
+        for end, first, grip in zip(ends, np.r_[0, ends[:-1] + 1], before, strict=True):
+            assert (path[first:end, 6] == grip).all()
+        thin = paths.thinned(HERE, path, 10)
+        assert len(thin) == 10
+        between = [np.linalg.norm(thin - pose, axis=1).min() for pose in plan[plan[:, 6] != before]]
+        assert max(between, default=0) < 1e-6  # where the gripper changes
+        np.testing.assert_array_equal(paths.thinned(HERE, path, 50), path)
+        assert len(paths.thinned(HERE, path, 1)) == 1
+        np.testing.assert_array_equal(paths.thinned(HERE, path, 1)[0], path[-1])
+    np.testing.assert_array_equal(paths.moving(HERE, np.stack([HERE, plan[0], plan[0], plan[0]])), plan[:1])
+    np.testing.assert_array_equal(paths.moving(HERE, HERE[None]), HERE[None])
+
+
+# -- the policy --------------------------------------------------------------------------------------------------------
+
+
+def test_candidates_differ_and_are_functions_of_the_key(shown: list[Demonstration]) -> None:
+    policy, key = untrained(), Key(3, 1, 2)
+    first, second = (situation(each, key) for each in shown)
+    plans = policy.propose([first, second], 5, 50)
+    assert [len(each) for each in plans] == [5, 5]
+    assert all(plan.actions.shape == (50, 7) for each in plans for plan in each)
+    assert len({plan.actions.tobytes() for each in plans for plan in each}) == 10
+    np.testing.assert_array_equal(policy.propose([second], 5, 50)[0][2].actions, plans[1][2].actions)
+    np.testing.assert_allclose(policy.propose([second], 2, 50)[0][1].actions, plans[1][1].actions, atol=1e-4)
+    later = policy.propose([situation(shown[0], key.at(3))], 1, 50)[0][0]
+    assert not np.allclose(later.actions, plans[0][0].actions)
+    assert len(policy.propose([situation(shown[0], key, imagines=False)], 5, 50)[0]) == 1
+    assert all(1 <= len(plan.actions) <= 4 for plan in policy.propose([first], 5, 4)[0])
+
+
+def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstration]) -> None:
+    policy = untrained()
+    policy._network.half().float()
+    save(tmp_path / "weights.safetensors", policy._network, {"recipe": {"epochs": 1}})
+    again = wiw.policy("diffuser", weights=tmp_path / "weights.safetensors", steps=4)
+    assert again.card == {"recipe": {"epochs": 1}}
+    here = situation(shown[0], Key(0, 0))
+    np.testing.assert_array_equal(
+        policy.propose([here], 1, 50)[0][0].actions, again.propose([here], 1, 50)[0][0].actions
+    )
+    assert again.describe()["weights"] != policy.describe()["weights"]
+    with pytest.raises(WeightsError, match="wiw train diffuser") as missing:
+        wiw.policy("diffuser", weights=tmp_path / "none")
+    assert missing.value.kind == "missing"
+    (tmp_path / "damaged").write_bytes((tmp_path / "weights.safetensors").read_bytes()[:-100])
+    with pytest.raises(WeightsError, match="whole") as damaged:
+        load(tmp_path / "damaged")
+    assert damaged.value.kind == "unfit"
+    with pytest.raises(WeightsError, match="of something else"):
+        load(Path(wiw.__file__).parent / "world_models/warpnet/weights.safetensors")
+    with pytest.raises(ArgumentError, match="1 to 100 steps"):
+        wiw.policy("diffuser", weights=tmp_path / "weights.safetensors", steps=0)
+    with pytest.raises(ArgumentError, match="width"):
+        Shape(width=32)
+
+
+# -- training ----------------------------------------------------------------------------------------------------------
+
+
+def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: Moments) -> None:
+    assert len(seen) == 2 and seen.path.shape == (2, 6, 7)
+    setup = KINDS["slide_block"].setup(shown[0].seed, shown[0].variation)
+    plan = KINDS["slide_block"].expert(shown[0].places, setup.target)
+    np.testing.assert_allclose(seen.path[0][[0, 1, 2, 3, 5], :6], plan[[0, 1, 2, 3, 3], :6], atol=1e-6)
+    np.testing.assert_array_equal(seen.pose[0], shown[0].poses[0])
+    rows, columns = LENS.window((480, 480))
+    np.testing.assert_array_equal(seen.sight.image[0], shown[0].images[0][rows, columns])
+    pushes, _ = demonstrated(KINDS["push_buttons"], 1, Collection(frames=16, depth=True))
+    two = moments([pushes], LENS)
+    assert len(two) == 2
+    np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
+    np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
+    lit = two.sight.image[1].astype(int) - two.sight.image[0]
+    assert np.abs(lit).max() > 60
+    with pytest.raises(ArgumentError, match="--depth"):
+        moments([replace(shown[0], encoded_depths=None)], LENS)
+    with pytest.raises(ArgumentError, match="push_buttons"):
+        moments([replace(shown[0], task="juggle")], LENS)
+    with pytest.raises(ArgumentError, match="got none"):
+        moments([], LENS)
+
+
+def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Moments) -> None:
+    recipe = Recipe(epochs=100, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
+    network, _ = train(seen, recipe)
+    policy = Diffuser.of(network)
+    for each, path in zip(shown, seen.path, strict=True):
+        stops = policy._stops(situation(each, Key(0, 0)), [1, 2, 3])
+        off = np.linalg.norm(stops[..., :3] - path[:, :3], axis=-1)
+        assert np.median(off) < 0.03
+        assert (stops[..., 6] == path[:, 6]).mean() > 0.8
+
+
+def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_path: Path) -> None:
+    recipe = Recipe(epochs=3, batch=1, levels=2, width=24, layers=1)
+    whole, _ = train(seen, recipe)
+    file = tmp_path / "checkpoint"
+
+    def stop(step: int, *_: Any) -> None:
+        if step == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(seen, recipe, show=stop, checkpoint=Checkpoint(file, {"a": 1}, seconds=0))
+    steps: list[int] = []
+    on, _ = train(seen, recipe, show=lambda step, *_: steps.append(step), checkpoint=Checkpoint(file, {"a": 1}))
+    assert steps == [4, 5, 6]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, on.state_dict()[name])
+    with pytest.raises(ArgumentError, match="another training"):
+        Checkpoint(file, {"a": 2}).stand()
+    file.write_bytes(file.read_bytes()[:50])
+    with pytest.raises(FileError, match="delete it"):
+        Checkpoint(file, {"a": 1}).stand()
+    with pytest.raises(ArgumentError, match="epochs"):
+        Recipe(epochs=0)
+
+
+def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "x")]
+    assert main(["train", "diffuser", *out]) == 2
+    assert "--demonstrations" in capsys.readouterr().err
+    assert main(["train", "warpnet", *out, "--demonstrations", str(tmp_path)]) == 2
+    assert "leave it out" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_trains_on_what_was_collected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pyarrow", reason="needs wiw[export]")
+    demos, out = str(tmp_path / "demos"), tmp_path / "weights.safetensors"
+    few = ["--tasks", "slide_block", "--episodes", "8", "--frames", "16", "--depth"]
+    assert main(["collect", "manipulation", *few, "--out", demos]) == 0
+    assert main(["train", "diffuser", "--demonstrations", demos, "--epochs", "2", "--out", str(out)]) == 0
+    assert "8 demonstrations" in capsys.readouterr().out
+    assert [each.name for each in tmp_path.iterdir() if each.name.startswith("weights")] == [out.name]
+    assert load(out)[1]["recipe"]["epochs"] == 2
