@@ -8,6 +8,7 @@ import io
 import json
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -22,7 +23,7 @@ from test_export import contents_of
 import wiw
 from wiw.errors import ArgumentError
 from wiw.evaluation.evaluate import evaluate
-from wiw.evaluation.films import film
+from wiw.evaluation.films import film, keep_films
 from wiw.evaluation.report.page import render
 from wiw.evaluation.report.stage import SIDE, Stage, signs, stage_of
 from wiw.evaluation.rows import decode_jpeg, kept_frames
@@ -116,6 +117,10 @@ def test_arms_that_did_the_same_are_filmed_once(log: Any) -> None:
     assert films[0] != films[1] and len(films[1]) < len(films[0])
     with pytest.raises(ArgumentError, match="finite pose"):
         film(Manipulation().table(log.store.episodes()[0]).bench, [[np.nan] * 7])
+
+
+def test_failures_that_are_run_again_are_not_filmed() -> None:
+    keep_films(SimpleNamespace(config={"attributes": {}}), SimpleNamespace(build=Manipulation))  # type: ignore[arg-type]
 
 
 def test_the_report_speaks_of_the_table(log: Any, html: str) -> None:
