@@ -321,7 +321,7 @@ def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: M
 
 
 def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Moments) -> None:
-    recipe = Recipe(epochs=100, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
+    recipe = Recipe(epochs=150, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
     network, _ = train(seen, recipe)
     policy = Diffuser.of(network)
     for each, path in zip(shown, seen.path, strict=True):
