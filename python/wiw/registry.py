@@ -179,6 +179,7 @@ WORLD_MODELS = Registry(
         "wan2.2-a14b-action": "wiw.world_models.actions.variants:Wan22Action",
         "cosmos-predict2-action": "wiw.world_models.actions.variants:CosmosPredict2Action",
         "warpnet": "wiw.world_models.warpnet:WarpNet",
+        "armnet": "wiw.world_models.armnet:ArmNet",
         "remote:": "wiw.world_models.remote:Remote",
     },
     "wiw.world_models.base:WorldModel",

@@ -12,7 +12,9 @@ from tyro.conf import Positional, arg
 
 
 def train(
-    what: Positional[Annotated[Literal["recogniser", "warpnet", "diffuser"], arg(metavar="WHAT")]] = "recogniser",
+    what: Positional[
+        Annotated[Literal["recogniser", "warpnet", "armnet", "diffuser"], arg(metavar="WHAT")]
+    ] = "recogniser",
     /,
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -23,20 +25,23 @@ def train(
     epochs: Annotated[int | None, arg(metavar="N")] = None,
     minutes: Annotated[float | None, arg(metavar="MIN")] = None,
     places: Annotated[int | None, arg(metavar="N")] = None,
+    plays: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
     workers: Annotated[int, arg(metavar="N")] = 2,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Trains a network on generated apartments or on scenes of your own, or on demonstrations.
+    """Trains a network on generated apartments or on scenes of your own, at the table of an arm, or on demonstrations.
 
     recogniser: the policy of Active Recognition, which tells what is in a red box from any number of real and imagined
-    views. warpnet: a world model that shows what a panorama would look like from near by. diffuser: the 3D diffusion
-    policy of manipulation.
+    views. warpnet: a world model that shows what a panorama would look like from near by. armnet: a world model that
+    shows what the front view of an arm would look like after it has gone to each pose of a plan. diffuser: the 3D
+    diffusion policy of manipulation.
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
     $ wiw train warpnet --out warpnet.safetensors
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
+    $ wiw train armnet --out armnet.safetensors
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
@@ -44,18 +49,21 @@ def train(
     an hour on two idle cores. Recipe and figures on the val scenes are kept in the file: the recogniser's accuracy and
     calibration error on one half of them, its confidence being calibrated on the other; warpnet's PSNR and SSIM beside
     those of copy and warp. The recogniser's weights that come with the package were made by this command as it stands.
+    armnet looks at no scenes: it plays at the tables of the manipulation tasks first, mostly badly, and measures on
+    plays of its own beside copy and a table on which nothing but the arm moves.
 
     Args:
-        what: recogniser or warpnet.
+        what: recogniser, warpnet or armnet.
         out: Weights, as safetensors of a few MB; WHAT.safetensors if not given.
         scenes: To learn from: apartments:train[:N], a mesh or a Gazebo world.
         val: To measure on, and for the recogniser to calibrate with: it halves them, or the looks of a single one.
         categories: What there is to recognise; the built-in list if none is given.
-        demonstrations: Of `wiw collect manipulation`, with depth, for diffuser to learn from.
-        epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet, 400 for
+        demonstrations: Of `wiw collect manipulation`: for diffuser to learn from, with depth; for armnet beside plays.
+        epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet, 4 for armnet, 400 for
             diffuser if not given.
         minutes: Fewer epochs where so many would take longer than this to train.
         places: From which a scene is looked at, or that it is walked through from; 16 and 24 if not given.
+        plays: For armnet: at tables, of eight poses each; 1000 if not given.
         seed: The looks are a function of it and the scenes, the weights of it, the looks and the epochs.
         workers: Processes that look around.
         cache: Where looks are kept; $WIW_CACHE/looks if not given. Deleting it is always safe.
@@ -64,19 +72,25 @@ def train(
     from wiw.scenes.store import folder
 
     out = out or Path(f"{what}.safetensors")
+    if what == "armnet" and places is not None:
+        raise ArgumentError("--places: armnet looks at no scenes; give --plays")
+    if what != "armnet" and plays is not None:
+        raise ArgumentError(f"--plays: {what} learns from something else; leave it out")
     _require_torch(what)
     _check_out(out)
     if what == "diffuser":
         _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
         return 0
-    if demonstrations is not None:
+    if demonstrations is not None and what != "armnet":
         raise ArgumentError(f"--demonstrations: {what} learns from scenes; leave it out")
     _check_scenes(scenes, val)
     asked = _Asked(scenes, val, seed, cache or folder().parent / "looks", workers)
     if what == "recogniser":
         _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
     elif categories:
-        raise ArgumentError("--categories: warpnet recognises nothing; leave them out")
+        raise ArgumentError(f"--categories: {what} recognises nothing; leave them out")
+    elif what == "armnet":
+        _armnet(out, asked, minutes, plays or 1000, demonstrations, _given(epochs=epochs))
     else:
         _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
     return 0
@@ -107,10 +121,10 @@ def _require_torch(what: str) -> None:
 
         require_torch()
     else:
+        from wiw.registry import WORLD_MODELS
         from wiw.world_models import devices
-        from wiw.world_models.warpnet import WarpNet
 
-        devices.require(WarpNet.requires)
+        devices.require(WORLD_MODELS.find(what).requires)
 
 
 def _recogniser(
@@ -182,6 +196,35 @@ def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 
+def _armnet(
+    out: Path, asked: _Asked, minutes: float | None, count: int, demonstrations: Path | None, how: dict[str, Any]
+) -> None:
+    from wiw.networks import one_thread
+    from wiw.training import armnet as training
+    from wiw.training.checkpoint import Checkpoint
+    from wiw.training.plays import demonstrated, gathered_plays, merged
+    from wiw.world_models.armnet.weights import load, save
+
+    recipe = training.Recipe(seed=asked.seed, **how)
+    plays = gathered_plays(count, asked.seed, **asked.gathering)
+    held_out = gathered_plays(training.HELD_OUT, asked.seed + training.OTHERS, **asked.gathering)
+    card: dict[str, Any] = {"plays": len(plays), "demonstrations": 0}
+    if demonstrations is not None:
+        shown = demonstrated(demonstrations)
+        card["demonstrations"] = len(shown)
+        plays = merged([plays, shown])
+    asked_for = {**card, "recipe": asdict(recipe), "minutes": minutes}
+    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), asked_for)
+    with one_thread(), _Steps() as steps:
+        network, recipe = training.train(plays, recipe, minutes, steps, checkpoint)
+    card["recipe"] = asdict(recipe)
+    save(out, network, card)  # before measuring, which takes another minute
+    checkpoint.remove()
+    card["held_out"] = training.measured(load(out)[0], held_out)
+    save(out, load(out)[0], card)
+    _report_armnet(card, out)
+
+
 def _given(**options: Any) -> dict[str, Any]:
     """Those that are not None."""
     return {name: value for name, value in options.items() if value is not None}
@@ -222,6 +265,19 @@ def _report_warpnet(card: dict[str, Any], out: Path) -> None:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]
         print(f"  {name:<18}" + "".join(cells))
     print("PSNR in dB and SSIM of whole panoramas, weighted by latitude")
+    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
+
+
+def _report_armnet(card: dict[str, Any], out: Path) -> None:
+    held_out = card["held_out"]
+    print(f"{card['plays']} plays, {card['recipe']['epochs']} epochs; held out: {held_out['plays']} plays")
+    print(f"{'poses gone to':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
+    for name in held_out["psnr"]:
+        cells = [
+            f"{held_out['changed'][name][n]:8.1f} {held_out['psnr'][name][n]:6.1f}" for n in held_out["psnr"][name]
+        ]
+        print(f"  {name:<18}" + "".join(cells))
+    print("mean absolute error, of 255, where things have changed, and PSNR in dB of the window around the table")
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is learnt from, of many scenes: kept on disk scene by scene, so that a command that was stopped goes on."""
+"""What is learnt from, of many scenes or plays: kept on disk one by one, so that a command that was stopped goes on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import scenes
-from wiw.datasets.worlds import World, world
+from wiw.datasets.worlds import world
 from wiw.errors import FileError
 from wiw.perception.glimpses import Glimpses
 from wiw.scenes.store import build_digest
@@ -34,16 +34,16 @@ Bar = Callable[[Iterable[str], str, int], Iterable[str]]
 
 @dataclass(frozen=True)
 class Job:
-    """What is gathered from each scene."""
+    """What is gathered from each scene, or other source."""
 
     name: str
     """In words, for bars."""
     fields: tuple[str, ...]
     """Of the arrays that `make` gives."""
-    make: Callable[[World], Arrays]
-    """Runs in other processes: a function of a module, or a `partial` of one."""
+    make: Callable[[str], Arrays]
+    """Of a source by its name. Runs in other processes: a function of a module, or a `partial` of one."""
     identity: tuple[Any, ...]
-    """JSON-able: all that the arrays depend on beside the scene, and a version to raise when `make` changes."""
+    """JSON-able: all that the arrays depend on beside the source, and a version to raise when `make` changes."""
 
 
 LOOKS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
@@ -60,8 +60,8 @@ def gathered(
         ArgumentError: the scenes show nothing of `categories`.
     """
     make = partial(_looks, seed=seed, categories=tuple(categories), rules=rules)
-    job = Job("looks", LOOKS, make, (1, list(categories), seed, asdict(rules)))
-    found = _gather(specs, job, folder, workers, bar)
+    job = Job(f"looks of {specs}", LOOKS, make, (1, list(categories), seed, asdict(rules)))
+    found = gather(_scenes(specs), job, folder, workers, bar)
     parts = [(Glimpses(a["images"], a["boxes"], a["scalars"]), a["owners"], a["kinds"], a["labels"]) for a in found]
     return merged([Looks(*part) for part in parts])
 
@@ -73,30 +73,48 @@ def gathered_walks(specs: str, seed: int, rules: WalkRules, folder: Path, worker
         FileError: the folder cannot be written.
         ArgumentError: nowhere in the scenes can one walk straight ahead.
     """
-    job = Job("walks", WALKS, partial(_walks, seed=seed, rules=rules), ("walks", 1, seed, asdict(rules)))
-    return merged_walks([Walks(*(a[name] for name in WALKS)) for a in _gather(specs, job, folder, workers, bar)])
+    job = Job(f"walks of {specs}", WALKS, partial(_walks, seed=seed, rules=rules), ("walks", 1, seed, asdict(rules)))
+    return merged_walks(
+        [Walks(*(a[name] for name in WALKS)) for a in gather(_scenes(specs), job, folder, workers, bar)]
+    )
 
 
-def _looks(world: World, seed: int, categories: Sequence[str], rules: LookRules) -> Arrays:
-    looks = look_around(world, seed, categories, rules)
+def _scenes(specs: str) -> dict[str, str]:
+    """Names of a spec's scenes wherever they are asked for, by their names here."""
+    return {name: scenes.absolute(name) for name in scenes.resolve(specs)}
+
+
+def _looks(name: str, seed: int, categories: Sequence[str], rules: LookRules) -> Arrays:
+    looks = look_around(world(name), seed, categories, rules)
     found = looks.glimpses
     values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
     return dict(zip(LOOKS, values, strict=True))
 
 
-def _walks(world: World, seed: int, rules: WalkRules) -> Arrays:
-    walks = walk_about(world, seed, rules)
+def _walks(name: str, seed: int, rules: WalkRules) -> Arrays:
+    walks = walk_about(world(name), seed, rules)
     return {name: getattr(walks, name) for name in WALKS}
 
 
-def _gather(specs: str, job: Job, folder: Path, workers: int, bar: Bar) -> list[Arrays]:
-    """Arrays of all scenes of a spec, in their order."""
-    names = scenes.resolve(specs)
-    files = {name: folder / f"{_digest(name, job)}.npz" for name in names}
+def gather(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar: Bar) -> list[Arrays]:
+    """Arrays of all sources, in their order; those that `folder` does not hold are made by `workers` processes.
+
+    Args:
+        sources: the name that tells each from all others, by the name that `job.make` takes.
+        job: what is made of each.
+        folder: where they are kept.
+        workers: processes.
+        bar: shows how far they have come.
+
+    Raises:
+        FileError: the folder cannot be written.
+    """
+    names = list(sources)
+    files = {name: folder / f"{_digest(source, job)}.npz" for name, source in sources.items()}
     missing = [name for name in names if _read(files[name], job) is None]
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        list(bar(_made(missing, files, job, workers), f"{job.name} of {specs}", len(missing)))
+        list(bar(_made(missing, files, job, workers), job.name, len(missing)))
     except OSError as error:
         raise FileError(f"{folder}: cannot be written ({error.strerror}); choose another with --cache") from error
     found = [_read(files[name], job) for name in names]
@@ -119,7 +137,7 @@ def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) 
 
 
 def _make(name: str, file: Path, job: Job) -> str:
-    arrays = job.make(world(name))
+    arrays = job.make(name)
     part = file.with_name(f"{file.stem}.{os.getpid()}.part")
     with part.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
@@ -136,7 +154,7 @@ def _read(file: Path, job: Job) -> Arrays | None:
         return None
 
 
-def _digest(name: str, job: Job) -> str:
+def _digest(source: str, job: Job) -> str:
     version, *rest = job.identity
-    identity = [version, build_digest(), scenes.absolute(name), *rest]
+    identity = [version, build_digest(), source, *rest]
     return blake2b(json.dumps(identity).encode(), digest_size=12).hexdigest()

@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is known before anything is learnt: the arm's own body, its camera and the bare table.
+
+A robot knows its description and where its camera stands. So the arm at any pose is drawn, over the bare table and with
+its shadow, and only what happens to things is left to a network. Nothing here sees the table that plans are made for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.tabletop.workbench import Workbench
+
+NEARER = 1e-3
+"""Metres that the arm is nearer to the camera than the bare table where it hides it."""
+
+
+@dataclass(frozen=True)
+class Sight:
+    """The arm over the bare table."""
+
+    color: NDArray[np.uint8]
+    """[H, W, 3]."""
+    arm: NDArray[np.bool_]
+    """[H, W]: where it hides the table."""
+    pose: NDArray[np.float64]
+    """float64 [7] of the gripper, which may not have come to the pose that it was told to go to."""
+
+
+@cache
+def _bare() -> Workbench:
+    return Workbench([])
+
+
+@cache
+def plate(size: tuple[int, int]) -> Sight:
+    """The bare table without an arm, as seen in front."""
+    seen = _bare().picture("front", size, ("color", "depth"), arm=False)
+    seen["color"].setflags(write=False)
+    return Sight(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
+
+
+@cache
+def _depth(size: tuple[int, int]) -> NDArray[np.float32]:
+    depth: NDArray[np.float32] = _bare().picture("front", size, ("depth",), arm=False)["depth"]
+    return depth
+
+
+def sights(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[Sight]:
+    """The arm after it has gone to each of the poses [N, 7], one after another, from where it waits."""
+    bench = _bare().fork()
+    for pose in poses:
+        bench.go(np.clip(pose, *_RANGE))
+        seen = bench.picture("front", size, ("color", "depth"))
+        yield Sight(seen["color"], seen["depth"] < _depth(size) - NEARER, bench.pose)
+
+
+_RANGE = np.array([[-np.inf] * 6 + [0.0], [np.inf] * 6 + [1.0]])
+"""A gripper that has been measured may be open by a hair more than all."""

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A plan carried out in imagination: the network in small, its composition in full size."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from wiw.world_models.armnet.body import Sight, plate, sights
+from wiw.world_models.armnet.motion import motion
+from wiw.world_models.armnet.network import (
+    FRONT,
+    WINDOW,
+    Arm,
+    Mixture,
+    Motion,
+    Network,
+    cleared,
+    composed,
+    imagined_in_sight,
+    in_sight,
+    shade,
+    sources,
+)
+
+
+def imagined(network: Network, image: NDArray[np.uint8], poses: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
+    """uint8 [H, W, 3] after each pose but the first of [N, 7], from the view at the first.
+
+    H and W are the same whole multiple of the network's front view.
+    """
+    size = image.shape[0], image.shape[1]
+    scale = size[0] // FRONT[0]
+    bare = _image(plate(size).color)
+    arms = sights(poses, size)
+    here = next(arms)
+    with torch.inference_mode():
+        view, first = _image(image), _arm(here)
+        canvas = cleared(view, first, in_sight(view, first), bare, bare)
+        for there in arms:
+            arm, way = _arm(there), motion(here.pose[None], there.pose[None])
+            seen = torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, bare, arm.mask)).clamp(0, 1)
+            inner = Arm(_window(arm.color, scale), _window(arm.mask, scale))
+            around, table = _window(canvas, scale), _window(bare, scale)
+            mixture = _mixture(network, around, inner, _window(_arm(here).mask, scale), way, table, scale)
+            _window(seen, scale)[:] = composed(mixture.shares, sources(mixture, around, inner, way, table, scale))
+            hidden = arm.mask > 0.5
+            _window(hidden, scale)[:] = imagined_in_sight(mixture.shares, inner)
+            canvas = cleared(seen, arm, hidden, bare, canvas)
+            here = there
+            yield (seen[0].permute(1, 2, 0) * 255).round().byte().numpy()
+
+
+def _mixture(
+    network: Network, canvas: Tensor, arm: Arm, before: Tensor, way: Motion, bare: Tensor, scale: int
+) -> Mixture:
+    """How the network composes the window, in full size."""
+
+    def small(image: Tensor) -> Tensor:
+        return functional.avg_pool2d(image, scale)
+
+    def large(image: Tensor) -> Tensor:
+        return functional.interpolate(image, scale_factor=scale, mode="bilinear", align_corners=False)
+
+    now = Arm(small(arm.color), (small(arm.mask) > 0.5).float())
+    found = network(small(canvas), now, (small(before) > 0.5).float(), way, small(bare))
+    return Mixture(large(found.shares), large(found.paint), large(found.flow))
+
+
+def _window(image: Tensor, scale: int) -> Tensor:
+    """The network's part of a front view that is so many times as large as it sees it."""
+    rows, columns = (slice(side.start * scale, side.stop * scale) for side in WINDOW)
+    return image[..., rows, columns]
+
+
+def _arm(sight: Sight) -> Arm:
+    return Arm(_image(sight.color), torch.from_numpy(sight.arm.astype(np.float32))[None, None])
+
+
+def _image(image: NDArray[np.uint8]) -> Tensor:
+    """Float [1, 3, H, W] in [0, 1]."""
+    return torch.from_numpy(np.array(image)).permute(2, 0, 1)[None].float() / 255

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of the small networks that are trained here: half-precision safetensors with how each was made and measured."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save as packed
+from torch import nn
+
+from wiw.errors import FileError, WeightsError
+
+N = TypeVar("N", bound=nn.Module)
+
+
+@dataclass(frozen=True)
+class WeightFile(Generic[N]):
+    """The files of one kind of network."""
+
+    name: str
+    """Of the world model, as it is trained by `wiw train NAME`."""
+    sizes: Callable[[N], dict[str, Any]]
+    """JSON-able: what a network of the same shape is built of."""
+    build: Callable[[Mapping[str, Any]], N]
+    """A network of such sizes."""
+
+    @property
+    def format(self) -> str:
+        """In the header; its number is raised when networks change."""
+        return f"wiw-{self.name}-1"
+
+    @property
+    def cure(self) -> str:
+        """What to do without a file."""
+        return f"`wiw train {self.name}` makes some"
+
+    def load(self, path: str | Path) -> tuple[N, dict[str, Any]]:
+        """The network and its card.
+
+        Raises:
+            WeightsError: there is no such file, or it is damaged, of another version or of something else.
+        """
+        path = Path(path).expanduser()
+        if not path.is_file():
+            raise WeightsError(f"no file {path}; {self.cure}")
+        try:
+            with safe_open(path, framework="pt") as file:
+                header = self._header(file.metadata(), path)
+                values = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - it is no mapping
+            network = self.build(header)
+            network.load_state_dict(values)
+            return network.eval(), dict(header["card"])
+        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+            raise WeightsError(
+                f"{path}: expected weights of {self.name}, whole: {error}; {self.cure}", "unfit"
+            ) from error
+
+    def save(self, path: Path, network: N, card: Mapping[str, Any]) -> None:
+        """Writes them whole or not at all.
+
+        Raises:
+            FileError: the file cannot be written.
+        """
+        header = {**self.sizes(network), "card": dict(card)}
+        values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+        half = path.with_name(f"{path.name}.{os.getpid()}.part")
+        try:
+            half.write_bytes(packed(values, {"format": self.format, "header": json.dumps(header, sort_keys=True)}))
+            half.replace(path)
+        except OSError as error:
+            half.unlink(missing_ok=True)
+            raise FileError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+
+    def _header(self, metadata: Mapping[str, str] | None, path: Path) -> dict[str, Any]:
+        found = (metadata or {}).get("format")
+        if not metadata or found != self.format:
+            raise WeightsError(
+                f"{path}: expected the format '{self.format}' in its header, got {found!r}: weights of something else, "
+                f"or of another version; {self.cure}",
+                "revision" if str(found).startswith(f"wiw-{self.name}") else "unfit",
+            )
+        return dict(json.loads(metadata["header"]))

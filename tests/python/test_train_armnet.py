@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""armnet's training: what plays are, that lessons can be repeated, and that a short one is worth something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.cli.app import main
+from wiw.errors import ArgumentError
+from wiw.tabletop.workbench import TABLE
+
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+from wiw.training.armnet import CHANGED, Recipe, drawn, followed, led, measured, train, ways  # noqa: E402
+from wiw.training.checkpoint import Checkpoint  # noqa: E402
+from wiw.training.plays import FIELDS, POSES, Plays, demonstrated, gathered_plays, played, spoilt  # noqa: E402
+from wiw.world_models.armnet import ArmNet  # noqa: E402
+from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
+
+SMALL = (8, 16, 16)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Any:
+    """Threads that wait for each other spin: on a busy machine two are slower than one."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def plays() -> Plays:
+    """One of each task."""
+    return played(0, 0, 4)
+
+
+def test_a_play_is_a_function_of_its_number(plays: Plays) -> None:
+    again = played(0, 2, 1)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(again, name)[0], getattr(plays, name)[2])
+    assert plays.seen.shape == (4, POSES + 1, *np.zeros((160, 160))[WINDOW].shape, 3) == plays.bare.shape
+    assert plays.arm.dtype == np.bool_ and 0.01 < plays.arm.mean() < 0.3
+    hidden = np.abs(plays.seen.astype(int) - plays.bare).max(axis=-1)[plays.arm]
+    assert np.mean(hidden < 8) > 0.9
+    assert np.abs(plays.seen.astype(int) - plays.bare).max(axis=-1)[~plays.arm].max() > 60  # things
+
+
+def test_plans_are_spoilt_in_many_ways() -> None:
+    plan = np.array([[0.1 * k, 0.0, TABLE + 0.1, np.pi, 0, 0, k % 2] for k in range(6)])
+    made = [spoilt(plan, np.random.default_rng(seed)) for seed in range(200)]
+    same = [len(each) == len(plan) and np.array_equal(each, plan) for each in made]
+    assert 0.2 < np.mean(same) < 0.45
+    assert any(len(each) == 5 for each in made)
+    whole = [each for each in made if len(each) == 6]
+    assert any((each[:, 6] != plan[:, 6]).any() and np.array_equal(each[:, :6], plan[:, :6]) for each in whole)
+    shifts = [each[:, :2] - plan[:, :2] for each in whole]
+    assert any(np.ptp(shift, axis=0).max() < 1e-9 < np.abs(shift).max() for shift in shifts)
+    assert all(each[:, 6].min() >= 0 and each[:, 6].max() <= 1 and each[:, 2].min() > TABLE for each in made)
+
+
+def test_a_way_goes_on_from_what_the_network_made(plays: Plays) -> None:
+    batch = drawn(plays, 5, 3, np.random.default_rng(0))
+    assert len(batch.seen) == len(batch.arms) == 4 and len(batch.motions) == 3
+    assert all(view.shape == (5, 3, 64, 120) for view in batch.seen)
+    torch.manual_seed(0)
+    network, batch = Network(SMALL), ways(plays, np.arange(4), np.zeros(4, np.int64), 2)
+    steps, (whole,) = list(followed(network, batch)), led(network, batch)
+    assert len(steps) == 2 and len(whole.made) == 8
+    torch.testing.assert_close(whole.made[:4], steps[0].made)  # from the same canvas
+    assert (whole.made[4:] - steps[1].made).abs().max() > 0.05  # from that of the true view
+    for step in steps:
+        assert step.made.requires_grad and not step.still.requires_grad
+        assert (step.still - step.target).abs().mean() < (step.made - step.target).abs().mean() * 2
+
+
+def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp_path: Path) -> None:
+    once, again, other = (
+        train(plays, Recipe(epochs=1, batch=4, widths=(4, 4, 4), seed=seed))[0].state_dict() for seed in (1, 1, 2)
+    )
+    assert all(torch.equal(once[name], again[name]) for name in once)
+    assert not torch.equal(once["last.weight"], other["last.weight"])
+    checkpoint = Checkpoint(tmp_path / "kept", {}, seconds=0)
+
+    def cut(step: int, steps: int, loss: float) -> None:
+        if step == 2:
+            raise KeyboardInterrupt
+
+    recipe = Recipe(epochs=3, batch=4, steps=1, widths=(4, 4, 4))
+    whole = train(plays, recipe)[0].state_dict()
+    with pytest.raises(KeyboardInterrupt):
+        train(plays, recipe, show=lambda step, steps, loss: cut(step - 1, steps, loss), checkpoint=checkpoint)
+    assert checkpoint.stand().step == 2
+    resumed = train(plays, recipe, checkpoint=checkpoint)[0].state_dict()
+    assert all(torch.equal(whole[name], resumed[name]) for name in whole)
+    for wrong in ({"epochs": 0}, {"steps": POSES + 1}):
+        with pytest.raises(ArgumentError, match="epochs"):
+            Recipe(**wrong)
+
+
+def test_training_teaches_what_becomes_of_things(plays: Plays) -> None:
+    """By heart, of one play: it is nearer to what changes than one who leaves things alone."""
+    one = Plays(*(getattr(plays, name)[:1] for name in FIELDS))
+    network, _ = train(one, Recipe(epochs=40, batch=4, steps=2, free=0, widths=SMALL, rate=5e-3))
+    batch = ways(one, np.zeros(7, np.int64), np.arange(7), 1)
+    with torch.inference_mode():
+        (step,) = followed(network, batch)
+        changed = (step.target - step.still).abs().amax(1, keepdim=True) > CHANGED
+        wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.made, step.still))
+    assert wrong < 0.95 * alone
+
+
+def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Plays) -> None:
+    network = Network(SMALL)
+    torch.nn.init.zeros_(network.last.weight)
+    found = measured(network, plays)
+    assert found["plays"] == 4 and set(found["psnr"]) == {"copy", "arm", "armnet"}
+    assert found["psnr"]["arm"]["1"] > found["psnr"]["copy"]["1"] + 3
+    assert abs(found["psnr"]["armnet"]["1"] - found["psnr"]["arm"]["1"]) < 6
+    assert found["changed"]["arm"]["5"] > 10
+
+
+def test_plays_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("wiw.training.plays.CHUNK", 2)
+    bars: list[tuple[str, int]] = []
+
+    def bar(items: Any, text: str, total: int) -> Any:
+        bars.append((text, total))
+        return items
+
+    once = gathered_plays(3, 0, tmp_path, 1, bar)
+    again = gathered_plays(3, 0, tmp_path, 1, bar)
+    assert len(once) == 3 and bars == [("3 plays", 2), ("3 plays", 0)]
+    np.testing.assert_array_equal(once.seen, again.seen)
+
+
+def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
+    pytest.importorskip("pyarrow")
+    out = str(tmp_path / "demos")
+    command = ["collect", "manipulation", "--out", out, "--episodes", "1", "--tasks", "slide_block", "--size", "160"]
+    assert main(command) == 0
+    found = demonstrated(tmp_path / "demos")
+    assert len(found) == 1 and found.seen.shape[1:] == plays.seen.shape[1:]
+    hidden = np.abs(found.seen.astype(int) - found.bare).max(axis=-1)[found.arm]
+    assert np.mean(hidden < 12) > 0.85
+    np.testing.assert_array_equal(found.seen[0, 4], found.seen[0, 8])  # four poses, then it stays
+    np.testing.assert_allclose(found.poses[0, 4, :3], found.poses[0, 8, :3], atol=1e-3)
+
+
+@pytest.mark.slow
+def test_the_command_makes_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
+    command = ["train", "armnet", "--plays", "25", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
+    assert main(command) == 0
+    assert "poses gone to" in capsys.readouterr().out
+    card = ArmNet(out).card
+    assert card["plays"] == 25 and card["recipe"]["epochs"] == 8
+    changed = card["held_out"]["changed"]
+    assert changed["armnet"]["1"] < changed["arm"]["1"]
+
+
+def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "x")]
+    assert main(["train", "armnet", *out, "--categories", "chair"]) == 2
+    assert "recognises nothing" in capsys.readouterr().err
+    assert main(["train", "armnet", *out, "--places", "3"]) == 2
+    assert "--plays" in capsys.readouterr().err
+    assert main(["train", "warpnet", *out, "--plays", "3"]) == 2
+    assert "--plays: warpnet" in capsys.readouterr().err
