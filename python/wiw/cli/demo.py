@@ -46,7 +46,7 @@ PARTS = (
         ("none", "copy", "oracle"),
         4,
         "A robot arm pushes buttons in the order that it is told: 4 episodes",
-        "wiw run manipulation --arms none,copy,oracle",
+        "wiw run manipulation --arms none,copy,armnet,oracle",
         {"tasks": "push_buttons"},
     ),
 )
