@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.datasets.demonstrations import Demonstration, Demonstrations
 from wiw.tabletop.kind import DOWN, Kind, Setup
+from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.workbench import TABLE, Workbench
-from wiw.tasks.manipulation import KINDS
 from wiw.training.gather import Arrays, Bar, Job, gather
 from wiw.world_models.armnet.body import sights
 from wiw.world_models.armnet.network import FRONT, WINDOW
