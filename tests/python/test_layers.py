@@ -18,7 +18,9 @@ CPP_ROWS = [
 ]
 FACES = {
     "types",
+    "weight_file",
     "errors",
+    "files",
     "registry",
     "networks",
     "panorama",

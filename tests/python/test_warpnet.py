@@ -171,7 +171,7 @@ def test_a_saved_network_is_loaded_again(tmp_path: Path) -> None:
     for name, value in network.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value.half().float())
     with pytest.raises(wiw.errors.FileError, match="cannot be written"):
-        save(tmp_path / "no" / "w", network, {})
+        save(file / "w", network, {})
 
 
 def test_what_is_no_weights_is_refused(tmp_path: Path) -> None:

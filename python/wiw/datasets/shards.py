@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wiw.errors import DependencyError, FileError
+from wiw.files import whole_file
 
 if TYPE_CHECKING:
     from wiw.datasets.demonstrations import Demonstration
@@ -67,20 +67,12 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
 
     depth = demonstrations[0].encoded_depths is not None
     schema = _schema(depth, facts)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        with parquet.ParquetWriter(part, schema, use_dictionary=list(REPEATED), compression=_packing(depth)) as file:
-            for each in demonstrations:
-                file.write_table(_table(each, schema), row_group_size=len(each))
-        with part.open("rb") as written:
-            os.fsync(written.fileno())
-        part.replace(path)
-    except OSError as error:
-        raise FileError(
-            f"{path}: cannot be written ({error.strerror or error}); make room or name another folder"
-        ) from error
-    finally:
-        part.unlink(missing_ok=True)
+    with (
+        whole_file(path) as draft,
+        parquet.ParquetWriter(draft, schema, use_dictionary=list(REPEATED), compression=_packing(depth)) as file,
+    ):
+        for each in demonstrations:
+            file.write_table(_table(each, schema), row_group_size=len(each))
 
 
 class Shard:

@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.faults import whole_file
 from wiw.evaluation.rows import to_json
 from wiw.evaluation.statistics import Estimate, estimate_mean
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.summary import show_estimate
+from wiw.files import whole_file
 from wiw.loop.swaps import STAGES
 from wiw.metrics.headlines import SUCCESS
 

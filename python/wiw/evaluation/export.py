@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.faults import whole_file, whole_folder
 from wiw.evaluation.rows import to_json
 from wiw.evaluation.runlog import RunLog
+from wiw.files import whole_file, whole_folder
 
 Table = list[dict[str, Any]]
 

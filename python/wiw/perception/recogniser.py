@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, BackendError, FileError
+from wiw.files import whole_file
 from wiw.networks import one_thread
 from wiw.perception.calibration import softmax
 from wiw.perception.glimpses import Glimpses, joined
@@ -106,14 +106,8 @@ class Recogniser:
         }
         weights = {name: value.half().contiguous() for name, value in state(self.network).items()}
         metadata = {"format": FORMAT, "header": json.dumps(header, sort_keys=True)}
-        path = Path(path)
-        half = path.with_name(f"{path.name}.{os.getpid()}.part")
-        try:
-            half.write_bytes(save(weights, metadata))
-            half.replace(path)
-        except OSError as error:
-            half.unlink(missing_ok=True)
-            raise FileError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        with whole_file(Path(path)) as draft:
+            draft.write_bytes(save(weights, metadata))
 
     def __call__(self, sets: Sequence[Glimpses], choices: Sequence[str] | None = None) -> NDArray[np.float64]:
         """What each target is, from all looks at it: float64 [sets, choices], rows sum to 1.

@@ -16,7 +16,7 @@ from torch.nn import functional
 from wiw._core import core
 from wiw.errors import ArgumentError
 from wiw.training.checkpoint import Checkpoint
-from wiw.training.course import taught
+from wiw.training.course import taught, up_and_down
 from wiw.training.plays import POSES, Plays
 from wiw.world_models.armnet.body import plate
 from wiw.world_models.armnet.motion import motion as motion_of
@@ -97,7 +97,9 @@ def train(
         checkpoint: where the state of training is kept, and gone on from.
     """
     an_epoch = max(1, len(plays) * POSES // (recipe.batch * recipe.steps))
-    lesson, recipe = taught(lambda: _Lesson(plays, recipe), recipe, an_epoch, minutes, _pace, show, checkpoint)
+    lesson, recipe = taught(
+        lambda: _Lesson(plays, recipe), recipe, an_epoch, minutes, up_and_down(0.03), show, checkpoint
+    )
     return lesson.network.eval(), recipe
 
 
@@ -143,11 +145,6 @@ class _Lesson:
         self.count = state["count"]
         self.network.load_state_dict(state["network"])
         self._optimiser.load_state_dict(state["optimiser"])
-
-
-def _pace(done: float) -> float:
-    """Of the learning rate: up over the first 3 %, then down along a cosine."""
-    return done / 0.03 + 0.02 if done < 0.03 else 0.005 + 0.5 * (1 + np.cos(np.pi * (done - 0.03) / 0.97))
 
 
 @dataclass(frozen=True)

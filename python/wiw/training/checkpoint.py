@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 import time
 from collections.abc import Mapping
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, FileError
+from wiw.files import whole_file
 
 
 class Kept(Protocol):
@@ -82,13 +82,8 @@ class Checkpoint:
 
         if time.monotonic() < self._last + self.seconds:
             return
-        half = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
-        try:
-            torch.save({"of": self._of, "epochs": epochs, "step": step, "state": lesson.state()}, half)
-            half.replace(self.path)
-        except OSError as error:
-            half.unlink(missing_ok=True)
-            raise FileError(f"{self.path}: cannot be written ({error.strerror})") from error
+        with whole_file(self.path) as draft:
+            torch.save({"of": self._of, "epochs": epochs, "step": step, "state": lesson.state()}, draft)
         self._last = time.monotonic()
 
     def remove(self) -> None:

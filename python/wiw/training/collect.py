@@ -26,6 +26,7 @@ import wiw
 from wiw.datasets import shards
 from wiw.datasets.demonstrations import MANIFEST, Demonstrations, read_manifest, shard_paths, shard_range
 from wiw.errors import ArgumentError, FileError, InfrastructureError
+from wiw.files import sweep, whole_file
 from wiw.render import resolve_backend
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.workbench import CAMERAS
@@ -148,32 +149,16 @@ def _begin(folder: Path, config: Mapping[str, Any]) -> None:
     """Makes the folder and its manifest, or sees that the one that is there asks for the same."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _sweep(folder)
+        sweep(folder)
         if not any(folder.iterdir()):
-            part = folder / f".{MANIFEST}.{os.getpid()}.part"
-            part.write_text(json.dumps(config, indent=2) + "\n")
-            part.replace(folder / MANIFEST)
+            with whole_file(folder / MANIFEST) as draft:
+                draft.write_text(json.dumps(config, indent=2) + "\n")
     except OSError as error:
         raise FileError(f"{folder}: cannot be written ({error.strerror}); name another folder with --out") from error
     before = read_manifest(folder)
     if differing := [name for name in {**config, **before} if before.get(name) != config.get(name)]:
         said = ", ".join(f"{name} {before.get(name)} there and {config.get(name)} asked" for name in differing)
         raise ArgumentError(f"{folder} holds another collection: {said}; ask for the same, or name another with --out")
-
-
-def _sweep(folder: Path) -> None:
-    """Takes away what writers that were killed have left."""
-    for part in folder.glob(".*.part"):
-        if not _runs(part.name.split(".")[-2]):
-            part.unlink(missing_ok=True)
-
-
-def _runs(pid: str) -> bool:
-    """Whether there is such a process, and not as a zombie."""
-    try:
-        return Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
-    except OSError:
-        return False
 
 
 # -- workers -----------------------------------------------------------------------------------------------------------

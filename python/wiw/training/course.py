@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -61,6 +62,17 @@ def taught(
         if checkpoint:
             checkpoint.keep(cast(Kept, lesson), recipe.epochs, step + 1)
     return lesson, recipe
+
+
+def up_and_down(rise: float, floor: float = 0.005) -> Callable[[float], float]:
+    """A pace: up over a first share of the training, then down along a cosine to a floor."""
+
+    def pace(done: float) -> float:
+        if done < rise:
+            return done / rise + 0.02
+        return floor + 0.5 * (1 + math.cos(math.pi * (done - rise) / (1 - rise)))
+
+    return pace
 
 
 def _seconds_a_step(lesson: Lesson, trials: int = 10) -> float:

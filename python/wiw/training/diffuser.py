@@ -23,7 +23,7 @@ from wiw.policies.diffuser.network import Network, Shape
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
 from wiw.policies.diffuser.sight import Lens, Sight
 from wiw.training.checkpoint import Checkpoint
-from wiw.training.course import taught
+from wiw.training.course import taught, up_and_down
 
 if TYPE_CHECKING:
     from wiw.datasets.demonstrations import Demonstration
@@ -140,7 +140,7 @@ def train(
     """
     an_epoch = max(1, len(moments) // recipe.batch)
     begin = partial(_Lesson, moments, recipe)
-    lesson, recipe = taught(begin, recipe, an_epoch, minutes, _pace, show, checkpoint)
+    lesson, recipe = taught(begin, recipe, an_epoch, minutes, up_and_down(0.03), show, checkpoint)
     return lesson.average.eval(), recipe
 
 
@@ -213,11 +213,6 @@ def _errors(off: Tensor, level: Tensor) -> Tensor:
     ratio = ((1 - KEPT[level]) / KEPT[level]).sqrt().clamp(0.02, 2.0)[..., None, :]
     size = off.abs()
     return torch.where(size < ratio, size * size / (2 * ratio), size - ratio / 2)
-
-
-def _pace(done: float) -> float:
-    """Of the learning rate: up over the first 3 %, then down along a cosine."""
-    return done / 0.03 + 0.02 if done < 0.03 else 0.005 + 0.5 * (1 + np.cos(np.pi * (done - 0.03) / 0.97))
 
 
 @dataclass(frozen=True)

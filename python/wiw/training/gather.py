@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.datasets.worlds import world
-from wiw.errors import FileError
+from wiw.files import whole_file
 from wiw.perception.glimpses import Glimpses
 from wiw.scenes.store import build_digest
 from wiw.training.looks import LookRules, Looks, look_around, merged
@@ -112,11 +111,7 @@ def gather(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar
     names = list(sources)
     files = {name: folder / f"{_digest(source, job)}.npz" for name, source in sources.items()}
     missing = [name for name in names if _read(files[name], job) is None]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        list(bar(_made(missing, files, job, workers), job.name, len(missing)))
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be written ({error.strerror}); choose another with --cache") from error
+    list(bar(_made(missing, files, job, workers), job.name, len(missing)))
     found = [_read(files[name], job) for name in names]
     return [arrays for arrays in found if arrays is not None]
 
@@ -138,10 +133,8 @@ def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) 
 
 def _make(name: str, file: Path, job: Job) -> str:
     arrays = job.make(name)
-    part = file.with_name(f"{file.stem}.{os.getpid()}.part")
-    with part.open("wb") as stream:
+    with whole_file(file) as draft, draft.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
-    part.replace(file)
     return name
 
 

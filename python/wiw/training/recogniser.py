@@ -17,7 +17,7 @@ from wiw.errors import ArgumentError
 from wiw.perception.calibration import calibration_error, fitted_temperature, softmax
 from wiw.perception.recogniser import Recogniser
 from wiw.perception.recognition_network import Network, pictures
-from wiw.training.course import taught
+from wiw.training.course import taught, up_and_down
 from wiw.training.looks import NEAR, PERFECT, START, WARPED, Looks
 
 COLOURS = [0, 1, 2, 4, 5, 6]
@@ -66,7 +66,9 @@ def train(
         show: called after each step with its number, how many there are, and a running mean of the loss.
     """
     an_epoch = max(1, len(looks) // recipe.batch)
-    lesson, recipe = taught(lambda: _Lesson(looks, categories, recipe), recipe, an_epoch, minutes, _pace, show)
+    lesson, recipe = taught(
+        lambda: _Lesson(looks, categories, recipe), recipe, an_epoch, minutes, up_and_down(0.15, 0.01), show
+    )
     return lesson.network.eval(), recipe
 
 
@@ -91,11 +93,6 @@ class _Lesson:
         loss.backward()
         self._optimiser.step()
         return float(loss.detach())
-
-
-def _pace(done: float) -> float:
-    """Of the learning rate: up over the first 15 %, then down along a cosine."""
-    return done / 0.15 + 0.02 if done < 0.15 else 0.01 + 0.5 * (1 + np.cos(np.pi * (done - 0.15) / 0.85))
 
 
 def _chances(labels: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from wiw._core import core
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.reproject import pose, warp
-from wiw.training.course import taught
+from wiw.training.course import taught, up_and_down
 from wiw.training.walks import Walks, straight_ways
 from wiw.world_models.warpnet import WarpNet, to_network
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
@@ -71,7 +71,7 @@ def train(
         show: called after each step with its number, how many there are, and a running mean of the loss.
     """
     an_epoch = max(1, walks.places.size // recipe.batch)
-    lesson, recipe = taught(lambda: _Lesson(walks, recipe), recipe, an_epoch, minutes, _pace, show)
+    lesson, recipe = taught(lambda: _Lesson(walks, recipe), recipe, an_epoch, minutes, up_and_down(0.05), show)
     return lesson.network.eval(), recipe
 
 
@@ -98,11 +98,6 @@ class _Lesson:
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._optimiser.step()
         return float(loss.detach())
-
-
-def _pace(done: float) -> float:
-    """Of the learning rate: up over the first 5 %, then down along a cosine."""
-    return done / 0.05 + 0.02 if done < 0.05 else 0.005 + 0.5 * (1 + np.cos(np.pi * (done - 0.05) / 0.95))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,6 @@ from markupsafe import Markup
 
 from wiw.evaluation.blame import SWAPS, VERDICTS, Blame, blame
 from wiw.evaluation.costs import cost_columns, costs
-from wiw.evaluation.faults import whole_file
 from wiw.evaluation.fidelity import ArmFidelity, fidelity, shown_columns
 from wiw.evaluation.report import plots
 from wiw.evaluation.report.episodes import stories, wording
@@ -21,6 +20,7 @@ from wiw.evaluation.report.story import Album
 from wiw.evaluation.report.templating import environment, signed
 from wiw.evaluation.statistics import Difference
 from wiw.evaluation.summary import Summary, notes, shown_headlines
+from wiw.files import whole_file
 from wiw.types import Wording
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wiw._core import core
-from wiw.evaluation.faults import whole_folder
 from wiw.evaluation.report.episodes import outcomes_by_episode, tell, wording
 from wiw.evaluation.report.plots import arm_colors
 from wiw.evaluation.report.story import Album, Story, place, taken_for, where
 from wiw.evaluation.report.templating import environment
+from wiw.files import whole_folder
 from wiw.types import Episode, Wording
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,9 +12,8 @@ from numpy.typing import NDArray
 
 from wiw.networks import one_thread
 from wiw.types import Conditioning, Control
-from wiw.world_models import devices
-from wiw.world_models.base import Requirements, WorldModel, accepts
-from wiw.world_models.fingerprint import code_digest
+from wiw.world_models.base import accepts
+from wiw.world_models.trained import Trained
 
 if TYPE_CHECKING:
     from wiw.world_models.armnet.network import Network
@@ -25,7 +23,7 @@ SIZE = (480, 480)
 """Of the front views that come in and go out."""
 
 
-class ArmNet(WorldModel):
+class ArmNet(Trained):
     """Draws the arm at each pose, which it knows, and guesses what becomes of the things, which it has learnt.
 
     A network composes each pixel of the next view of what is seen there now, of what is carried along with the gripper,
@@ -42,37 +40,12 @@ class ArmNet(WorldModel):
     accepts = accepts(
         control="action", space="pose7", view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
     )
-    requires = Requirements(("torch", "safetensors"), "torch")
 
-    def __init__(self, weights: str | Path | None = None) -> None:
-        devices.require(self.requires)
+    @staticmethod
+    def _load(weights: str | Path | None) -> tuple[Network, dict[str, Any]]:
         from wiw.world_models.armnet.weights import load
 
-        self.weights = None if weights is None else str(weights)
-        self._network, self.card = load(weights or BUILT_IN)
-
-    @classmethod
-    def of(cls, network: Network) -> ArmNet:
-        """The world model of a network at hand, such as one in training."""
-        model = cls.__new__(cls)
-        model.weights, model._network, model.card = None, network.eval(), {}
-        return model
-
-    def describe(self) -> dict[str, Any]:
-        """The weights' file and a digest of them, and torch's version."""
-        import torch
-
-        return {
-            "name": type(self).__name__,
-            "weights": self.weights,
-            "digest": self._digest(),
-            "torch": torch.__version__,
-        }
-
-    def fingerprint(self) -> str:
-        """Digest of code, weights and torch's version; where the weights lie does not count."""
-        said = {**self.describe(), "weights": None}
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+        return load(weights or BUILT_IN)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -89,9 +62,3 @@ class ArmNet(WorldModel):
                 for made, frame in zip(imagined(self._network, image, poses), future[1:], strict=False):
                     frame[:] = made
         return frames
-
-    def _digest(self) -> str:
-        digest = blake2b(digest_size=8)
-        for name, value in self._network.state_dict().items():
-            digest.update(name.encode() + value.numpy().tobytes())
-        return digest.hexdigest()

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+from wiw.weight_file import WeightFile
 from wiw.world_models.armnet.network import Network
-from wiw.world_models.weight_file import WeightFile
 
 _FILE = WeightFile("armnet", lambda network: {"widths": network.widths}, lambda sizes: Network(tuple(sizes["widths"])))
 load, save = _FILE.load, _FILE.save

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +13,8 @@ from numpy.typing import NDArray
 
 from wiw.networks import one_thread
 from wiw.types import Conditioning, Control
-from wiw.world_models import devices
-from wiw.world_models.base import Requirements, WorldModel, accepts
-from wiw.world_models.fingerprint import code_digest
+from wiw.world_models.base import accepts
+from wiw.world_models.trained import Trained
 
 if TYPE_CHECKING:
     from wiw.world_models.warpnet.network import Network
@@ -26,7 +24,7 @@ STILL = 1e-4
 """Metres: who has moved less stands where it stood."""
 
 
-class WarpNet(WorldModel):
+class WarpNet(Trained):
     """Guesses how far away everything will be, warps the panorama by that, and paints what the warp cannot know.
 
     Where a plan leads is one jump (turn towards the place, go straight, turn back), however many primitives it takes,
@@ -42,37 +40,12 @@ class WarpNet(WorldModel):
     """
 
     accepts = accepts(control="trajectory", view="panorama", causal=True, best_batch=16, cacheable=True)
-    requires = Requirements(("torch", "safetensors"), "torch")
 
-    def __init__(self, weights: str | Path | None = None) -> None:
-        devices.require(self.requires)
+    @staticmethod
+    def _load(weights: str | Path | None) -> tuple[Network, dict[str, Any]]:
         from wiw.world_models.warpnet.weights import load
 
-        self.weights = None if weights is None else str(weights)
-        self._network, self.card = load(weights or BUILT_IN)
-
-    @classmethod
-    def of(cls, network: Network) -> WarpNet:
-        """The world model of a network at hand, such as one in training."""
-        model = cls.__new__(cls)
-        model.weights, model._network, model.card = None, network.eval(), {}
-        return model
-
-    def describe(self) -> dict[str, Any]:
-        """The weights' file and a digest of them, and torch's version."""
-        import torch
-
-        return {
-            "name": type(self).__name__,
-            "weights": self.weights,
-            "digest": self._digest(),
-            "torch": torch.__version__,
-        }
-
-    def fingerprint(self) -> str:
-        """Digest of code, weights and torch's version; where the weights lie does not count."""
-        said = {**self.describe(), "weights": None}
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+        return load(weights or BUILT_IN)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -114,12 +87,6 @@ class WarpNet(WorldModel):
             sharp = warp(to_network(image[None]), guess[:, :1], ahead)
             colours = blend(sharp, guess[:, 1:4], guess[:, 4:])[0].permute(1, 2, 0)
             return (colours * 127.5 + 127.5).round().clamp(0, 255).byte().numpy()
-
-    def _digest(self) -> str:
-        digest = blake2b(digest_size=8)
-        for name, value in self._network.state_dict().items():
-            digest.update(name.encode() + value.numpy().tobytes())
-        return digest.hexdigest()
 
 
 def turned(image: NDArray[Any], azimuth: float) -> NDArray[Any]:

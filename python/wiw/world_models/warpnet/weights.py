@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+from wiw.weight_file import WeightFile
 from wiw.world_models.warpnet.network import Network
-from wiw.world_models.weight_file import WeightFile
 
 _FILE = WeightFile(
     "warpnet",

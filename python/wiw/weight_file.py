@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +13,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as packed
 from torch import nn
 
-from wiw.errors import FileError, WeightsError
+from wiw.errors import ArgumentError, WeightsError
+from wiw.files import whole_file
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -24,7 +24,7 @@ class WeightFile(Generic[N]):
     """The files of one kind of network."""
 
     name: str
-    """Of the world model, as it is trained by `wiw train NAME`."""
+    """Of the world model or policy, as it is trained by `wiw train NAME`."""
     sizes: Callable[[N], dict[str, Any]]
     """JSON-able: what a network of the same shape is built of."""
     build: Callable[[Mapping[str, Any]], N]
@@ -56,7 +56,7 @@ class WeightFile(Generic[N]):
             network = self.build(header)
             network.load_state_dict(values)
             return network.eval(), dict(header["card"])
-        except (OSError, SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        except (OSError, SafetensorError, ArgumentError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise WeightsError(
                 f"{path}: expected weights of {self.name}, whole: {error}; {self.cure}", "unfit"
             ) from error
@@ -69,13 +69,8 @@ class WeightFile(Generic[N]):
         """
         header = {**self.sizes(network), "card": dict(card)}
         values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
-        half = path.with_name(f"{path.name}.{os.getpid()}.part")
-        try:
-            half.write_bytes(packed(values, {"format": self.format, "header": json.dumps(header, sort_keys=True)}))
-            half.replace(path)
-        except OSError as error:
-            half.unlink(missing_ok=True)
-            raise FileError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        with whole_file(path) as draft:
+            draft.write_bytes(packed(values, {"format": self.format, "header": json.dumps(header, sort_keys=True)}))
 
     def _header(self, metadata: Mapping[str, str] | None, path: Path) -> dict[str, Any]:
         found = (metadata or {}).get("format")

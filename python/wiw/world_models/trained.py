@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the world models of `wiw train` share: weights that come with wiw or from a file, and what they are told by."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from hashlib import blake2b
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from wiw.world_models import devices
+from wiw.world_models.base import Requirements, WorldModel
+from wiw.world_models.fingerprint import code_digest
+
+if TYPE_CHECKING:
+    from torch import nn
+
+T = TypeVar("T", bound="Trained")
+
+
+class Trained(WorldModel):
+    """A small network that runs on the CPU, in eval mode, with the card of how it was made and measured.
+
+    Args:
+        weights: a file of `wiw train NAME`; None means those that come with wiw.
+
+    Raises:
+        DependencyError: torch or safetensors is not installed.
+        WeightsError: no such file, damaged, or of another version.
+    """
+
+    requires = Requirements(("torch", "safetensors"), "torch")
+    _network: Any
+
+    def __init__(self, weights: str | Path | None = None) -> None:
+        devices.require(self.requires)
+        self.weights = None if weights is None else str(weights)
+        self._network, self.card = self._load(weights)
+
+    @staticmethod
+    @abstractmethod
+    def _load(weights: str | Path | None) -> tuple[nn.Module, dict[str, Any]]:
+        """Network and card of a file, or of the built-in one. Imports torch."""
+
+    @classmethod
+    def of(cls: type[T], network: nn.Module) -> T:
+        """The world model of a network at hand, such as one in training."""
+        model = cls.__new__(cls)
+        model.weights, model._network, model.card = None, network.eval(), {}
+        return model
+
+    def describe(self) -> dict[str, Any]:
+        """The weights' file and a digest of them, and torch's version."""
+        import torch
+
+        return {
+            "name": type(self).__name__,
+            "weights": self.weights,
+            "digest": self._digest(),
+            "torch": torch.__version__,
+        }
+
+    def fingerprint(self) -> str:
+        """Digest of code, weights and torch's version; where the weights lie does not count."""
+        said = {**self.describe(), "weights": None}
+        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+
+    def _digest(self) -> str:
+        digest = blake2b(digest_size=8)
+        for name, value in self._network.state_dict().items():
+            digest.update(name.encode() + value.numpy().tobytes())
+        return digest.hexdigest()
