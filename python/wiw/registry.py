@@ -77,16 +77,24 @@ class Registry:
         Raises:
             RegistryError: see `find`; also when the options do not fit the constructor.
         """
-        factory = self.find(what) if isinstance(what, str) else what
-        if not (inspect.isclass(factory) or inspect.isfunction(factory) or isinstance(factory, partial)):
-            if options:
-                raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
-            return self._checked(what, factory)
-        try:
-            inspect.signature(factory).bind(**options)
-        except TypeError as error:
-            raise RegistryError(f"{self.kind} '{what}': {error}; it takes {inspect.signature(factory)}") from None
-        return self._checked(what, factory(**options))
+        found = self.fitting(what, **options)
+        return self._checked(what, found(**options) if _makes(found) else found)
+
+    def fitting(self, what: Any, **options: Any) -> Any:
+        """What `make` would call with these options, or the instance that it would return.
+
+        Raises:
+            RegistryError: as of `make`, but for what shows only as it is made.
+        """
+        found = self.find(what) if isinstance(what, str) else what
+        if _makes(found):
+            try:
+                inspect.signature(found).bind(**options)
+            except TypeError as error:
+                raise RegistryError(f"{self.kind} '{what}': {error}; it takes {inspect.signature(found)}") from None
+        elif options:
+            raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
+        return found
 
     def _plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
@@ -109,6 +117,11 @@ class Registry:
         if issubclass(thing, base) if inspect.isclass(thing) else isinstance(thing, base):
             return thing
         raise RegistryError(f"'{name}' is no {self.kind}: expected a class derived from wiw.{attribute}, got {thing!r}")
+
+
+def _makes(thing: Any) -> bool:
+    """Whether it is a class or a factory, rather than an instance."""
+    return inspect.isclass(thing) or inspect.isfunction(thing) or isinstance(thing, partial)
 
 
 def _attribute(path: str) -> Any:

@@ -175,9 +175,12 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     assert taken == {"none": {}, "placebo-shuffled": given, "Tinted": given}
     assert main(["resume", str(tmp_path / "run"), "--no-report"]) == 0
     for wrong, said in (("weights", "KEY=VALUE"), ("speed=3", "unexpected keyword"), ("strength=[", "no YAML")):
-        assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / wrong)]) == 2
+        assert main([*task, *model, "--world-model-option", wrong, "--out", str(tmp_path / "again")]) == 2
         assert said in capsys.readouterr().err
+        assert not (tmp_path / "again").exists()  # so that the same folder may be named once it is put right
     assert main([*task, "--world-model-option", "steps=3"]) == 2
+    assert main([*task, "--policy-option", "steps=3", "--out", str(tmp_path / "run")]) == 2  # where a run is already
+    assert load_run(tmp_path / "run").episodes
 
 
 def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
@@ -203,6 +206,11 @@ def test_scaling_and_episodes_take_a_tasks_options_too(tmp_path, two_rooms, shor
     options = ["--task-option", "radius=9", "--world-model", "copy", "--out", str(tmp_path / "run")]
     assert main([*task, *options]) == 0
     assert load_run(tmp_path / "run").store.config["task"]["radius"] == 9.0
+    table = ["scale", "manipulation", "--tasks", "push_buttons", "--world-model", "copy", "--episodes", "1"]
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main([*table, "--policy-option", "turned=1", "--out", str(tmp_path)]) == 2
+    assert "unexpected keyword argument 'turned'" in capsys.readouterr().err
+    assert {each.name for each in tmp_path.iterdir()} >= {"notes.txt"} and not (tmp_path / "run.sqlite").exists()
     made = ["episodes", "ar", "--scenes", two_rooms, "--out", str(tmp_path / "ar.json")]
     assert main([*made, "--task-option", "categories=bathtub, coffee table"]) == 2
     assert "holds nothing of the categories bathtub, coffee table" in capsys.readouterr().err

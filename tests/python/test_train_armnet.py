@@ -152,7 +152,10 @@ def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_makes_a_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_makes_a_model(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("wiw.training.armnet.HELD_OUT", 25)
     out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
     command = ["train", "armnet", "--plays", "25", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
     assert main(command) == 0

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.options import Options, default_policy, model_options, semantics_options, task_options
+from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
 
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -23,10 +23,12 @@ def scale(
     world_model: Name = "warp",
     world_model_option: Options = (),
     policy: Annotated[str | None, arg(metavar="NAME")] = None,
+    policy_option: Options = (),
     revision: Annotated[str | None, arg(metavar="NAME")] = None,
     candidates: Values = None,
     imagine_fraction: Values = None,
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
+    robot: Annotated[Path | None, arg(metavar="URDF")] = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     episodes: Count = 20,
     seed: Count = 0,
@@ -59,10 +61,12 @@ def scale(
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
         policy: Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar
             recogniser, for manipulation scripted.
+        policy_option: An option of --policy, such as weights=FILE; may be given again.
         revision: Scores imagined futures; the policy's own choice if not given.
         candidates: Plans imagined at each decision; 1,2,4,8 if neither this nor --imagine-fraction is given.
         imagine_fraction: Shares of decisions for which the world model is consulted, from 0 to 1.
         tasks: For manipulation: which of its tasks, taken in turn; all of them if not given.
+        robot: For manipulation: description of an arm to work with, as in `wiw run`.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
             apartments:val if not given.
         episodes: How many.
@@ -94,9 +98,11 @@ def scale(
         absolute(policy), model, revision and absolute(revision), horizon=horizon,
         model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
         semantics_options=semantics_options(semantics, semantics_option),
-        policy_options=vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""]),
+        policy_options=policy_options(
+            absolute(policy), policy_option, vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""])
+        ),
     )  # fmt: skip
-    flags = {"tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend}
+    flags = {"tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "robot": robot}
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
     folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")

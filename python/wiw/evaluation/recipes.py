@@ -116,14 +116,18 @@ class AgentRecipe:
         """Identity of the agent before it is built: a model is made once, when its turn comes.
 
         Raises:
-            RegistryError: a part is not known.
+            RegistryError: a part is not known, or takes other options.
         """
         from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 
-        parts = ((POLICIES, self.policy), (WORLD_MODELS, self.model), (POLICIES, self.revision))
-        for registry, name in (*parts, (SEMANTICS, self.semantics)):
+        policies = [(POLICIES, name, self.policy_options.get(str(name), {})) for name in (self.policy, self.revision)]
+        for registry, name, options in (*policies, (WORLD_MODELS, self.model, self.model_options)):
             if name is not None:
-                registry.find(name)
+                registry.fitting(name, **options)
+        if self.semantics_options:
+            SEMANTICS.fitting(self.semantics, **self.semantics_options)
+        elif self.semantics is not None:
+            SEMANTICS.find(self.semantics)  # some are made of what an environment tells
         said = {name: value for name, value in asdict(self).items() if value not in (None, {})}
         if self.policy_options:
             said["policy_options"] = {
