@@ -57,7 +57,11 @@ def _guard(watch: int, done: threading.Event) -> None:
         if number[0] == signal.SIGTERM and not done.wait(GRACE):
             for worker in multiprocessing.active_children():
                 worker.kill()
-            print("wiw: stopped at once; all that was recorded is kept. Go on with `wiw resume`", file=sys.stderr)
+            print(
+                "wiw: stopped at once; all that was recorded is kept. Go on with `wiw resume`, or "
+                "collect and train with the same command",
+                file=sys.stderr,
+            )
             sys.stderr.flush()
             os._exit(EXIT_RESUME)
 
@@ -71,4 +75,14 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
     except BaseException as stop:
         if not isinstance(stop, Exception | SystemExit) and store_path(folder).exists():
             print(f"\nstopped; everything so far is kept. Go on with:  wiw {command} {folder}", file=sys.stderr)
+        raise
+
+
+@contextmanager
+def begun_again() -> Iterator[None]:
+    """Around work that keeps what it has finished: when it is stopped, says that the same command goes on with it."""
+    try:
+        yield
+    except (KeyboardInterrupt, Terminated):
+        print("\nstopped. The same command goes on with what is kept", file=sys.stderr)
         raise

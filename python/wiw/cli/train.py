@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.stop import begun_again
+
 
 def train(
     what: Positional[
@@ -63,7 +65,7 @@ def train(
             diffuser if not given.
         minutes: Fewer epochs where so many would take longer than this to train.
         places: From which a scene is looked at, or that it is walked through from; 16 and 24 if not given.
-        plays: For armnet: at tables, of eight poses each; 1000 if not given.
+        plays: For armnet: at tables, of eight poses each; 2000 if not given.
         seed: The looks are a function of it and the scenes, the weights of it, the looks and the epochs.
         workers: Processes that look around.
         cache: Where looks are kept; $WIW_CACHE/looks if not given. Deleting it is always safe.
@@ -79,20 +81,22 @@ def train(
     _require_torch(what)
     _check_out(out)
     if what == "diffuser":
-        _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
+        with begun_again():
+            _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
         return 0
     if demonstrations is not None and what != "armnet":
         raise ArgumentError(f"--demonstrations: {what} learns from scenes; leave it out")
     _check_scenes(scenes, val)
     asked = _Asked(scenes, val, seed, cache or folder().parent / "looks", workers)
-    if what == "recogniser":
-        _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
-    elif categories:
+    if categories and what != "recogniser":
         raise ArgumentError(f"--categories: {what} recognises nothing; leave them out")
-    elif what == "armnet":
-        _armnet(out, asked, minutes, plays or 1000, demonstrations, _given(epochs=epochs))
-    else:
-        _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
+    with begun_again():
+        if what == "recogniser":
+            _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
+        elif what == "armnet":
+            _armnet(out, asked, minutes, plays or 2000, demonstrations, _given(epochs=epochs))
+        else:
+            _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
     return 0
 
 
