@@ -128,7 +128,7 @@ Damped least squares with joint limits. The first attempt starts from `start`, w
       .def(py::init([](const ArticulationPtr& articulation, const std::string& link) {
              return std::make_unique<InverseKinematics>(articulation, articulation->link_index(link));
            }),
-           py::arg("articulation"), py::arg("link"))
+           py::arg("articulation").none(false), py::arg("link"))
       .def("__call__", &solve, py::arg("T_base_link"), py::arg("start"), py::kw_only(),
            py::arg("position_tolerance") = defaults.position_tolerance,
            py::arg("rotation_tolerance") = defaults.rotation_tolerance, py::arg("iterations") = defaults.iterations,

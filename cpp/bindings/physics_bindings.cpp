@@ -165,7 +165,7 @@ void bind_articulated(py::class_<World>& world) {
       [](World& self, const ArticulationPtr& articulation, const Array<double>& pose) {
         return self.add_articulation(articulation, to_pose(pose, "T_world_base"));
       },
-      py::arg("articulation"), py::arg("T_world_base") = pose_array(Pose::Identity()),
+      py::arg("articulation").none(false), py::arg("T_world_base") = pose_array(Pose::Identity()),
       "Adds an Articulation on a fixed base and returns its index, from 0. Its joints start at the positions nearest "
       "to "
       "zero that the limits allow.");

@@ -372,3 +372,81 @@ def test_the_real_description_is_the_same_arm(franka_urdf: Path) -> None:
     world.set_joint_positions(PANDA_READY)
     world.step(240)
     assert np.abs(world.joint_positions() - PANDA_READY).max() < 1e-3
+
+
+def tree(*joints: tuple[str, str, str]) -> str:
+    """URDF text of links and the joints (parent, child, type) between them."""
+    links = dict.fromkeys(link for parent, child, _ in joints for link in (parent, child))
+    limit = '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="10" velocity="1"/>'
+    named = [
+        f'<joint name="j{i}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>{limit}</joint>'
+        for i, (parent, child, kind) in enumerate(joints)
+    ]
+    return '<robot name="r">' + "".join(f'<link name="{link}"/>' for link in links) + "".join(named) + "</robot>"
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        ([("R", "A", "fixed"), ("A", "B", "revolute"), ("B", "A", "revolute")], "above itself"),
+        ([("R", "A", "fixed"), ("A", "A", "revolute")], "above itself"),
+        ([("R", "A", "fixed"), ("R", "B", "fixed"), ("A", "C", "fixed"), ("B", "C", "fixed")], "two parents"),
+        ([(f"l{i}", f"l{i + 1}", "fixed") for i in range(1200)], "at most 1000 links"),
+    ],
+)
+def test_links_that_make_no_tree_are_refused(joints: list[tuple[str, str, str]], words: str) -> None:
+    with pytest.raises(ArgumentError, match=words):
+        Articulation.from_text(tree(*joints))
+
+
+def test_nothing_in_the_place_of_an_arm_is_refused() -> None:
+    with pytest.raises(TypeError):
+        World().add_articulation(None)
+    with pytest.raises(TypeError):
+        InverseKinematics(None, "x")
+    world = World()
+    still = world.add_articulation(Articulation.from_text('<robot name="r"><link name="a"/></robot>'))
+    world.set_joint_forces(np.zeros(0), still)
+
+
+def test_a_path_of_another_arm_is_not_followed() -> None:
+    world = World()
+    world.add_articulation(panda())
+    world.set_joint_positions(PANDA_READY)
+    other = world.add_articulation(Articulation.from_text(tree(("R", "A", "revolute"))), place(x=3))
+    path = world.plan_linear(place(0.5, 0, 0.3, DOWN), PANDA_TCP)
+    with pytest.raises(ArgumentError, match="path: expected 1 number"):
+        world.follow(path, other)
+
+
+def test_a_joint_that_mimics_another_is_nothing_to_solve_for() -> None:
+    joint = 'name="panda_joint6" type="revolute">'
+    text = URDF.read_text()
+    assert joint in text
+    coupled = Articulation.from_text(text.replace(joint, joint + '<mimic joint="panda_joint4" multiplier="-0.5"/>'))
+    with pytest.raises(ArgumentError, match="'panda_joint6' mimics another"):
+        InverseKinematics(coupled, PANDA_TCP)
+
+
+def test_a_snapshot_of_another_world_is_refused_and_changes_nothing() -> None:
+    def two(held: bool) -> World:
+        world = World(gravity=[0, 0, 0])
+        world.add_articulation(Articulation.from_text(tree(("R", "A", "revolute"))))
+        for x in (1, 2) if held else (5,):
+            world.add_body(Box([0.1] * 3), mass=1, T_world_body=place(x=x))
+        if held:
+            world.attach("A", 1)
+        return world
+
+    ours, theirs = two(False), two(True).snapshot()
+    with pytest.raises(ArgumentError, match=r"of another world: expected one of 1 bodies.*got one of 2 bodies"):
+        ours.restore(theirs)
+    assert ours.body_poses()[0][0, 3] == 5
+    ours.fork().step(3)
+    boxes = World()  # as many numbers as an arm of eleven joints
+    for x in (1, 2):
+        boxes.add_body(Box([0.1] * 3), mass=1, T_world_body=place(x=x))
+    arm = World()
+    arm.add_articulation(Articulation.from_text(tree(*[(f"l{i}", f"l{i + 1}", "revolute") for i in range(11)])))
+    with pytest.raises(ArgumentError, match="of another world"):
+        arm.restore(boxes.snapshot())

@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
+import re
 import shutil
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError, FileError
+from wiw.evaluation.recipes import AgentRecipe
 from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import own_panda, robot_of
@@ -159,3 +163,108 @@ def test_the_real_description_does_the_work(franka_urdf: Path) -> None:
         bench.go(pose)
     assert kind.succeeded(bench, setup)
     assert sum(len(mesh["triangles"]) for _, mesh in robot.looks) > 50_000
+
+
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 {}
+"""
+DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1"><asset/>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="9">0 0 0 1 0 0 0 1 0</float_array>
+<technique_common><accessor source="#a" count="{count}" stride="{stride}"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<vertices id="v"><input semantic="POSITION" source="#p"/></vertices><triangles count="1">
+<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry></library_geometries>
+<library_visual_scenes><visual_scene id="s"><node id="n"><instance_geometry url="#g"/>{more}</node></visual_scene>
+</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+DEEP = 3000
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("far.ply", PLY.format(99999999), "surface"),
+        ("before.ply", PLY.format(-7), "surface"),
+        ("stride.dae", DAE.format(count=3, stride=100000, more=""), "damaged"),
+        ("count.dae", DAE.format(count=4000000, stride=3, more=""), "damaged"),
+        ("itself.dae", DAE.format(count=3, stride=3, more='<instance_node url="#n"/>'), "shows itself"),
+        ("deep.dae", DAE.format(count=3, stride=3, more="<node>" * DEEP + "</node>" * DEEP), "too deep"),
+        ("normal.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nvn nan nan nan\nf 1//1 2//1 3//1\n", "normal is not finite"),
+    ],
+)
+def test_a_damaged_mesh_is_named_with_its_link(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(FileError, match=rf"{name}: .*mesh of link 'hand'") as refused:
+        read_surface(tmp_path / name, link="hand")
+    assert words in str(refused.value) or words == "surface"
+
+
+@pytest.mark.parametrize("scale", [[1, 0, 1], [1, np.nan, 1]])
+def test_a_mesh_keeps_its_extent(tmp_path: Path, scale: list[float]) -> None:
+    (tmp_path / "whole.ply").write_text(PLY.format(2))
+    assert len(read_surface(tmp_path / "whole.ply")["triangles"]) == 1
+    assert len(read_surface(write(tmp_path / "whole.dae", DAE.format(count=3, stride=3, more="")))["triangles"]) == 1
+    with pytest.raises(FileError, match="factors of scale"):
+        read_surface(tmp_path / "whole.ply", scale=scale)
+
+
+def write(file: Path, text: str) -> Path:
+    """The file, with this in it."""
+    file.write_text(text)
+    return file
+
+
+def test_an_arm_that_is_not_seen_leaves_the_things_where_they_are(tmp_path: Path) -> None:
+    bare = re.sub(r"<visual>.*?</visual>", "", OWN, flags=re.S)
+    setup = KINDS["push_buttons"].setup(3, 0)
+    seen, with_own = (
+        setup.bench(robot=robot).picture("front", (120, 120), ("instance",), arm=False)["instance"]
+        for robot in (robot_of(write(tmp_path / "bare.urdf", bare)), None)
+    )
+    np.testing.assert_array_equal(seen, with_own)
+
+
+def test_a_panda_of_narrower_fingers_works(tmp_path: Path) -> None:
+    narrow = write(tmp_path / "narrow.urdf", OWN.replace('upper="0.04"', 'upper="0.035"'))
+    assert robot_of(narrow).ready[-2:] == pytest.approx(0.035)
+    Manipulation("slide_block", robot=narrow).environment().reset(seed=0)
+
+
+def test_a_description_that_has_changed_is_another_robot(other: Path) -> None:
+    first = robot_of(other)
+    assert robot_of(other) is first
+    other.write_text(other.read_text().replace("0 0.6 0.6 1", "0.6 0 0 1"))
+    assert robot_of(other).identity != first.identity
+
+
+def test_a_model_that_draws_one_arm_is_refused_with_another(other: Path, tmp_path: Path) -> None:
+    task = Manipulation("slide_block", robot=other)
+    with pytest.raises(ArgumentError, match="armnet: expected the built-in arm"):
+        wiw.evaluate(task, AgentRecipe("scripted", "armnet"), episodes=1, out=tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_bench_and_its_fork_are_drawn_by_two_threads(tmp_path: Path) -> None:
+    setup = KINDS["slide_block"].setup(3, 0)
+    bench = setup.bench()
+    fork = bench.fork()
+    fork.go([0.15, 0.1, TABLE + 0.1, np.pi, 0, 0, 1])
+    alone = [each.picture("front", (48, 48))["color"] for each in (bench, fork)]
+    usual = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        with ThreadPoolExecutor(2) as pool:
+            taken = list(pool.map(lambda k: (bench, fork)[k % 2].picture("front", (48, 48))["color"], range(120)))
+    finally:
+        sys.setswitchinterval(usual)
+    assert all(np.array_equal(picture, alone[k % 2]) for k, picture in enumerate(taken))

@@ -57,6 +57,10 @@ InverseKinematics::InverseKinematics(ArticulationPtr articulation, int link) : a
     const Joint& joint = joints[static_cast<std::size_t>(i)];
     tail_ = tail_ * joint.origin;
     if (joint.index < 0) continue;
+    if (joint.mimic) {
+      throw ArgumentError("inverse kinematics: joint '" + joint.name +
+                          "' mimics another; expected joints that move by themselves between base and link");
+    }
     Pose turn = Pose::Identity();
     turn.linear() = Eigen::Quaterniond::FromTwoVectors(Eigen::Vector3d::UnitZ(), joint.axis).toRotationMatrix();
     const JointLimits& limits = articulation_->limits();

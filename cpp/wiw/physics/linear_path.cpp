@@ -87,6 +87,7 @@ LinearPath plan_linear(World& world, int articulation, int link, const Pose& T_w
 bool follow(World& world, int articulation, const LinearPath& path, double speed, double tolerance, int settle) {
   if (!(speed > 0 && speed <= 1)) throw ArgumentError("expected a speed in (0, 1], got " + std::to_string(speed));
   if (path.joints.empty()) return false;
+  for (const Eigen::VectorXd& each : path.joints) world.articulation(articulation)->check_positions(each, "path");
   const Eigen::VectorXd& limit = world.articulation(articulation)->limits().velocity;
   const double reach = speed * world.options().time_step;
   Eigen::VectorXd target = world.joint_targets(articulation);

@@ -12,6 +12,8 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/shape.hpp"
+#include "wiw/scene/import/collada_check.hpp"
+#include "wiw/scene/import/ply_header.hpp"
 
 namespace wiw::physics {
 
@@ -21,6 +23,12 @@ namespace {
 
 constexpr std::uintmax_t kMaxBytes = 256u << 20;  // meshes of links are at most a few megabytes
 constexpr float kSmooth = 40;                     // degrees between faces that are one curve
+
+std::string extension_of(const fs::path& path) {
+  std::string extension = path.extension().string();
+  std::ranges::transform(extension, extension.begin(), [](unsigned char c) { return std::tolower(c); });
+  return extension;
+}
 
 /// A mesh file of a link, open for reading.
 class MeshFile {
@@ -36,21 +44,36 @@ class MeshFile {
     const std::uintmax_t bytes = fs::file_size(path_, code);
     if (code) throw error("no such file");
     if (bytes > kMaxBytes) throw error("larger than 256 MiB, which a mesh of a link has no need of");
+    check_damage();
     importer_.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);  // URDF knows the file's axes only
     importer_.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_LINE | aiPrimitiveType_POINT);
     importer_.SetPropertyInteger(AI_CONFIG_PP_RVC_FLAGS, aiComponent_NORMALS);
     importer_.SetPropertyFloat(AI_CONFIG_PP_GSN_MAX_SMOOTHING_ANGLE, kSmooth);
-    const aiScene* scene = importer_.ReadFile(path_.string(), steps | aiProcess_PreTransformVertices);
+    const aiScene* scene = importer_.ReadFile(
+        path_.string(), steps | aiProcess_PreTransformVertices | aiProcess_ValidateDataStructure);
     if (scene == nullptr) throw error(importer_.GetErrorString());
     for (unsigned m = 0; m < scene->mNumMeshes; ++m) check(*scene->mMeshes[m]);
     return *scene;
   }
 
  private:
+  /// What assimp does not survive.
+  void check_damage() const {
+    try {
+      if (extension_of(path_) == ".ply") check_ply(path_);
+      if (extension_of(path_) == ".dae") check_collada(path_);
+    } catch (const FileError& damage) {
+      throw error(std::string(damage.what()).substr(path_.string().size() + 2));  // behind "path: "
+    }
+  }
+
   void check(const aiMesh& mesh) const {
+    const auto finite = [](const aiVector3D& v) {
+      return std::isfinite(v.x) && std::isfinite(v.y) && std::isfinite(v.z);
+    };
     for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
-      const aiVector3D& p = mesh.mVertices[v];
-      if (!std::isfinite(p.x) || !std::isfinite(p.y) || !std::isfinite(p.z)) throw error("a vertex is not finite");
+      if (!finite(mesh.mVertices[v])) throw error("a vertex is not finite");
+      if (mesh.HasNormals() && !finite(mesh.mNormals[v])) throw error("a normal is not finite");
     }
   }
 
@@ -60,11 +83,7 @@ class MeshFile {
 };
 
 /// STL knows faces alone: its normals would show every curve as facets.
-bool is_stl(const fs::path& path) {
-  std::string extension = path.extension().string();
-  std::ranges::transform(extension, extension.begin(), [](unsigned char c) { return std::tolower(c); });
-  return extension == ".stl";
-}
+bool is_stl(const fs::path& path) { return extension_of(path) == ".stl"; }
 
 Eigen::Vector3f to_eigen(const aiVector3D& v) { return {v.x, v.y, v.z}; }
 
@@ -92,10 +111,15 @@ void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& sca
   }
 }
 
+void check_scale(const MeshFile& file, const Eigen::Vector3d& scale) {
+  if (!scale.allFinite() || (scale.array() == 0).any()) throw file.error("expected finite factors of scale, none zero");
+}
+
 }  // namespace
 
 Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
+  check_scale(file, scale);
   unsigned steps =
       aiProcess_Triangulate | aiProcess_SortByPType | aiProcess_GenSmoothNormals | aiProcess_JoinIdenticalVertices;
   if (is_stl(path)) steps |= aiProcess_RemoveComponent;
@@ -108,6 +132,7 @@ Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, cons
 
 std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
+  check_scale(file, scale);
   const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
   std::vector<Eigen::Vector3d> points;
   for (unsigned m = 0; m < scene.mNumMeshes; ++m) {

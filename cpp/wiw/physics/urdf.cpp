@@ -8,6 +8,7 @@
 #include <limits>
 #include <mutex>
 #include <sstream>
+#include <unordered_set>
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/articulation.hpp"
@@ -64,6 +65,8 @@ Pose to_pose(const urdf::Pose& from, const std::string& what) {
   return pose;
 }
 
+constexpr int kDeepest = 1000;  // links one below another; arms have some ten
+
 class Reader {
  public:
   Reader(const urdf::ModelInterface& model, std::string source, fs::path folder)
@@ -87,12 +90,19 @@ class Reader {
     double lower, upper, velocity, effort;
   };
 
-  void add(const urdf::Link& from) {
+  /// A link and all below it. urdfdom lets a link have two parents, and be above itself.
+  void add(const urdf::Link& from, int depth = 0) {
+    if (!met_.insert(from.name).second) {
+      throw ArgumentError(source_ + ": link '" + from.name + "' has two parents, or is above itself; expected a tree");
+    }
+    if (depth > kDeepest) {
+      throw ArgumentError(source_ + ": expected at most " + std::to_string(kDeepest) + " links one below another");
+    }
     const int index = static_cast<int>(links_.size());
     links_.push_back(to_link(from));
     for (const urdf::JointSharedPtr& joint : from.child_joints) {
       add_joint(*joint, index);
-      add(*model_.getLink(joint->child_link_name));
+      add(*model_.getLink(joint->child_link_name), depth + 1);
     }
   }
 
@@ -217,6 +227,7 @@ class Reader {
   const urdf::ModelInterface& model_;
   const std::string source_;
   const fs::path folder_;
+  std::unordered_set<std::string> met_;  // links by name
   std::vector<Link> links_;
   std::vector<Joint> joints_;
   std::vector<Range> ranges_;

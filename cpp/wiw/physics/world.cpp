@@ -131,6 +131,15 @@ struct World::Impl {
     return values;
   }
 
+  [[nodiscard]] std::vector<int> layout() const {
+    std::vector<int> counts{static_cast<int>(bodies.size())};
+    for (const auto& each : arms) {
+      counts.push_back(each->articulation().dof());
+      counts.push_back(static_cast<int>(each->articulation().links().size()));
+    }
+    return counts;
+  }
+
   void set_numbers(const std::vector<double>& values) {
     NumberReader reader(values);
     for (const auto& each : bodies) {
@@ -276,7 +285,7 @@ void World::set_joint_targets(int articulation, const Eigen::VectorXd& targets) 
 void World::set_joint_forces(int articulation, const Eigen::VectorXd& forces) {
   Arm& arm = impl_->arm(articulation);
   arm.articulation().check_positions(forces, "forces");
-  if (forces.minCoeff() < 0) throw ArgumentError("forces: expected 0 or more for every joint");
+  if ((forces.array() < 0).any()) throw ArgumentError("forces: expected 0 or more for every joint");
   arm.set_forces(forces);
 }
 
@@ -353,13 +362,15 @@ void World::detach(int articulation) {
 
 const std::vector<Attachment>& World::attachments() const { return impl_->attachments; }
 
-WorldState World::snapshot() const { return {impl_->steps, impl_->numbers(), impl_->attachments}; }
+WorldState World::snapshot() const { return {impl_->steps, impl_->numbers(), impl_->attachments, impl_->layout()}; }
 
 void World::restore(const WorldState& state) {
-  const std::size_t expected = impl_->numbers().size();
-  if (state.numbers.size() != expected) {
-    throw ArgumentError("the snapshot is of another world: expected " + std::to_string(expected) + " numbers, got " +
-                        std::to_string(state.numbers.size()));
+  if (state.layout != impl_->layout()) {
+    const auto told = [](const std::vector<int>& layout) {
+      return std::to_string(layout[0]) + " bodies and " + std::to_string(layout.size() / 2) + " articulations";
+    };
+    throw ArgumentError("the snapshot is of another world: expected one of " + told(impl_->layout()) +
+                        " with the same joints and links, got one of " + told(state.layout));
   }
   impl_->set_numbers(state.numbers);
   impl_->hold(state.attachments);

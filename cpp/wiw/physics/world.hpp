@@ -57,6 +57,7 @@ struct WorldState {
   std::int64_t steps = 0;
   std::vector<double> numbers;
   std::vector<Attachment> attachments;
+  std::vector<int> layout;  // of the world: how many bodies, then joints and links of each articulation
 };
 
 /// What an arm may touch on its way.

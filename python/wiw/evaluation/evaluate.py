@@ -257,6 +257,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
         "episodes": options.episodes,
         "arms": [{"name": arm, "agent": recipe.describe()} for arm, recipe in agents.items()],
     }
+    for recipe in agents.values():
+        recipe.require(config["task"])
     if options.resume and options.out is not None and RunStore.begun(options.out):
         store = RunStore.resume(options.out, config)
         _require_left(built, store, agents)

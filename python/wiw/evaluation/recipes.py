@@ -136,6 +136,18 @@ class AgentRecipe:
             }
         return said
 
+    def require(self, task: Mapping[str, Any]) -> None:
+        """Sees that the world model is made for a task that describes itself so.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        from wiw.registry import WORLD_MODELS
+
+        model = None if self.model is None else WORLD_MODELS.find(self.model)
+        if hasattr(model, "require"):
+            model.require(task)
+
     def replaying(self, run: Path) -> AgentRecipe:
         """The same agent with the answers that a run has recorded in the place of its language model."""
         replay = {"vlm": f"replay:{run}", "cache": "off"}
@@ -168,6 +180,12 @@ class Ready:
     def describe(self) -> dict[str, Any]:
         """What the thing says of itself."""
         return dict(self.thing.describe())
+
+    def require(self, task: Mapping[str, Any]) -> None:
+        """See `AgentRecipe.require`."""
+        model = getattr(self.thing, "model", None)
+        if hasattr(model, "require"):
+            model.require(task)
 
     def to_json(self) -> None:
         """Nothing: an object in memory cannot be written down."""

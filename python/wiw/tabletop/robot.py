@@ -63,9 +63,11 @@ class Robot:
         Raises:
             ArgumentError: the arm does not come there.
         """
-        if self.description.joints == panda().joints:
-            return PANDA_READY
         limits = self.description.limits
+        if self.description.joints == panda().joints:
+            start = np.clip(PANDA_READY, limits["lower"], limits["upper"])
+            if np.array_equal(start[:-2], PANDA_READY[:-2]):  # fingers may open less
+                return start
         start = np.clip(0, np.maximum(limits["lower"], -np.pi), np.minimum(limits["upper"], np.pi))
         for joint in self.finger_joints:
             index = self.description.joint_index(joint)
@@ -99,19 +101,22 @@ def robot_of(file: str | PathLike[str], tcp: str = "") -> Robot:
         ArgumentError: it has no two fingers, or no such link, or another frame there; the message says what was looked
             for and what there is.
     """
-    return _read(Path(file).expanduser().absolute(), tcp)
-
-
-@cache
-def _read(file: Path, tcp: str) -> Robot:
-    description = Articulation(file)
-    digest = hashlib.sha256(file.read_bytes())
+    path = Path(file).expanduser().absolute()
+    description = Articulation(path)
+    digest = hashlib.sha256(path.read_bytes())
     for mesh in description.meshes:
         digest.update(Path(mesh).read_bytes() if Path(mesh).is_file() else b"")
-    identity = {"name": file.name, "digest": digest.hexdigest()[:16], **({"tcp": tcp} if tcp else {})}
-    robot = _robot(description, tcp, identity)
-    _ = robot.looks, robot.ready  # what cannot be drawn or used is told here
-    return robot
+    key = path, digest.hexdigest()[:16], tcp
+    if key not in _MADE:
+        identity = {"name": path.name, "digest": key[1], **({"tcp": tcp} if tcp else {})}
+        robot = _robot(description, tcp, identity)
+        _ = robot.looks, robot.ready  # what cannot be drawn or used is told here
+        _MADE[key] = robot
+    return _MADE[key]
+
+
+_MADE: dict[tuple[Path, str, str], Robot] = {}
+"""By file, digest of it and its meshes, and link between the finger tips."""
 
 
 def _robot(description: Articulation, tcp: str, identity: dict[str, Any]) -> Robot:

@@ -7,6 +7,7 @@ the renderer's frame, where y is up (`Y_UP`).
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -113,7 +114,10 @@ class Move:
     """How far the arm came on its way to a pose."""
 
     free: float
-    """Share of the straight way that it went, from 0 to 1."""
+    """Share of the straight way that is free of the table and within reach, from 0 to 1, and that it set out on.
+
+    Things may be touched, so what stands fast, such as a peg, can still stop it: `Workbench.pose` is where it has come.
+    """
     why: str
     """"free", or what ended the way: "out of reach", "joint limits", "not converged", "jump" or "collision"."""
 
@@ -384,6 +388,7 @@ class _Pictures:
     def __init__(self, bench: Workbench, backend: Literal["auto", "cpu", "gpu"]) -> None:
         self._things, self._robot, self._start = bench.things, bench.robot, bench.poses_of_parts()
         self._first, self._backend = len(_ROOM) + 1, backend
+        self._lock = threading.Lock()
 
     @cached_property
     def _renderer(self) -> Renderer:
@@ -429,10 +434,11 @@ class _Pictures:
         """A batch of one picture of a state."""
         moved = np.stack([Y_UP @ pose for pose in bench.poses_of_parts()])
         if not arm:
-            moved[-len(self._robot.looks) :, 1, 3] -= FAR_BELOW
+            moved[len(moved) - len(self._robot.looks) :, 1, 3] -= FAR_BELOW
         ids = np.arange(self._first, self._first + len(moved), dtype=np.uint32)
-        self._renderer.core.set_poses(ids, moved.astype(np.float32))
-        return self._renderer.perspective(Y_UP @ camera, size, hfov_deg, outputs=outputs)
+        with self._lock:  # forks in other threads draw by the same renderer
+            self._renderer.core.set_poses(ids, moved.astype(np.float32))
+            return self._renderer.perspective(Y_UP @ camera, size, hfov_deg, outputs=outputs)
 
 
 _PAINTED: Colour = (1.0, 1.0, 1.0)

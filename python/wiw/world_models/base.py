@@ -180,6 +180,14 @@ class WorldModel(ABC):
         """The model for plans of primitives or of poses, where it is asked with both. Default: itself."""
         return self
 
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:  # noqa: B027 - most models have nothing to say
+        """Asked before a run begins, with what its task says of itself. Default: any task will do.
+
+        Raises:
+            ArgumentError: the model is not made for it.
+        """
+
     def describe(self) -> dict[str, Any]:
         """JSON-able identity for the run's manifest: the class and its options.
 

@@ -42,11 +42,14 @@ constexpr std::array<Requirement, 22> kRequired{{{"source", "id"},
                                                  {"visual_scene", "id"},
                                                  {"instance_visual_scene", "url"}}};
 
+constexpr int kDeepest = 1000;  // elements in elements
+
 class Walker : public pugi::xml_tree_walker {
  public:
   explicit Walker(std::string path) : path_(std::move(path)) {}
 
   bool for_each(pugi::xml_node& node) override {
+    if (depth() > kDeepest) throw FileError(path_, "its elements lie too deep in each other (damaged file)");
     for (const Requirement& requirement : kRequired) {
       if (requirement.element != node.name() || is_other_use(node)) continue;
       if (!node.attribute(requirement.attribute)) {
@@ -97,6 +100,45 @@ void check_accessors(const pugi::xml_document& document, const std::string& path
   }
 }
 
+/// Nodes may show other nodes; assimp copies these, and calls itself, for as long as there are any.
+class Instances {
+ public:
+  Instances(const pugi::xml_document& document, std::string path) : path_(std::move(path)) {
+    for (const pugi::xpath_node& found : document.select_nodes("//node")) {
+      for (const char* name : {"name", "sid", "id"}) {  // the last one wins
+        if (const auto key = found.node().attribute(name)) nodes_[key.value()] = found.node();
+      }
+    }
+  }
+
+  void check(const pugi::xml_document& document) {
+    for (const pugi::xpath_node& found : document.select_nodes("//visual_scene")) size(found.node(), 0);
+  }
+
+ private:
+  /// How many nodes come of an element.
+  std::uint64_t size(const pugi::xml_node& element, int depth) {
+    if (depth > kDeepest) throw FileError(path_, "its nodes lie too deep in each other (damaged file)");
+    const auto [known, is_new] = sizes_.try_emplace(element, 0);
+    if (!is_new && known->second == 0) throw FileError(path_, "a <node> shows itself (damaged file)");
+    if (!is_new) return known->second;
+    std::uint64_t total = 1;
+    for (const pugi::xml_node& child : element.children("node")) total += size(child, depth + 1);
+    for (const pugi::xml_node& instance : element.children("instance_node")) {
+      const std::string url = instance.attribute("url").value();
+      const auto target = nodes_.find(url.substr(url.starts_with('#') ? 1 : 0));
+      if (target != nodes_.end()) total += size(target->second, depth + 1);
+    }
+    if (total > kMostNodes) throw FileError(path_, "its nodes show more than a million nodes (damaged file)");
+    return sizes_[element] = total;
+  }
+
+  static constexpr std::uint64_t kMostNodes = 1'000'000;
+  std::string path_;
+  std::map<std::string, pugi::xml_node> nodes_;
+  std::map<pugi::xml_node, std::uint64_t> sizes_;  // 0: being looked at
+};
+
 }  // namespace
 
 void check_collada(const std::filesystem::path& path) {
@@ -109,6 +151,7 @@ void check_collada(const std::filesystem::path& path) {
   Walker walker(path.string());
   document.traverse(walker);
   check_accessors(document, path.string());
+  Instances(document, path.string()).check(document);
 }
 
 }  // namespace wiw

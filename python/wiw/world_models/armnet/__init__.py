@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.errors import ArgumentError
 from wiw.networks import one_thread
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import accepts
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 SIZE = (480, 480)
 """Of the front views that come in and go out."""
+ROBOT = {"name": "panda"}
+"""What runs record of the arm that it draws."""
 
 
 class ArmNet(Trained):
@@ -40,6 +43,19 @@ class ArmNet(Trained):
     accepts = accepts(
         control="action", space="pose7", view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
     )
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """The arm that it draws must be the one that works.
+
+        Raises:
+            ArgumentError: the task's arm is another one.
+        """
+        if task.get("robot", ROBOT) != ROBOT:
+            raise ArgumentError(
+                f"world model armnet: expected the built-in arm, which is the only one it draws, got {task['robot']}; "
+                "leave --robot out, or ask oracle, copy or a model of your own"
+            )
 
     @staticmethod
     def _load(weights: str | Path | None) -> tuple[Network, dict[str, Any]]:
