@@ -286,3 +286,13 @@ def test_its_card_has_the_recipe_and_what_it_is_worth() -> None:
     assert set(changed) == set(psnr) == {"copy", "arm", "armnet"}
     assert all(changed["armnet"][k] < 0.7 * changed["arm"][k] and psnr["armnet"][k] > psnr["arm"][k] for k in "1235")
     assert card["plays"] > 0 and card["recipe"]["epochs"] >= 1
+
+
+def test_the_readme_tells_the_figures_of_the_weights() -> None:
+    held_out = ArmNet().card["held_out"]
+    lines = (BUILT_IN.parent / "README.md").read_text().splitlines()
+    for name, row in (("copy", "`copy`"), ("arm", "the arm alone"), ("armnet", "`armnet`")):
+        told = next(line for line in lines if line.startswith(f"| {row}") and "/" in line).split("|")[2:-1]
+        made = [f"{held_out['changed'][name][k]:.1f} / {held_out['psnr'][name][k]:.1f}" for k in ("1", "2", "3", "5")]
+        assert [each.strip() for each in told] == made
+    assert any(f"{held_out['plays']} plays at tables that it never saw" in line for line in lines)

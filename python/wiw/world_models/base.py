@@ -180,8 +180,8 @@ class WorldModel(ABC):
         """The model for plans of primitives or of poses, where it is asked with both. Default: itself."""
         return self
 
-    @classmethod
-    def require(cls, task: Mapping[str, Any]) -> None:  # noqa: B027 - most models have nothing to say
+    @classmethod  # noqa: B027 - most models have nothing to say
+    def require(cls, task: Mapping[str, Any]) -> None:
         """Asked before a run begins, with what its task says of itself. Default: any task will do.
 
         Raises:
