@@ -145,7 +145,7 @@ class AgentRecipe:
         from wiw.registry import WORLD_MODELS
 
         model = None if self.model is None else WORLD_MODELS.find(self.model)
-        if hasattr(model, "require"):
+        if model is not None and hasattr(model, "require"):
             model.require(task)
 
     def replaying(self, run: Path) -> AgentRecipe:
@@ -184,7 +184,7 @@ class Ready:
     def require(self, task: Mapping[str, Any]) -> None:
         """See `AgentRecipe.require`."""
         model = getattr(self.thing, "model", None)
-        if hasattr(model, "require"):
+        if model is not None and hasattr(model, "require"):
             model.require(task)
 
     def to_json(self) -> None:
