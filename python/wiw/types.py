@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.errors import ArgumentError
+
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
 Space = Literal["discrete", "pose7"]
@@ -27,6 +29,17 @@ class Key:
     def at(self, decision: int) -> Key:
         """The key of another decision of the same episode."""
         return Key(self.seed, self.episode, decision)
+
+
+def checked_seed(seed: Any) -> int:
+    """A seed, as it was given.
+
+    Raises:
+        ArgumentError: it is no whole number from 0 to 2**64 - 1.
+    """
+    if not isinstance(seed, int | np.integer) or not 0 <= seed < 2**64:
+        raise ArgumentError(f"seed: expected a whole number from 0 to 2**64 - 1, got {seed!r}")
+    return int(seed)
 
 
 Box = tuple[float, float, float, float]

@@ -14,6 +14,7 @@ from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
 from wiw.tabletop.kind import PALETTE, REACH, above, scattered
 from wiw.tabletop.workbench import LAMPS, TABLE
+from wiw.tasks.imagenav import ImageNav
 from wiw.tasks.manipulation import KINDS, Manipulation
 
 GRID = PoseGrid()
@@ -155,3 +156,18 @@ def test_the_palette_is_told_apart() -> None:
     colours = np.array(list(PALETTE.values()))
     gaps = np.abs(colours[:, None] - colours).max(-1) + np.eye(len(colours))
     assert gaps.min() >= 0.1 and len(PALETTE) == 19
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64, 0.5])
+def test_a_seed_is_a_whole_number(seed: float) -> None:
+    with pytest.raises(ArgumentError, match=r"seed: expected a whole number from 0 to 2\*\*64 - 1"):
+        Manipulation(seed=seed)
+    with pytest.raises(ArgumentError, match="seed: expected"):
+        ImageNav(seed=seed)
+
+
+def test_an_episode_has_a_number() -> None:
+    with pytest.raises(ArgumentError, match="episode: expected a number of 0 or more"):
+        Manipulation().environment().reset(options={"episode": -1})
+    with pytest.raises(ArgumentError, match="robot_tcp"):
+        Manipulation(robot_tcp="tip")

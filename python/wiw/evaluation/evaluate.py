@@ -23,7 +23,7 @@ from wiw.evaluation.scene_map import keep_scene_maps
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.metrics import Lpips
-from wiw.types import Episode, EpisodeResult, Wording
+from wiw.types import Episode, EpisodeResult, Wording, checked_seed
 
 
 def evaluate(
@@ -231,6 +231,8 @@ class _Options:
         for name, least in (("episodes", 1), ("workers", 1), ("live", 1)):
             _at_least(name, getattr(self, name), least)
         _at_least("keep_images", self.pictures, 0)
+        if self.seed is not None:
+            checked_seed(self.seed)
 
     @property
     def pictures(self) -> int:

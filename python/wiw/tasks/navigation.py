@@ -21,7 +21,7 @@ from wiw.errors import ArgumentError, FileError
 from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
-from wiw.types import Episode, Goal, Wording
+from wiw.types import Episode, Goal, Wording, checked_seed
 
 
 class NavigationTask(ABC):
@@ -63,7 +63,8 @@ class NavigationTask(ABC):
         self.given = frozenset(rules)
         """Names of the rules that were given as options."""
         self.rules: Any = presets.rules(self.rules_class, self.name, preset, rules)
-        self.scenes, self.seed, self.backend, self.per_scene = absolute(scenes), seed, backend, per_scene
+        self.scenes, self.seed = absolute(scenes), checked_seed(seed)
+        self.backend, self.per_scene = backend, per_scene
         self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
         self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""
         self._episodes: list[Episode] = []

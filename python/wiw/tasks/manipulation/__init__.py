@@ -20,7 +20,7 @@ from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import Robot, own_panda, robot_of
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
-from wiw.types import ArmObservation, Episode, Goal, Wording
+from wiw.types import ArmObservation, Episode, Goal, Wording, checked_seed
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
@@ -77,12 +77,14 @@ class Manipulation:
         robot_tcp: str = "",
         **rules: Any,
     ) -> None:
+        if robot_tcp and robot is None:
+            raise ArgumentError(f"robot_tcp: names a link of the file `robot`, which is not given; got '{robot_tcp}'")
         if walking := [name for name in rules if name in WALKING]:
             raise ArgumentError(
                 f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
                 "tables are set by `tasks` and `seed`"
             )
-        self.tasks, self.seed, self.backend = _named(tasks), seed, backend
+        self.tasks, self.seed, self.backend = _named(tasks), checked_seed(seed), backend
         self.robot = own_panda() if robot is None else robot_of(robot, robot_tcp)
         self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
 
@@ -140,7 +142,13 @@ class Manipulation:
         return [self.episode(index) for index in range(count)]
 
     def episode(self, index: int) -> Episode:
-        """A table of its own for each; variations are drawn by the seed."""
+        """A table of its own for each; variations are drawn by the seed.
+
+        Raises:
+            ArgumentError: a number below 0.
+        """
+        if index < 0:
+            raise ArgumentError(f"episode: expected a number of 0 or more, got {index}")
         name = self.tasks[index % len(self.tasks)]
         seed = key_of(self.seed, index, 0) % 2**31
         variation = index // len(self.tasks) % KINDS[name].variations
