@@ -11,6 +11,7 @@ import pytest
 
 from wiw.cli import main
 from wiw.cli.doctor import examine
+from wiw.cli.options import parsed
 from wiw.errors import ArgumentError
 from wiw.evaluation.runlog import load_run
 from wiw.tasks.imagenav import ImageNav
@@ -181,6 +182,27 @@ def test_a_world_model_takes_options(tmp_path, two_rooms, short, capsys):
     assert main([*task, "--world-model-option", "steps=3"]) == 2
     assert main([*task, "--policy-option", "steps=3", "--out", str(tmp_path / "run")]) == 2  # where a run is already
     assert load_run(tmp_path / "run").episodes
+
+
+def test_files_in_options_are_named_from_the_root_on(tmp_path, monkeypatch):
+    def factory(weights: "str | Path", prompts: "Path | None" = None, cache: "str | Path" = "auto", text: str = ""):
+        """Annotated as text, as with `from __future__ import annotations`."""
+
+    def other(weights="hub/name", checkpoint: str = "", folder: Path | None = None):
+        """Annotated as they are, or not at all."""
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in ("w: 1", "auto"):
+        (tmp_path / name).touch()
+    there = str(tmp_path / "w: 1")
+    options = parsed(["weights=w: 1", "prompts=~/w: 1", "cache=auto", "text=auto"], factory, "--x")
+    assert options == {"weights": there, "prompts": there, "cache": "auto", "text": "auto"}
+    given = ["weights=w: 1", "checkpoint=auto", "folder=./auto"]
+    auto = str(tmp_path / "auto")
+    assert parsed(given, other, "--x") == {"weights": there, "checkpoint": auto, "folder": auto}
+    missing = ["weights=hub/none", "checkpoint=", "folder=null"]
+    assert parsed(missing, other, "--x") == {"weights": "hub/none", "checkpoint": "", "folder": None}
 
 
 def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import UseAppendAction, arg
@@ -13,6 +15,8 @@ from wiw.errors import ArgumentError
 
 Options = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="KEY=VALUE")]
 """A flag that may be given several times."""
+FILES = ("weights", "checkpoint", "vae")
+"""Options that are files or folders although they are annotated as text, since they may be names on a hub too."""
 
 
 def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict[str, Any]:
@@ -20,7 +24,8 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
 
     A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
     such, so that a revision of digits is no number. The brackets of a list may be left out where it is annotated as a
-    sequence: `categories=bed,coffee table`.
+    sequence: `categories=bed,coffee table`. Files and folders that are there are named from the root on, so that a run
+    can be resumed from any folder.
 
     Raises:
         ArgumentError: no `=`, a key given twice, or a value that is no YAML; names the flag.
@@ -39,11 +44,23 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
         annotation = inspect.formatannotation(parameters[name].annotation).strip("'") if name in parameters else ""
         if annotation.startswith("Sequence") and not value.lstrip().startswith("["):
             value = f"[{value}]"
+        default = parameters[name].default if name in parameters else None
+        names_files = (name in FILES or re.search(r"\bPath\b", annotation)) and value != default
+        path = _rooted(value) if names_files else None
         try:
-            options[name] = value if annotation.startswith("str") else yaml.safe_load(value)
+            options[name] = path or (value if annotation.startswith("str") else yaml.safe_load(value))
         except yaml.YAMLError as error:
             raise ArgumentError(f"{flag}: {pair}: the value is no YAML ({error})") from None
     return options
+
+
+def _rooted(value: str) -> str | None:
+    """The absolute path of a file or folder that is there."""
+    try:
+        path = Path(value).expanduser()
+        return str(path.resolve()) if value and path.exists() else None
+    except (OSError, RuntimeError, ValueError):  # too long for a name, or of a user whom nobody knows: no file
+        return None
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
