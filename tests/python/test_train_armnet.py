@@ -20,6 +20,7 @@ from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.plays import FIELDS, POSES, Plays, demonstrated, gathered_plays, played, spoilt  # noqa: E402
 from wiw.world_models.armnet import ArmNet  # noqa: E402
 from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
+from wiw.world_models.armnet.weights import load  # noqa: E402
 
 SMALL = (8, 16, 16)
 
@@ -164,6 +165,42 @@ def test_the_command_makes_a_model(
     assert card["plays"] == 25 and card["recipe"]["epochs"] == 8
     changed = card["held_out"]["changed"]
     assert changed["armnet"]["1"] < changed["arm"]["1"]
+
+
+def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_measured(
+    tmp_path: Path, plays: Plays, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def learnt(plays: Plays, recipe: Recipe, minutes: Any, show: Any, checkpoint: Checkpoint) -> Any:
+        checkpoint.stand()
+        checkpoint.seconds = 0
+        checkpoint.keep(_Nothing(), 1, 1)
+        return Network(SMALL), recipe
+
+    def stopped(network: Network, plays: Plays) -> Any:
+        raise KeyboardInterrupt
+
+    demos, out = tmp_path / "demos", tmp_path / "w"
+    demos.mkdir()
+    monkeypatch.setattr("wiw.training.plays.gathered_plays", lambda *_, **__: plays)
+    monkeypatch.setattr("wiw.training.plays.demonstrated", lambda folder: plays)
+    monkeypatch.setattr("wiw.training.armnet.train", learnt)
+    monkeypatch.setattr("wiw.training.armnet.measured", stopped)
+    command = ["train", "armnet", "--out", str(out), "--demonstrations", str(demos)]
+    (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 0}')
+    assert main(command) == 130
+    assert (tmp_path / "w.checkpoint").exists(), "it is done only once it is measured"
+    assert load(out)[1]["collection"]["seed"] == 0
+    (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 1}')
+    assert main(command) == 2
+    assert "another training stopped there" in capsys.readouterr().err
+
+
+class _Nothing:
+    def state(self) -> dict[str, Any]:
+        return {}
+
+    def restore(self, state: Any) -> None:
+        pass
 
 
 def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -203,6 +203,7 @@ def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how
 def _armnet(
     out: Path, asked: _Asked, minutes: float | None, count: int, demonstrations: Path | None, how: dict[str, Any]
 ) -> None:
+    from wiw.datasets.demonstrations import read_manifest
     from wiw.networks import one_thread
     from wiw.training import armnet as training
     from wiw.training.checkpoint import Checkpoint
@@ -215,7 +216,7 @@ def _armnet(
     card: dict[str, Any] = {"plays": len(plays), "demonstrations": 0}
     if demonstrations is not None:
         shown = demonstrated(demonstrations)
-        card["demonstrations"] = len(shown)
+        card |= {"demonstrations": len(shown), "collection": read_manifest(demonstrations)}
         plays = merged([plays, shown])
     asked_for = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), asked_for)
@@ -223,9 +224,9 @@ def _armnet(
         network, recipe = training.train(plays, recipe, minutes, steps, checkpoint)
     card["recipe"] = asdict(recipe)
     save(out, network, card)  # before measuring, which takes another minute
-    checkpoint.remove()
     card["held_out"] = training.measured(load(out)[0], held_out)
     save(out, load(out)[0], card)
+    checkpoint.remove()
     _report_armnet(card, out)
 
 
