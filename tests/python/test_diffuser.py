@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import resource
+import signal
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -354,6 +357,47 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_pa
         Checkpoint(file, {"a": 1}).stand()
     with pytest.raises(ArgumentError, match="epochs"):
         Recipe(epochs=0)
+
+
+class _Bytes:
+    """What can be kept of a lesson: some numbers."""
+
+    def state(self) -> dict[str, Any]:
+        return {"values": torch.arange(500.0)}
+
+    def restore(self, state: Any) -> None:
+        pass
+
+
+def test_a_checkpoint_damaged_anyhow_is_told(tmp_path: Path) -> None:
+    file = tmp_path / "checkpoint"
+    checkpoint = Checkpoint(file, {"a": 1}, seconds=0)
+    checkpoint.keep(_Bytes(), 3, 2)
+    assert checkpoint.stand().step == 2
+    whole = file.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        at, bits = int(rng.integers(len(whole))), int(rng.integers(1, 256))
+        file.write_bytes(whole[:at] + bytes([whole[at] ^ bits]) + whole[at + 1 :])
+        with suppress(FileError, ArgumentError):
+            checkpoint.stand()
+    for data in (b"", b"PK", b"\x80\x02]q\x00.", b"\x80\x02X\x01\x00\x00\x00\xff.", whole[:900], rng.bytes(99)):
+        file.write_bytes(data)
+        with pytest.raises(FileError, match="delete it to begin anew"):
+            checkpoint.stand()
+
+
+def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
+    kept = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, kept[1]))
+    try:
+        with pytest.raises(FileError, match="free space"):
+            Checkpoint(tmp_path / "checkpoint", {}, seconds=0).keep(_Bytes(), 3, 2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, kept)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

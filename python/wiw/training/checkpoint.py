@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+import io
 import json
-import pickle
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -64,7 +64,7 @@ class Checkpoint:
         try:
             held = torch.load(self.path, weights_only=True)
             of, stand = held["of"], Stand(held["epochs"], held["step"], held["state"])
-        except (OSError, RuntimeError, EOFError, pickle.UnpicklingError, KeyError, TypeError) as error:
+        except Exception as error:  # what torch's unpickler meets in damaged bytes raises nearly anything
             raise FileError(f"{self.path}: damaged ({error}); delete it to begin anew") from error
         if of != self._of:
             raise ArgumentError(
@@ -82,8 +82,10 @@ class Checkpoint:
 
         if time.monotonic() < self._last + self.seconds:
             return
+        packed = io.BytesIO()  # torch's own writer tells a full disk by a bare RuntimeError
+        torch.save({"of": self._of, "epochs": epochs, "step": step, "state": lesson.state()}, packed)
         with whole_file(self.path) as draft:
-            torch.save({"of": self._of, "epochs": epochs, "step": step, "state": lesson.state()}, draft)
+            draft.write_bytes(packed.getbuffer())
         self._last = time.monotonic()
 
     def remove(self) -> None:
