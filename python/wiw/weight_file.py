@@ -6,12 +6,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as packed
-from torch import nn
+from torch import Tensor, nn
 
 from wiw.errors import ArgumentError, WeightsError
 from wiw.files import whole_file
@@ -52,9 +53,10 @@ class WeightFile(Generic[N]):
         try:
             with safe_open(path, framework="pt") as file:
                 header = self._header(file.metadata(), path)
-                values = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - it is no mapping
+                values = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - it is no mapping
+                self._check(values, file.metadata().get("digest"), path)
             network = self.build(header)
-            network.load_state_dict(values)
+            network.load_state_dict({name: value.float() for name, value in values.items()})
             return network.eval(), dict(header["card"])
         except (OSError, SafetensorError, ArgumentError, KeyError, TypeError, ValueError, RuntimeError) as error:
             raise WeightsError(
@@ -69,8 +71,19 @@ class WeightFile(Generic[N]):
         """
         header = {**self.sizes(network), "card": dict(card)}
         values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+        metadata = {"format": self.format, "header": json.dumps(header, sort_keys=True), "digest": digest(values)}
         with whole_file(path) as draft:
-            draft.write_bytes(packed(values, {"format": self.format, "header": json.dumps(header, sort_keys=True)}))
+            draft.write_bytes(packed(values, metadata))
+
+    def _check(self, values: Mapping[str, Tensor], told: str | None, path: Path) -> None:
+        """That values are those that were written, as far as the file says which, and are numbers."""
+        if told is not None and told != digest(values):
+            wrong = "its values are not those that were written: it is damaged"
+        elif not all(value.isfinite().all() for value in values.values()):
+            wrong = "some of its values are no finite numbers: it is damaged, or its training failed"
+        else:
+            return
+        raise WeightsError(f"{path}: expected weights of {self.name}, whole; {wrong}; {self.cure}", "unfit")
 
     def _header(self, metadata: Mapping[str, str] | None, path: Path) -> dict[str, Any]:
         found = (metadata or {}).get("format")
@@ -81,3 +94,11 @@ class WeightFile(Generic[N]):
                 "revision" if str(found).startswith(f"wiw-{self.name}") else "unfit",
             )
         return dict(json.loads(metadata["header"]))
+
+
+def digest(values: Mapping[str, Tensor]) -> str:
+    """Of names and values."""
+    found = blake2b(digest_size=16)
+    for name in sorted(values):
+        found.update(name.encode() + b"\0" + values[name].cpu().numpy().tobytes())
+    return found.hexdigest()

@@ -23,6 +23,9 @@ from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
+from safetensors import safe_open  # noqa: E402
+from safetensors.torch import save as packed  # noqa: E402
+
 from wiw.world_models.armnet import BUILT_IN, SIZE, ArmNet  # noqa: E402
 from wiw.world_models.armnet.body import plate, sights  # noqa: E402
 from wiw.world_models.armnet.motion import motion  # noqa: E402
@@ -245,6 +248,27 @@ def test_a_saved_network_is_loaded_again(tmp_path: Path) -> None:
     assert error.value.kind == "unfit"
     with pytest.raises(WeightsError, match="wiw train armnet"):
         ArmNet(tmp_path / "none")
+
+
+def test_damaged_weights_are_told(tmp_path: Path) -> None:
+    file, network = tmp_path / "w.safetensors", Network((4, 8, 12))
+    save(file, network, {})
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(WeightsError, match="not those that were written: it is damaged") as error:
+        load(file)
+    assert error.value.kind == "unfit"
+    network.last.weight.data[0, 0, 0, 0] = float("nan")
+    save(file, network, {})
+    with pytest.raises(WeightsError, match="no finite numbers") as error:
+        load(file)
+    assert error.value.kind == "unfit"
+    save(file, Network((4, 8, 12)), {})
+    with safe_open(file, "pt") as held:
+        values, metadata = {name: held.get_tensor(name) for name in held.keys()}, held.metadata()  # noqa: SIM118
+    del metadata["digest"]
+    file.write_bytes(packed(values, metadata))
+    assert load(file)[0].widths == (4, 8, 12), "as files were before they had one"
 
 
 def test_without_torch_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

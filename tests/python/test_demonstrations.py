@@ -353,6 +353,24 @@ def test_a_damaged_picture_is_told(collected: Path) -> None:
     broken = replace(Demonstrations(collected)[0], encoded_images=(b"no picture",))
     with pytest.raises(FileError, match="picture of a demonstration is damaged"):
         _ = broken.images
+    rng = np.random.default_rng(0)
+    small, large = (encoded_image(rng.integers(0, 256, (n, n, 3)).astype(np.uint8), "png") for n in (8, 9))
+    depths = tuple(encoded_depth(np.ones((n, n), np.float32)) for n in (8, 9))
+    broken = replace(broken, encoded_images=(small, large), encoded_depths=depths)
+    for name in ("images", "depths"):
+        with pytest.raises(FileError, match="picture of a demonstration is damaged"):
+            getattr(broken, name)
+
+
+def test_a_flipped_bit_is_told(tmp_path: Path) -> None:
+    each = made_up(np.random.default_rng(0), 3, 0, True, "jpeg")
+    path = tmp_path / "made-00000.parquet"
+    shards.write(path, [each], {})
+    whole = path.read_bytes()
+    for at in (whole.index(each.encoded_images[1]) + 300, whole.index(each.poses[0, :1].tobytes()[:4]) + 1):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises(FileError, match=r"made-00000\.parquet.*damaged"):
+            shards.Shard(path)[0]
 
 
 def test_pyarrow_is_asked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -77,7 +77,7 @@ class Demonstration:
         Raises:
             FileError: one of them is damaged.
         """
-        return np.stack([_decoded(data, cv2.IMREAD_COLOR) for data in self.encoded_images])[..., ::-1]
+        return _decoded(self.encoded_images, cv2.IMREAD_COLOR)[..., ::-1]
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:
@@ -88,7 +88,7 @@ class Demonstration:
         """
         if self.encoded_depths is None:
             return None
-        units = np.stack([_decoded(data, cv2.IMREAD_UNCHANGED) for data in self.encoded_depths])
+        units = _decoded(self.encoded_depths, cv2.IMREAD_UNCHANGED)
         return units.astype(np.float32) / np.float32(DEPTH_UNITS)
 
 
@@ -211,8 +211,14 @@ def encoded_depth(depth: NDArray[np.float32]) -> bytes:
     return bytes(cv2.imencode(".png", units)[1])
 
 
-def _decoded(data: bytes, how: int) -> NDArray[Any]:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None
-    if image is None:
-        raise FileError("a picture of a demonstration is damaged; delete its file, then `wiw collect` makes it anew")
-    return image
+def _decoded(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
+    """[T, H, W, ...]; what is damaged is no picture, or one of another size."""
+    try:
+        images = [cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None for data in pictures]
+        if any(image is None for image in images):
+            raise ValueError("no picture")
+        return np.stack(images)
+    except (ValueError, cv2.error) as error:
+        raise FileError(
+            f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
+        ) from error

@@ -67,10 +67,8 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
 
     depth = demonstrations[0].encoded_depths is not None
     schema = _schema(depth, facts)
-    with (
-        whole_file(path) as draft,
-        parquet.ParquetWriter(draft, schema, use_dictionary=list(REPEATED), compression=_packing(depth)) as file,
-    ):
+    how = {"use_dictionary": list(REPEATED), "compression": _packing(depth), "write_page_checksum": True}
+    with whole_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
         for each in demonstrations:
             file.write_table(_table(each, schema), row_group_size=len(each))
 
@@ -108,9 +106,9 @@ class Shard:
         from pyarrow import ArrowException, parquet
 
         try:
-            with parquet.ParquetFile(self.path, metadata=self._metadata) as file:
+            with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
                 return _demonstration(file.read_row_group(index).to_pydict())
-        except (OSError, ArrowException, KeyError, ValueError) as error:
+        except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
             raise _damaged(self.path, error) from error
 
 
