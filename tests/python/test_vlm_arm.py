@@ -138,6 +138,17 @@ def test_of_another_policys_plans_one_is_chosen_by_some_of_its_poses() -> None:
     assert [strip.shape[1] // 384 for strip in images(call)[1:]] == [5, 5]
     last = GRID.encode(decision.proposals[1].actions[-1]).tolist()
     assert words(call).count(str(last)) == 1
+    assert words(call).count(": 5 of 12 actions: [[") == 2
+
+
+def test_a_long_plan_that_may_be_written_again_is_told_whole() -> None:
+    long = [[50, 50, height, 0, 60, 60, 1] for height in range(30, 23, -1)]
+    both = json.dumps({"plans": [answer(*long), answer(ABOVE)]})
+    client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(*long))
+    decision = decided(VLM(client, proposals="listed"), "copy", horizon=7)
+    assert f"Plan 1: Go there.\nActions: {long}" in words(client.asked[-1])
+    assert [strip.shape[1] // 384 for strip in images(client.asked[-1])[1:]] == [5, 1]
+    assert decision.chosen == 0
 
 
 @pytest.mark.parametrize(("count", "places"), [(1, [0]), (4, [0, 1, 2, 3]), (50, [9, 19, 29, 39, 49]), (7, None)])

@@ -81,7 +81,7 @@ class ArmVLM(VLM):
         parts = [self._words(situation, "planner", horizon), *self._now(situation, horizon)]
         parts.append(self._words(situation, "chooser" if selects else "planner_imagined", horizon))
         for number, (plan, rollout) in enumerate(zip(proposals, rollouts, strict=True), 1):
-            parts += [f"Plan {number}: {_told(plan)}", looks.plan_strip(plan, rollout)]
+            parts += [f"Plan {number}: {_told(plan, whole=not selects)}", looks.plan_strip(plan, rollout)]
         options: dict[str, Any] = {"seed": seed_of(situation.key, REVISE), "tries": self.tries}
         if selects:
             choices = tuple(f"plan {number}" for number in range(1, len(proposals) + 1))
@@ -112,7 +112,9 @@ class ArmVLM(VLM):
         return {**super()._read(reply), "out_of_range": outside}
 
 
-def _told(plan: Proposal) -> str:
-    """A plan in words, where it has any, and in whole numbers."""
-    words = plan.text.removeprefix(plans.SCENE)
-    return f"{words}\nActions: {plans.named(plan.actions)}" if words else plans.named(plan.actions)
+def _told(plan: Proposal, whole: bool) -> str:
+    """A plan in words, where it has any, and in whole numbers: all of its poses, or those that are shown of it."""
+    words, count = plan.text.removeprefix(plans.SCENE), len(plan.actions)
+    places = np.arange(count) if whole else plans.shown(count)
+    head = f"{len(places)} of {count} actions: " if len(places) < count else "Actions: " if words else ""
+    return (f"{words}\n" if words else "") + head + plans.named(plan.actions[places])

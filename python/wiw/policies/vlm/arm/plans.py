@@ -77,8 +77,8 @@ def on_grid(poses: NDArray[np.float64]) -> bool:
 
 
 def named(poses: NDArray[np.float64]) -> str:
-    """Poses [K, 7] as they are written, those of `shown` of a longer plan."""
-    return str(GRID.encode(poses[shown(len(poses))]).tolist())
+    """Poses [K, 7] as they are written."""
+    return str(GRID.encode(poses).tolist())
 
 
 def shown(count: int) -> NDArray[np.int64]:
