@@ -406,6 +406,23 @@ def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFi
     assert "--demonstrations" in capsys.readouterr().err
     assert main(["train", "warpnet", *out, "--demonstrations", str(tmp_path)]) == 2
     assert "leave it out" in capsys.readouterr().err
+    needless = {"scenes": "a.glb", "val": "a.glb", "categories": "bed", "places": "3", "plays": "3", "cache": "c"}
+    for flag, value in needless.items():
+        assert main(["train", "diffuser", *out, f"--{flag}", value, "--demonstrations", str(tmp_path)]) == 2
+        assert f"--{flag}: diffuser " in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert "armnet or diffuser" in said and "sized for a night" in said
+
+
+def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("pyarrow", reason="needs wiw[export]")
+    demos = str(tmp_path / "demos")
+    few = ["--tasks", "slide_block", "--episodes", "1", "--frames", "16", "--depth", "--size", "64"]
+    assert main(["collect", "manipulation", *few, "--out", demos]) == 0
+    assert main(["train", "diffuser", "--demonstrations", demos, "--out", str(tmp_path / "x")]) == 2
+    assert "of 64; collect with --size 480" in capsys.readouterr().err
 
 
 @pytest.mark.slow

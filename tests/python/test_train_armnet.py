@@ -211,3 +211,9 @@ def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pyte
     assert "--plays" in capsys.readouterr().err
     assert main(["train", "warpnet", *out, "--plays", "3"]) == 2
     assert "--plays: warpnet" in capsys.readouterr().err
+    for count in ("0", "-5"):
+        assert main(["train", "armnet", *out, "--plays", count]) == 2
+        assert f"--plays: expected 1 or more, got {count}" in capsys.readouterr().err
+    for flag in ("--scenes", "--val"):
+        assert main(["train", "armnet", *out, flag, "apartments:train:1"]) == 2
+        assert f"{flag}: armnet looks at no scenes" in capsys.readouterr().err

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,6 +12,20 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from wiw.cli.stop import begun_again
+
+TRAIN, VAL, PLAYS = "apartments:train:80", "apartments:val:20", 2000
+"""What is learnt from and measured on where nothing else is asked for."""
+SEEING, PLAYING = ("recogniser", "warpnet"), ("armnet",)
+USES: Mapping[str, tuple[tuple[str, ...], str]] = {
+    "scenes": (SEEING, "looks at no scenes"),
+    "val": (SEEING, "looks at no scenes"),
+    "places": (SEEING, "looks at no scenes"),
+    "categories": (("recogniser",), "recognises nothing"),
+    "plays": (PLAYING, "plays at no tables"),
+    "demonstrations": ((*PLAYING, "diffuser"), "learns from scenes"),
+    "cache": ((*SEEING, *PLAYING), "looks at no scenes and plays at no tables"),
+}
+"""By flag: what has a use for it, and why the rest has none."""
 
 
 def train(
@@ -20,8 +35,8 @@ def train(
     /,
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
-    scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:train:80",
-    val: Annotated[str, arg(metavar="SPEC")] = "apartments:val:20",
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
+    val: Annotated[str | None, arg(metavar="SPEC")] = None,
     categories: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
     demonstrations: Annotated[Path | None, arg(metavar="DIR")] = None,
     epochs: Annotated[int | None, arg(metavar="N")] = None,
@@ -48,17 +63,19 @@ def train(
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
     Looks around all scenes first, which a command that was stopped does not do again, then trains: about a quarter of
-    an hour on two idle cores. Recipe and figures on the val scenes are kept in the file: the recogniser's accuracy and
-    calibration error on one half of them, its confidence being calibrated on the other; warpnet's PSNR and SSIM beside
-    those of copy and warp. The recogniser's weights that come with the package were made by this command as it stands.
-    armnet looks at no scenes: it plays at the tables of the manipulation tasks first, mostly badly, and measures on
-    plays of its own beside copy and a table on which nothing but the arm moves.
+    an hour on two idle cores, but for diffuser, whose recipe is sized for a night (--minutes makes it shorter). Recipe
+    and figures on the val scenes are kept in the file: the recogniser's accuracy and calibration error on one half of
+    them, its confidence being calibrated on the other; warpnet's PSNR and SSIM beside those of copy and warp. The
+    recogniser's weights that come with the package were made by this command as it stands. armnet looks at no scenes:
+    it plays at the tables of the manipulation tasks first, mostly badly, and measures on plays of its own beside copy
+    and a table on which nothing but the arm moves. diffuser looks at no scenes either and is not measured.
 
     Args:
-        what: recogniser, warpnet or armnet.
+        what: recogniser, warpnet, armnet or diffuser.
         out: Weights, as safetensors of a few MB; WHAT.safetensors if not given.
-        scenes: To learn from: apartments:train[:N], a mesh or a Gazebo world.
-        val: To measure on, and for the recogniser to calibrate with: it halves them, or the looks of a single one.
+        scenes: To learn from: apartments:train[:N], a mesh or a Gazebo world; apartments:train:80 if not given.
+        val: To measure on, and for the recogniser to calibrate with: it halves them, or the looks of a single one;
+            apartments:val:20 if not given.
         categories: What there is to recognise; the built-in list if none is given.
         demonstrations: Of `wiw collect manipulation`: for diffuser to learn from, with depth; for armnet beside plays.
         epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet, 4 for armnet, 400 for
@@ -68,33 +85,26 @@ def train(
         plays: For armnet: at tables, of eight poses each; 2000 if not given.
         seed: The looks are a function of it and the scenes, the weights of it, the looks and the epochs.
         workers: Processes that look around.
-        cache: Where looks are kept; $WIW_CACHE/looks if not given. Deleting it is always safe.
+        cache: Where looks and plays are kept; $WIW_CACHE/looks if not given. Deleting it is always safe.
     """
-    from wiw.errors import ArgumentError
     from wiw.scenes.store import folder
 
     out = out or Path(f"{what}.safetensors")
-    if what == "armnet" and places is not None:
-        raise ArgumentError("--places: armnet looks at no scenes; give --plays")
-    if what != "armnet" and plays is not None:
-        raise ArgumentError(f"--plays: {what} learns from something else; leave it out")
+    flags = {"scenes": scenes, "val": val, "categories": categories or None, "demonstrations": demonstrations}
+    _check_use(what, _given(**flags, places=places, plays=plays, cache=cache))
     _require_torch(what)
     _check_out(out)
-    if what == "diffuser":
-        with begun_again():
-            _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
-        return 0
-    if demonstrations is not None and what != "armnet":
-        raise ArgumentError(f"--demonstrations: {what} learns from scenes; leave it out")
-    _check_scenes(scenes, val)
-    asked = _Asked(scenes, val, seed, cache or folder().parent / "looks", workers)
-    if categories and what != "recogniser":
-        raise ArgumentError(f"--categories: {what} recognises nothing; leave them out")
+    from_where = TRAIN if scenes is None else scenes, VAL if val is None else val
+    asked = _Asked(*from_where, seed, cache or folder().parent / "looks", workers)
+    if what in SEEING:
+        _check_scenes(asked.scenes, asked.val)
     with begun_again():
         if what == "recogniser":
             _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
+        elif what == "diffuser":
+            _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
         elif what == "armnet":
-            _armnet(out, asked, minutes, plays or 2000, demonstrations, _given(epochs=epochs))
+            _armnet(out, asked, minutes, PLAYS if plays is None else plays, demonstrations, _given(epochs=epochs))
         else:
             _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
     return 0
@@ -177,6 +187,7 @@ def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, An
 
 def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how: dict[str, Any]) -> None:
     from wiw.datasets.demonstrations import Demonstrations
+    from wiw.envs.sensors import Sensors
     from wiw.errors import ArgumentError
     from wiw.networks import one_thread
     from wiw.policies.diffuser.sight import Lens
@@ -187,6 +198,11 @@ def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how
     if demonstrations is None:
         raise ArgumentError("diffuser learns from demonstrations: give a folder of `wiw collect` with --demonstrations")
     shown, recipe = Demonstrations(demonstrations), training.Recipe(**how)
+    if shown.config.get("size") != Sensors.size:
+        raise ArgumentError(
+            f"--demonstrations: diffuser is run on views of {Sensors.size} pixels a side, got demonstrations of "
+            f"{shown.config.get('size')}; collect with --size {Sensors.size}"
+        )
     lens = Lens(shown.camera.intrinsics, shown.camera.T_world_camera)
     moments = training.moments(_bar(shown, "looking", len(shown)), lens)
     card: dict[str, Any] = {"demonstrations": shown.config, "moments": len(moments)}
@@ -233,6 +249,19 @@ def _armnet(
 def _given(**options: Any) -> dict[str, Any]:
     """Those that are not None."""
     return {name: value for name, value in options.items() if value is not None}
+
+
+def _check_use(what: str, given: Mapping[str, Any]) -> None:
+    """That nothing is asked for in vain."""
+    from wiw.errors import ArgumentError
+
+    for name in given:
+        users, why = USES[name]
+        if what not in users:
+            instead = "give --plays in place of it" if (what, name) == ("armnet", "places") else "leave it out"
+            raise ArgumentError(f"--{name}: {what} {why}; {instead}")
+    if given.get("plays", 1) < 1:
+        raise ArgumentError(f"--plays: expected 1 or more, got {given['plays']}")
 
 
 def _check_out(out: Path) -> None:
