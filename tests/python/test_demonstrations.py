@@ -322,6 +322,20 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
         wiw.collect(tmp_path / "file", **SMALL)
 
 
+OTHERS = (
+    *("{}", "[]", "null", "3", '{"tasks": ["push_buttons"]}', '{"tasks": 3, "episodes": 1}'),
+    *('{"tasks": [], "episodes": "1"}', '{"tasks": [], "episodes": true}'),
+)
+
+
+@pytest.mark.parametrize("text", OTHERS)
+def test_a_manifest_of_something_else_is_told(tmp_path: Path, text: str) -> None:
+    (tmp_path / "manifest.json").write_text(text)
+    for call in (lambda: Demonstrations(tmp_path), lambda: wiw.collect(tmp_path, **SMALL)):
+        with pytest.raises(FileError, match="expected a manifest of `wiw collect`, got something else"):
+            call()
+
+
 def test_files_that_are_missing_or_damaged_are_named(collected: Path, tmp_path: Path) -> None:
     for name, data in contents(collected).items():
         (tmp_path / name).write_bytes(data)

@@ -181,7 +181,12 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     try:
-        return dict(json.loads(path.read_text()))
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or not isinstance(found.get("tasks"), list):
+            raise ValueError("no list of tasks")
+        if type(found.get("episodes")) is not int:
+            raise ValueError("no number of episodes")
+        return found
     except FileNotFoundError as error:
         raise FileError(f"{path} is missing; expected a folder that `wiw collect` has written") from error
     except (OSError, ValueError) as error:
