@@ -220,9 +220,10 @@ def _decoded(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
     """[T, H, W, ...]; what is damaged is no picture, or one of another size."""
     try:
         images = [cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None for data in pictures]
-        if any(image is None for image in images):
+        whole = [image for image in images if image is not None]
+        if len(whole) < len(images):
             raise ValueError("no picture")
-        return np.stack(images)
+        return np.stack(whole)
     except (ValueError, cv2.error) as error:
         raise FileError(
             f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
