@@ -62,13 +62,15 @@ def train(
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
-    Looks around all scenes first, which a command that was stopped does not do again, then trains: about a quarter of
-    an hour on two idle cores, but for diffuser, whose recipe is sized for a night (--minutes makes it shorter). Recipe
-    and figures on the val scenes are kept in the file: the recogniser's accuracy and calibration error on one half of
-    them, its confidence being calibrated on the other; warpnet's PSNR and SSIM beside those of copy and warp. The
-    recogniser's weights that come with the package were made by this command as it stands. armnet looks at no scenes:
-    it plays at the tables of the manipulation tasks first, mostly badly, and measures on plays of its own beside copy
-    and a table on which nothing but the arm moves. diffuser looks at no scenes either and is not measured.
+    recogniser and warpnet look around all scenes first, armnet plays at the tables of the manipulation tasks, mostly
+    badly; a command that was stopped does not do so again. Then they train: a quarter of an hour to half of one on two
+    idle cores. diffuser learns from demonstrations, for a night (--minutes makes it shorter).
+
+    Recipe and figures on what was not learnt from are kept in the file: the recogniser's accuracy and calibration error
+    on one half of the val scenes, its confidence being calibrated on the other; warpnet's PSNR and SSIM there beside
+    those of copy and warp; armnet's errors on plays of its own beside those of copy and of a table on which nothing but
+    the arm moves. diffuser is not measured. The weights that come with the package were made by this command as it
+    stands.
 
     Args:
         what: recogniser, warpnet, armnet or diffuser.
