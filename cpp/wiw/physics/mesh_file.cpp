@@ -49,8 +49,8 @@ class MeshFile {
     importer_.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_LINE | aiPrimitiveType_POINT);
     importer_.SetPropertyInteger(AI_CONFIG_PP_RVC_FLAGS, aiComponent_NORMALS);
     importer_.SetPropertyFloat(AI_CONFIG_PP_GSN_MAX_SMOOTHING_ANGLE, kSmooth);
-    const aiScene* scene = importer_.ReadFile(
-        path_.string(), steps | aiProcess_PreTransformVertices | aiProcess_ValidateDataStructure);
+    const aiScene* scene =
+        importer_.ReadFile(path_.string(), steps | aiProcess_PreTransformVertices | aiProcess_ValidateDataStructure);
     if (scene == nullptr) throw error(importer_.GetErrorString());
     for (unsigned m = 0; m < scene->mNumMeshes; ++m) check(*scene->mMeshes[m]);
     return *scene;
