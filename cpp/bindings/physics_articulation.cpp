@@ -47,7 +47,7 @@ py::list visuals(const Articulation& articulation) {
 
 template <class Row>
 py::array rows(const std::vector<Row>& values) {
-  using Number = typename Row::Scalar;
+  using Number = Row::Scalar;
   py::array_t<Number> array({static_cast<py::ssize_t>(values.size()), py::ssize_t{Row::RowsAtCompileTime}});
   Number* out = array.mutable_data();
   for (const Row& row : values) out = std::copy(row.begin(), row.end(), out);

@@ -100,7 +100,7 @@ void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& sca
   const auto first = static_cast<std::uint32_t>(surface.positions.size());
   const Eigen::Vector4f color = color_of(scene, mesh);
   for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
-    surface.positions.push_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v])));
+    surface.positions.emplace_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v])));
     surface.normals.push_back(to_eigen(mesh.mNormals[v]).cwiseQuotient(scale).normalized());
     const aiColor4D* own = mesh.mColors[0];
     surface.colors.push_back(own == nullptr ? color : Eigen::Vector4f(own[v].r, own[v].g, own[v].b, 1.f));
@@ -138,7 +138,7 @@ std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vec
   for (unsigned m = 0; m < scene.mNumMeshes; ++m) {
     const aiMesh& mesh = *scene.mMeshes[m];
     for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
-      points.push_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v]).cast<double>()));
+      points.emplace_back(scale.cwiseProduct(to_eigen(mesh.mVertices[v]).cast<double>()));
     }
   }
   const HullMesh hull = hull_mesh(points);
