@@ -52,6 +52,10 @@ PARTS = (
 )
 
 
+WORKERS = 2
+"""Processes that share the arms of a part."""
+
+
 def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     """Image-Goal Navigation in generated apartments and a robot arm at a table, with several world models each.
 
@@ -85,7 +89,7 @@ def _run(part: Part, folder: Path) -> int:
     task, agent = TaskRecipe(part.task, part.options), AgentRecipe(part.policy)
 
     def work() -> Any:
-        return evaluate(task, agent, part.episodes, out=folder, arms=arms, live=part.episodes)
+        return evaluate(task, agent, part.episodes, out=folder, workers=WORKERS, arms=arms, live=part.episodes)
 
     return finish(stoppable(work, folder), report=True)
 
