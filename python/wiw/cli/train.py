@@ -109,6 +109,7 @@ def train(
             _armnet(out, asked, minutes, PLAYS if plays is None else plays, demonstrations, _given(epochs=epochs))
         else:
             _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
+    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
     return 0
 
 
@@ -165,7 +166,7 @@ def _recogniser(
     card |= {"looks": asdict(rules), "recipe": asdict(recipe)}
     made = training.calibrated(network, names, calibration, held_out, card)
     made.save(out)
-    _report(made.card, made.temperature, out)
+    _report(made.card, made.temperature)
 
 
 def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, Any], how: dict[str, Any]) -> None:
@@ -184,7 +185,7 @@ def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, An
     save(out, network, card)  # before measuring, which takes another minute
     card["held_out"] = training.measured(WarpNet(out), asked.val, asked.seed, bar=_bar)
     save(out, load(out)[0], card)
-    _report_warpnet(card, out)
+    _report_warpnet(card)
 
 
 def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how: dict[str, Any]) -> None:
@@ -215,7 +216,6 @@ def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how
     save(out, network, {**card, "recipe": asdict(recipe)})
     checkpoint.remove()
     print(f"{len(shown)} demonstrations, {len(moments)} paths, {recipe.epochs} epochs")
-    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 
 def _armnet(
@@ -242,10 +242,11 @@ def _armnet(
         network, recipe = training.train(plays, recipe, minutes, steps, checkpoint)
     card["recipe"] = asdict(recipe)
     save(out, network, card)  # before measuring, which takes another minute
-    card["held_out"] = training.measured(load(out)[0], held_out)
-    save(out, load(out)[0], card)
+    network = load(out)[0]  # as it is kept, in half precision
+    card["held_out"] = training.measured(network, held_out)
+    save(out, network, card)
     checkpoint.remove()
-    _report_armnet(card, out)
+    _report_armnet(card)
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -284,16 +285,15 @@ def _check_scenes(scenes: str, val: str) -> None:
         raise ArgumentError(f"--val: expected scenes that are not learnt from, got {shared[0]} in both; choose others")
 
 
-def _report(card: dict[str, Any], temperature: float, out: Path) -> None:
+def _report(card: dict[str, Any], temperature: float) -> None:
     print(f"{card['sets']} sets of looks, {card['recipe']['epochs']} epochs; held out: {card['held_out_sets']} sets")
     for name, accuracy in card["accuracy"].items():
         print(f"  {name:<20} accuracy {100 * accuracy:5.1f} %")
     error = card["calibration_error"]
     print(f"calibration error {error['before']:.3f}, at temperature {temperature:.2f} {error['after']:.3f}")
-    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 
-def _report_warpnet(card: dict[str, Any], out: Path) -> None:
+def _report_warpnet(card: dict[str, Any]) -> None:
     held_out = card["held_out"]
     print(f"{card['ways']} ways, {card['recipe']['epochs']} epochs; held out: {held_out['ways']} ways")
     print(f"{'steps of 0.2 m ahead':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
@@ -301,10 +301,9 @@ def _report_warpnet(card: dict[str, Any], out: Path) -> None:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]
         print(f"  {name:<18}" + "".join(cells))
     print("PSNR in dB and SSIM of whole panoramas, weighted by latitude")
-    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 
-def _report_armnet(card: dict[str, Any], out: Path) -> None:
+def _report_armnet(card: dict[str, Any]) -> None:
     held_out = card["held_out"]
     print(f"{card['plays']} plays, {card['recipe']['epochs']} epochs; held out: {held_out['plays']} plays")
     print(f"{'poses gone to':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
@@ -314,7 +313,6 @@ def _report_armnet(card: dict[str, Any], out: Path) -> None:
         ]
         print(f"  {name:<18}" + "".join(cells))
     print("mean absolute error, of 255, where things have changed, and PSNR in dB of the window around the table")
-    print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
 
 
 def _bar(items: Any, text: str, total: int) -> Any:

@@ -144,9 +144,7 @@ class AgentRecipe:
         """
         from wiw.registry import WORLD_MODELS
 
-        model = None if self.model is None else WORLD_MODELS.find(self.model)
-        if model is not None and hasattr(model, "require"):
-            model.require(task)
+        _require(None if self.model is None else WORLD_MODELS.find(self.model), task)
 
     def replaying(self, run: Path) -> AgentRecipe:
         """The same agent with the answers that a run has recorded in the place of its language model."""
@@ -167,6 +165,12 @@ class AgentRecipe:
         return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
 
 
+def _require(model: Any, task: Mapping[str, Any]) -> None:
+    """Asks a world model, or its class; a factory tells nothing before it is called."""
+    if model is not None and hasattr(model, "require"):
+        model.require(task)
+
+
 @dataclass(frozen=True)
 class Ready:
     """A task or an agent that exists in memory. It reaches worker processes by pickling, and no later process."""
@@ -183,9 +187,7 @@ class Ready:
 
     def require(self, task: Mapping[str, Any]) -> None:
         """See `AgentRecipe.require`."""
-        model = getattr(self.thing, "model", None)
-        if model is not None and hasattr(model, "require"):
-            model.require(task)
+        _require(getattr(self.thing, "model", None), task)
 
     def to_json(self) -> None:
         """Nothing: an object in memory cannot be written down."""

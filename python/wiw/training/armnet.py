@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.training.checkpoint import Checkpoint
+from wiw.training.checkpoint import Checkpoint, Kept
 from wiw.training.course import taught, up_and_down
 from wiw.training.plays import POSES, Plays
 from wiw.world_models.armnet.body import plate
@@ -30,8 +30,8 @@ from wiw.world_models.armnet.network import (
     composed,
     imagined_in_sight,
     in_sight,
-    shade,
     sources,
+    still,
 )
 
 HELD_OUT = 150
@@ -103,21 +103,22 @@ def train(
     return lesson.network.eval(), recipe
 
 
-class _Lesson:
+class _Lesson(Kept):
     """A network in training, with all that its next step depends on."""
+
+    parts = ("network", "optimiser")
 
     def __init__(self, plays: Plays, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xA111]) % 2**63)
         self.plays, self.recipe = plays, recipe
         self.network = Network(recipe.widths)
-        self.count = 0
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
     def step(self, rate: float) -> float:
         """Learns from one batch of short ways; its loss."""
-        for group in self._optimiser.param_groups:
+        for group in self.optimiser.param_groups:
             group["lr"] = float(rate)
-        self._optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad(set_to_none=True)
         recipe, total = self.recipe, 0.0
         rng = np.random.default_rng(core.fold_key([recipe.seed, 0xA112, self.count]))
         self.count += 1
@@ -129,22 +130,8 @@ class _Lesson:
             loss.backward()
             total += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self._optimiser.step()
+        self.optimiser.step()
         return total
-
-    def state(self) -> dict[str, Any]:
-        """All that the next step depends on, but for the plays and the recipe."""
-        return {
-            "count": self.count,
-            "network": self.network.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a state."""
-        self.count = state["count"]
-        self.network.load_state_dict(state["network"])
-        self._optimiser.load_state_dict(state["optimiser"])
 
 
 @dataclass(frozen=True)
@@ -234,9 +221,8 @@ def _step(
     plate = bare_table()
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         mixture = network(canvas, arm, before, motion, plate)
-    still = torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, plate, arm.mask)).clamp(0, 1)
     parts = sources(mixture, canvas, arm, motion, plate)
-    return Step(composed(mixture.shares, parts), target, still, mixture.shares, parts)
+    return Step(composed(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
 
 
 def _loss(step: Step, recipe: Recipe) -> Tensor:
@@ -284,7 +270,7 @@ def measured(network: Network, plays: Plays) -> dict[str, Any]:
                 if number not in STEPS:
                     continue
                 arm = batch.arms[number]
-                alone = torch.where(arm.mask > 0.5, arm.color, first * shade(arm.color, plate, arm.mask)).clamp(0, 1)
+                alone = still(first, arm, plate)
                 changed = (step.target - alone).abs().amax(1, keepdim=True) > CHANGED
                 for name, made in (("copy", batch.seen[0]), ("arm", alone), ("armnet", step.made)):
                     gap = made - step.target

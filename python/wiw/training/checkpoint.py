@@ -9,20 +9,29 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 from wiw.errors import ArgumentError, FileError
 from wiw.files import whole_file
 
 
-class Kept(Protocol):
-    """What can be kept of a lesson."""
+class Kept:
+    """A lesson whose next step depends on how many it has done, on what it is taught, and on its `parts` alone."""
+
+    parts: ClassVar[tuple[str, ...]]
+    """Names of attributes with a state: networks, and what optimises them."""
+    count = 0
+    """Steps done."""
 
     def state(self) -> dict[str, Any]:
-        """All that its next step depends on."""
+        """All that the next step depends on, but for what is taught and how."""
+        return {"count": self.count, **{name: getattr(self, name).state_dict() for name in self.parts}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Goes on from a state."""
+        self.count = state["count"]
+        for name in self.parts:
+            getattr(self, name).load_state_dict(state[name])
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised
 from wiw.policies.diffuser.network import Network, Shape
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
 from wiw.policies.diffuser.sight import Lens, Sight
-from wiw.training.checkpoint import Checkpoint
+from wiw.training.checkpoint import Checkpoint, Kept
 from wiw.training.course import taught, up_and_down
 
 if TYPE_CHECKING:
@@ -144,47 +144,33 @@ def train(
     return lesson.average.eval(), recipe
 
 
-class _Lesson:
+class _Lesson(Kept):
     """A network in training, with all that its next step depends on."""
+
+    parts = ("network", "average", "optimiser")
 
     def __init__(self, moments: Moments, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xD1F1]) % 2**63)
-        self.moments, self.recipe, self.count = moments, recipe, 0
+        self.moments, self.recipe = moments, recipe
         shape = Shape(recipe.width, layers=recipe.layers, poses=moments.path.shape[1])
         self.network = Network(shape)
         self.average = deepcopy(self.network)
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
     def step(self, rate: float) -> float:
         """Learns from one batch of moments; its loss."""
-        for group in self._optimiser.param_groups:
+        for group in self.optimiser.param_groups:
             group["lr"] = float(rate)
         key = core.fold_key([self.recipe.seed, 0xD1F2, self.count])
         batch = drawn(self.moments, self.recipe.batch, self.recipe.tilt, np.random.default_rng(key))
         loss = self._loss(batch, torch.Generator().manual_seed(key % 2**63))
-        self._optimiser.zero_grad(set_to_none=True)
+        self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self._optimiser.step()
+        self.optimiser.step()
         self.count += 1
         self._follow(min(self.recipe.average, self.count / (self.count + 9)))
         return float(loss.detach())
-
-    def state(self) -> dict[str, Any]:
-        """All that the next step depends on, but for the moments and the recipe."""
-        return {
-            "count": self.count,
-            "network": self.network.state_dict(),
-            "average": self.average.state_dict(),
-            "optimiser": self._optimiser.state_dict(),
-        }
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a state."""
-        self.count = state["count"]
-        self.network.load_state_dict(state["network"])
-        self.average.load_state_dict(state["average"])
-        self._optimiser.load_state_dict(state["optimiser"])
 
     def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         recipe, network = self.recipe, self.network.train()

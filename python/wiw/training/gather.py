@@ -108,12 +108,12 @@ def gather(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar
     Raises:
         FileError: the folder cannot be written.
     """
-    names = list(sources)
     files = {name: folder / f"{_digest(source, job)}.npz" for name, source in sources.items()}
-    missing = [name for name in names if _read(files[name], job) is None]
+    found = {name: _read(file, job) for name, file in files.items()}
+    missing = [name for name, arrays in found.items() if arrays is None]
     list(bar(_made(missing, files, job, workers), job.name, len(missing)))
-    found = [_read(files[name], job) for name in names]
-    return [arrays for arrays in found if arrays is not None]
+    found |= {name: _read(files[name], job) for name in missing}
+    return [arrays for arrays in found.values() if arrays is not None]
 
 
 def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) -> Iterable[str]:

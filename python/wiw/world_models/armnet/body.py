@@ -40,7 +40,7 @@ def _bare() -> Workbench:
 @cache
 def plate(size: tuple[int, int]) -> Sight:
     """The bare table without an arm, as seen in front."""
-    seen = _bare().picture("front", size, ("color", "depth"), arm=False)
+    seen = _bare().picture("front", size, arm=False)
     seen["color"].setflags(write=False)
     return Sight(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
 

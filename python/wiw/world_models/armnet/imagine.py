@@ -24,8 +24,8 @@ from wiw.world_models.armnet.network import (
     composed,
     imagined_in_sight,
     in_sight,
-    shade,
     sources,
+    still,
 )
 
 
@@ -40,19 +40,19 @@ def imagined(network: Network, image: NDArray[np.uint8], poses: NDArray[np.float
     arms = sights(poses, size)
     here = next(arms)
     with torch.inference_mode():
-        view, first = _image(image), _arm(here)
-        canvas = cleared(view, first, in_sight(view, first), bare, bare)
+        view, before = _image(image), _arm(here)
+        canvas = cleared(view, before, in_sight(view, before), bare, bare)
         for there in arms:
             arm, way = _arm(there), motion(here.pose[None], there.pose[None])
-            seen = torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, bare, arm.mask)).clamp(0, 1)
+            seen = still(canvas, arm, bare)
             inner = Arm(_window(arm.color, scale), _window(arm.mask, scale))
             around, table = _window(canvas, scale), _window(bare, scale)
-            mixture = _mixture(network, around, inner, _window(_arm(here).mask, scale), way, table, scale)
+            mixture = _mixture(network, around, inner, _window(before.mask, scale), way, table, scale)
             _window(seen, scale)[:] = composed(mixture.shares, sources(mixture, around, inner, way, table, scale))
             hidden = arm.mask > 0.5
             _window(hidden, scale)[:] = imagined_in_sight(mixture.shares, inner)
             canvas = cleared(seen, arm, hidden, bare, canvas)
-            here = there
+            here, before = there, arm
             yield (seen[0].permute(1, 2, 0) * 255).round().byte().numpy()
 
 

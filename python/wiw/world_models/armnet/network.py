@@ -71,6 +71,11 @@ def shade(bare: Tensor, plate: Tensor, mask: Tensor) -> Tensor:
     return torch.where(mask > 0.5, torch.ones_like(ratio), ratio)
 
 
+def still(canvas: Tensor, arm: Arm, plate: Tensor) -> Tensor:
+    """The view if nothing but the arm had moved."""
+    return torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, plate, arm.mask)).clamp(0, 1)
+
+
 def in_sight(image: Tensor, arm: Arm) -> Tensor:
     """Where, [B, 1, H, W], a true view shows the arm itself, and no thing before it."""
     return (arm.mask > 0.5) & ((image - arm.color).abs().amax(1, keepdim=True) < ALIKE)
