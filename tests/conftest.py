@@ -55,6 +55,15 @@ def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """Threads that wait for each other spin: on a busy machine two are slower than one."""
+    from wiw.networks import one_thread
+
+    with one_thread():
+        yield
+
+
 @pytest.fixture(scope="session")
 def franka_urdf() -> Path:
     """The maker's description of the Panda with its meshes: `WIW_PANDA_URDF`, or package example-robot-data."""

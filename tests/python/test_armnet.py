@@ -44,17 +44,10 @@ from wiw.world_models.armnet.network import (  # noqa: E402
 )
 from wiw.world_models.armnet.weights import load, save  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SMALL = (8, 8, 8)
 PLAN = np.array([above(0.15, -0.1, 0.2, 1.0), above(0.2, 0.1, 0.1, 0.0, 0.3), above(0.1, 0.15, 0.25, 0.0)])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Any:
-    """Threads that wait for each other spin: on a busy machine two are slower than one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def untrained(seed: int = 0) -> ArmNet:

@@ -39,18 +39,11 @@ from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.diffuser import Moments, Recipe, moments, train  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SMALL = Shape(width=24, heads=2, layers=2)
 LENS = Lens.of(CAMERAS["front"], (480, 480))
 HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Any:
-    """Threads that wait for each other spin: on a busy machine two are slower than one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,9 @@ from wiw.world_models.armnet import ArmNet  # noqa: E402
 from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
 from wiw.world_models.armnet.weights import load  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SMALL = (8, 16, 16)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Any:
-    """Threads that wait for each other spin: on a busy machine two are slower than one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

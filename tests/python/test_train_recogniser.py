@@ -15,6 +15,8 @@ from wiw.errors import ArgumentError
 from wiw.perception.glimpses import SIDE, Glimpses
 from wiw.training.looks import PERFECT, START, WARPED, Looks, halves, merged
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 NAMES = ("bars", "dots", "plain")
@@ -47,15 +49,6 @@ def made_up(sets: int, seed: int) -> Looks:
     kinds = np.tile(KINDS, sets)
     scalars = np.column_stack([np.zeros((count, 4)), kinds == START]).astype(np.float32)
     return Looks(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Any:
-    """Threads that wait for each other spin: on a busy machine two are slower than one."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
