@@ -189,7 +189,7 @@ def test_models_of_grippers_are_asked_about_poses(declared):
 
 
 def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     class Blind(Arm):
         def rollout(self, observations, controls, seeds):
@@ -202,7 +202,7 @@ def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
 
 
 def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     findings = found(spoilt(nearly), two_rooms)
     assert not findings["batch"].serious and "the order in which a GPU adds up" in str(findings["batch"])

@@ -50,12 +50,12 @@ def test_alone_is_what_a_scene_of_that_instance_alone_shows(two_rooms: str) -> N
 
 def test_measuring_visibility_leaves_pictures_as_they_were() -> None:
     place = world("apartments:val/0", "cpu")
-    points = place.ground.put_down(place.navmesh.sample(3, 3)).astype(float)
-    poses = np.stack([visibility.camera_pose(point, 0.4) for point in points])
-    before = place.renderer.panorama(poses, (288, 512))
-    for instance in range(1, len(place.scene.instances) + 1, 4):
+    points = place.ground.put_down(place.navmesh.sample(25, 5)).astype(float)
+    poses = np.stack([visibility.camera_pose(points[k], np.pi / 8 * k) for k in (6, 18)])
+    before = place.renderer.perspective(poses, (480, 480), 90.0)
+    for instance in range(1, len(place.scene.instances) + 1):
         visibility.visible_share(place, points[0], instance)
-    after = place.renderer.panorama(poses, (288, 512))
+    after = place.renderer.perspective(poses, (480, 480), 90.0)
     for output, pixels in before.items():
         np.testing.assert_array_equal(after[output], pixels, output)
 

@@ -13,11 +13,11 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.evaluation.rows import decision_row
 from wiw.loop.agent import Query
 from wiw.loop.attempts import TRIES
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
+from wiw.runs.rows import decision_row
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Answer, DecisionRecord, Goal, Key, Observation, Proposal, Truth
 

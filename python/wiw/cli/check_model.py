@@ -38,7 +38,7 @@ def check_model(
     from rich.console import Console
     from rich.markup import escape
 
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     findings = model_check.check_model(model, scenes, deadline=deadline, **model_options(model, world_model_option))
     console = Console(highlight=False, soft_wrap=True)
