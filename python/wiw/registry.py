@@ -18,7 +18,7 @@ import inspect
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2b
 from importlib.machinery import SourceFileLoader
@@ -41,10 +41,22 @@ class Registry:
     """Name to `module:attribute`. A name that ends with a colon takes what is written after it as first argument."""
     base: str = ""
     """`module:class` that things of this kind derive from, if they have to."""
+    registered: dict[str, Any] = field(default_factory=dict)
+    """What programs have added under names of their own (`register`)."""
 
     def names(self) -> list[str]:
         """All registered names, built-in ones first."""
-        return [*self.built_in, *sorted(set(self._plugins()) - set(self.built_in))]
+        return [*self.built_in, *sorted(({*self._plugins(), *self.registered}) - set(self.built_in))]
+
+    def register(self, name: str, thing: Any) -> None:
+        """Add a class or factory under a name, in this process.
+
+        Raises:
+            RegistryError: the name is taken, or the class is of another kind.
+        """
+        if name in self.names():
+            raise RegistryError(f"the {self.kind} '{name}' is there already; choose another name")
+        self.registered[name] = self._checked(name, thing)
 
     def find(self, name: str) -> Any:
         """The class or factory behind a name or path.
@@ -53,6 +65,8 @@ class Registry:
             RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
                 cause); a class of another kind.
         """
+        if name in self.registered:
+            return self.registered[name]
         if name in self.built_in:
             return self._load(name, partial(_attribute, self.built_in[name]))
         plugins = self._plugins()
@@ -262,6 +276,17 @@ METRICS = Registry(
         "refused": "wiw.metrics.headlines:REFUSED",
     },
     "wiw.metrics.headlines:Headline",
+)
+
+
+PLAN_SPACES = Registry(
+    "plan space",
+    "wiw.plan_spaces",
+    {
+        "discrete": "wiw.loop.primitives:Primitives",
+        "pose7": "wiw.loop.gripper_poses:GripperPoses",
+    },
+    "wiw.loop.plan_space:PlanSpace",
 )
 
 

@@ -14,8 +14,9 @@ from wiw.errors import ArgumentError
 
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
-Space = Literal["discrete", "pose7"]
-"""What plans are made of: primitives, or poses of a gripper (x, y, z, roll, pitch, yaw, gripper)."""
+PRIMITIVES, GRIPPER_POSES = "discrete", "pose7"
+"""What plans can be made of (`wiw.loop.plan_space`): primitives, or poses of a gripper (x, y, z, roll, pitch, yaw,
+gripper)."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +186,8 @@ class Proposal:
 
     def __post_init__(self) -> None:
         actions = np.asarray(self.actions)
-        object.__setattr__(self, "actions", actions.astype(np.float64 if actions.ndim == 2 else np.int8, copy=False))
+        whole = actions.ndim == 1 and actions.dtype.kind in "biu"
+        object.__setattr__(self, "actions", actions.astype(np.int8 if whole else np.float64, copy=False))
 
 
 @dataclass(frozen=True)

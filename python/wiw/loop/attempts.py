@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError, RolloutError
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel, checked_rollout, patience
+from wiw.world_models.base import WorldModel, check_rollout, patience
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
@@ -90,7 +90,7 @@ class Attempts:
             LateError: no answer within the deadline.
             ContractError: the answer breaks the contract; and whatever the model raises.
         """
-        return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
+        return self._ask(lambda: check_rollout(self.model, observations, controls, seeds))
 
     def _count(self, controls: Sequence[Control]) -> None:
         self.tally["calls"] += 1

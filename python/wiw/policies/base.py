@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
+from wiw.errors import ContractError
+from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout
 
 
 @dataclass(frozen=True)
@@ -50,8 +51,8 @@ class Policy(ABC):
     All calls are batched over the live episodes. Randomness must be drawn from `situation.key` alone.
     """
 
-    space: Space = "discrete"
-    """What its plans are made of: "discrete" primitives, or "pose7" poses of a gripper."""
+    space: str = PRIMITIVES
+    """What its plans are made of: a name of `wiw.loop.plan_space`."""
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it."""
     frames: FrameSpec = FrameSpec()
@@ -60,8 +61,9 @@ class Policy(ABC):
     tokens: int = 0
     """Tokens that the policy's language model has read and written so far; 0 without one."""
 
-    def for_space(self, space: Space) -> Policy:
-        """The policy for plans of primitives or of poses, where it can make both. Default: itself."""
+    @property
+    def base(self) -> Policy:
+        """The policy itself, behind everything that wraps it."""
         return self
 
     def begin(self, goal: Goal, key: Key) -> Any:
@@ -97,6 +99,29 @@ class Policy(ABC):
     ) -> list[NDArray[np.float64]]:
         """One score a candidate for each episode, higher is better. One call for all live episodes."""
         raise NotImplementedError(f"{type(self).__name__} only proposes; give the agent a revision policy")
+
+    def score_or_prefer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[NDArray[np.float64]]:
+        """Score the plans of all episodes; where nothing was imagined, the proposer's own preference counts."""
+        scores = [np.array([plan.prior for plan in plans], np.float64) for plans in proposals]
+        shown = [(place, own) for place, own in enumerate(rollouts) if own is not None]
+        if not shown:
+            return scores
+        places = [place for place, _ in shown]
+        found = self.score(
+            [situations[place] for place in places], [proposals[place] for place in places], [own for _, own in shown]
+        )
+        if not isinstance(found, Sequence) or len(found) != len(places):
+            raise ContractError(
+                f"{type(self.base).__name__}.score: expected scores for each of {len(places)} episodes, got {found!r}"
+            )
+        for place, score in zip(places, found, strict=True):
+            scores[place] = score
+        return scores
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]

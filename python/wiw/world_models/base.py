@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.types import Conditioning, Control, ControlKind, Space, View
+from wiw.registry import PLAN_SPACES
+from wiw.types import PRIMITIVES, Conditioning, Control, ControlKind, View
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
@@ -30,7 +31,7 @@ class Accepts:
     """A world model's declaration, read by the loop; made by `wiw.accepts(...)`, which checks it."""
 
     control: ControlKind
-    space: Space
+    space: str
     view: View
     size: tuple[int, int]
     frames: int
@@ -49,7 +50,7 @@ def accepts(
     size: tuple[int, int] | None = None,
     frames: int = 0,
     *,
-    space: Space = "discrete",
+    space: str = PRIMITIVES,
     needs: Sequence[str] = (),
     causal: bool = False,
     best_batch: int = 8,
@@ -66,7 +67,8 @@ def accepts(
         size: (height, width) of its input and output; default 480x480 or 576x1024. A perspective view of any shape is
             90 degrees wide and has square pixels: what a wide one does not reach of an agent's view is black there.
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
-        space: "discrete" primitives or "pose7" poses; an agent says so where it cannot give them.
+        space: what the actions are that it follows, a name of `wiw.loop.plan_space`: "discrete" primitives, or "pose7"
+            poses of a gripper. An agent that plans in others refuses the model.
         needs: any of "depth", "semantic", "history", likewise; "simulator" is for `oracle` alone.
         causal: frame k depends on controls 1..k only, so shared prefixes are imagined once.
         best_batch: rows per call at which the model is most efficient.
@@ -82,7 +84,7 @@ def accepts(
     size = size or ((480, 480) if view == "perspective" else (576, 1024))
     _check("control", control, CONTROLS)
     _check("view", view, ("perspective", "panorama"))
-    _check("space", space, ("discrete", "pose7"))
+    _check("space", space, PLAN_SPACES.names())
     for need in needs:
         _check("needs", need, NEEDS)
     if len(size) != 2 or min(size) < 1:
@@ -176,9 +178,15 @@ class WorldModel(ABC):
         """
         raise NotImplementedError
 
-    def for_space(self, space: Space) -> WorldModel:
-        """The model for plans of primitives or of poses, where it is asked with both. Default: itself."""
+    @property
+    def base(self) -> WorldModel:
+        """The model itself, behind everything that wraps it."""
         return self
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What the model has used up so far, for the cost ledger (`Decision.spent`)."""
+        return {}
 
     @classmethod  # noqa: B027 - most models have nothing to say
     def require(cls, task: Mapping[str, Any]) -> None:
@@ -243,10 +251,10 @@ def _is_plain(value: Any) -> bool:
     return value is None or type(value) in (bool, int, float, str) or isinstance(value, Path)
 
 
-def checked_rollout(
+def check_rollout(
     model: WorldModel, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
 ) -> NDArray[np.uint8]:
-    """`model.rollout` with its answer held to the contract.
+    """Ask a model and hold its answer to the contract.
 
     Raises:
         ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected.
@@ -256,7 +264,7 @@ def checked_rollout(
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         kind, came = _breach(frames, expected)
         raise ContractError(
-            f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
+            f"{type(model.base).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
             f"width, 3), got {came}",
             kind,
         )
