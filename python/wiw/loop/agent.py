@@ -27,6 +27,7 @@ from wiw.loop.contract import (
     checked_scores,
 )
 from wiw.loop.fidelity import remembered, replay
+from wiw.loop.history import EpisodeHistories, Frame
 from wiw.loop.imagine import Imagination, model_spec
 from wiw.loop.imagine_poses import IMAGINE, PoseImagination
 from wiw.loop.labels import SIMULATOR, labelled, semantics_source
@@ -58,6 +59,9 @@ class Query:
     """What plans are truly worth; only looked at by an agent with swaps."""
     semantic: NDArray[np.uint32] | None = None
     """uint32 [H, W]: what the panorama's pixels truly are; only looked at by an agent with semantics="simulator"."""
+    history: tuple[Frame, ...] | None = None
+    """The episode's latest observations with this one, set by an agent whose world model needs them; None stands for
+    an episode's first moment."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +202,7 @@ class Agent:
             if self.depth > 1:
                 self._check_depth(self.model)
         self._lives: dict[tuple[int, int], _Life] = {}
+        self._histories = EpisodeHistories(None if self.model is None else self.model.accepts)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -228,6 +233,8 @@ class Agent:
         """One decision for each live episode; model and reviser see all candidates of all of them at once."""
         clock, meter = Clock(), self.meter()
         proposing, revising = self._situations(queries)
+        with clock("platform"):
+            queries = self._histories.add(queries, [situation.executed for situation in proposing])
         with clock("propose"):
             self.policy.observe(proposing)
             if self.revision is not self.policy:
@@ -251,6 +258,7 @@ class Agent:
     def forget(self, key: Key) -> None:
         """Drops the memory of an episode that has ended."""
         self._lives.pop((key.seed, key.episode), None)
+        self._histories.forget(key)
 
     def but(self, **changes: Any) -> Agent:
         """The same agent with other parts or numbers, e.g. `agent.but(model="oracle")`; what is open stays open."""

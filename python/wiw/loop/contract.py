@@ -17,7 +17,7 @@ from wiw.world_models.base import Accepts, WorldModel
 from wiw.world_models.oracle import Oracle
 
 PRIMITIVES = frozenset(map(int, (FORWARD, TURN_LEFT, TURN_RIGHT, STOP)))
-GIVEN = ("depth", "simulator")
+GIVEN = ("depth", "history", "simulator")
 """What the loop can give a world model beyond the image; semantics too where the agent has a source of them."""
 PLANS = {"discrete": "discrete primitives", "pose7": "poses of a gripper"}
 """By space, in words."""
@@ -52,9 +52,10 @@ def check_model(model: WorldModel, longest: int, space: Space = "discrete", sema
             f"{name} needs the simulator, which is handed to the oracle alone: it knows where the agent truly is. "
             "Declare what the model sees of the world instead (needs=('depth',)), or derive it from wiw's Oracle"
         )
-    if space == "discrete" and accepts.needs and accepts.frames and longest > accepts.frames - 1:
+    lacking = [need for need in accepts.needs if need != "history"]  # imagined frames make a history
+    if space == "discrete" and lacking and accepts.frames and longest > accepts.frames - 1:
         raise ArgumentError(
-            f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(accepts.needs)}, which an "
+            f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(lacking)}, which an "
             f"imagined frame does not have, but plans have up to {longest}; lower horizon or depth, or raise frames"
         )
 

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,9 @@ from wiw import action, panorama
 from wiw._core import core, planner
 from wiw.errors import ArgumentError, ContractError
 from wiw.loop.clock import Clock
+from wiw.loop.history import RowHistories
 from wiw.loop.rollout_cache import Asking
+from wiw.loop.views import maker_of, view_maker
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Key, Proposal, Rollout, View
 from wiw.world_models.base import Accepts
@@ -46,7 +47,7 @@ class Imagination:
         panoramas = np.stack([query.observation.panorama for query in self.queries])
         sizes = panoramas.shape[1:3], self.queries[0].observation.front.shape[:2]
         whole, front = (
-            self.batch.ends(candidates, panoramas, self.answers, _maker(view, size))
+            self.batch.ends(candidates, panoramas, self.answers, view_maker(view, size))
             for view, size in zip(("panorama", "front"), sizes, strict=True)
         )
         return whole, front
@@ -70,12 +71,19 @@ def imagine(
     with clock("platform"):
         batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], model_spec(accepts))
         panoramas = np.stack([query.observation.panorama for query in queries])
-        conditioning = _conditioning(accepts, batch, queries if seen is None else seen)
+        parts, shown = batch.parts, queries if seen is None else seen
+        conditioning = _conditioning(accepts, batch, shown)
+        histories = None
+        if accepts.history:
+            plans = [p.actions for plans in proposals for p in plans]
+            histories = RowHistories(accepts, batch, parts, plans, shown, conditioning.image)
         seeds = _seeds(batch, queries, origins)
     answers: list[NDArray[np.uint8]] = []
-    for part in batch.parts:
+    for part in parts:
         with clock("platform"):
             observations = _at_start(conditioning, part, answers, accepts)
+            if histories is not None:
+                observations = replace(observations, history=histories.before(part, answers))
             controls = _controls(accepts, part)
         with clock("world_model"):
             before = ask.cache_seconds
@@ -93,7 +101,7 @@ def _shown(
     """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
-    shown = batch.views(panoramas, answers, _maker(view, size), kind)
+    shown = batch.views(panoramas, answers, view_maker(view, size), kind)
     real, lengths = batch.real, batch.lengths
     rollouts: list[list[Rollout]] = [[] for _ in panoramas]
     for i, episode in enumerate(batch.candidate_episode):
@@ -106,14 +114,9 @@ def model_spec(accepts: Accepts) -> Any:
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
 
 
-@cache
-def _maker(view: str, size: tuple[int, int]) -> Any:
-    return planner.ViewMaker(view, size)
-
-
 def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> Conditioning:
     """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
-    maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
+    maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
         depth = batch.depths(depths_of(queries), maker)
@@ -135,7 +138,7 @@ def _labels(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> NDArray[np.
         )
     labels = np.stack([query.semantic for query in queries])
     if accepts.view == "panorama":  # small numbers survive as floats, and distances are turned by the nearest pixel
-        turned = batch.depths(labels.astype(np.float32), _maker("panorama", accepts.size))
+        turned = batch.depths(labels.astype(np.float32), view_maker("panorama", accepts.size))
         return np.asarray(turned, np.uint32)
     rows = zip(batch.row_episode, np.degrees(action.ActionSpace().turn_rad) * batch.row_turns, strict=True)
     return np.stack([panorama.to_perspective(labels[e], 90.0, accepts.size, yaw, 0.0, "nearest") for e, yaw in rows])
@@ -159,7 +162,7 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         semantic = None if whole.semantic is None else whole.semantic[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
         return Conditioning(whole.image[rows], depth=depth, semantic=semantic, simulators=simulators)
-    assert not accepts.needs  # check_model: an imagined frame has neither depth nor labels nor a simulator
+    assert not set(accepts.needs) - {"history"}  # check_model: imagined frames have no depth, labels or simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 

@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 from wiw import action
 from wiw.errors import ArgumentError
 from wiw.loop.clock import Clock
+from wiw.loop.history import frames_of, stack_histories
 from wiw.loop.imagine import Imagination, depths_of, imagine, seed_of
 from wiw.loop.rollout_cache import Asking
+from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout, Space, View
 from wiw.world_models.base import Accepts
@@ -138,17 +140,16 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
 def _conditioning(accepts: Accepts, queries: Sequence[Any]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = np.stack([_resized(value, accepts.size, cv2.INTER_NEAREST) for value in depths_of(queries)])
+        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in depths_of(queries)])
     if "simulator" in accepts.needs:
         simulators = [query.simulator for query in queries]
         if any(value is None for value in simulators):
             raise ArgumentError("the world model needs the simulator: pass decide(..., simulator=env.fork())")
-    image = np.stack([_resized(query.observation.front, accepts.size) for query in queries])
-    return Conditioning(image, depth=depth, simulators=simulators)
-
-
-def _resized(image: NDArray[Any], size: tuple[int, int], how: int = cv2.INTER_AREA) -> NDArray[Any]:
-    return image if image.shape[:2] == size else np.asarray(cv2.resize(image, size[::-1], interpolation=how))
+    image = np.stack([resize(query.observation.front, accepts.size) for query in queries])
+    history = None
+    if accepts.history:
+        history = stack_histories([frames_of(accepts, query) for query in queries], accepts.history)
+    return Conditioning(image, depth=depth, history=history, simulators=simulators)
 
 
 def _frames_of(row: _Row) -> NDArray[np.int64]:
@@ -157,7 +158,7 @@ def _frames_of(row: _Row) -> NDArray[np.int64]:
 
 
 def _rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
-    shown = np.stack([_resized(frame, size) for frame in frames])
+    shown = np.stack([resize(frame, size) for frame in frames])
     return Rollout(shown, np.zeros(len(frames), np.bool_), "front")
 
 

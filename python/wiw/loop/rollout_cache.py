@@ -222,8 +222,10 @@ def remember(ask: Attempts, cache: str | Path, budget_gb: float = BUDGET_GB) -> 
 def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:
     digest = blake2b(identity, digest_size=20)
     parts: list[Any] = [observations.image[row], control.actions, control.trajectory, control.viewpoints, seeds[row]]
-    optional = (observations.depth, observations.semantic, observations.history)
-    parts += [values[row] for values in optional if values is not None]
+    parts += [values[row] for values in (observations.depth, observations.semantic) if values is not None]
+    if observations.history is not None:
+        past = observations.history.rows([row])  # without the padding that the rest of the batch brings about
+        parts += [past.images, past.poses, past.actions, past.lengths, past.count]
     if control.ids is not None:
         parts.append(control.ids)
     for part in parts:
@@ -241,5 +243,5 @@ def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
     index = list(rows)
     depth = None if whole.depth is None else whole.depth[index]
     semantic = None if whole.semantic is None else whole.semantic[index]
-    history = None if whole.history is None else [whole.history[row] for row in index]
+    history = None if whole.history is None else whole.history.rows(index)
     return Conditioning(whole.image[index], depth=depth, semantic=semantic, history=history)
