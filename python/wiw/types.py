@@ -241,7 +241,7 @@ class History:
 
     @property
     def valid(self) -> NDArray[np.bool_]:
-        """bool [B, N]: False where a frame is padding."""
+        """Whether each frame is none of the padding, bool [B, N]."""
         most = self.images.shape[1]
         return np.arange(most) >= most - self.count[:, None]
 

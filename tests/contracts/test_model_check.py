@@ -143,7 +143,7 @@ BROKEN = {
     "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
     "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
     "inputs, history": (forgetting, PAST, r"It changes what it is given: observations\.history\.images"),
-    "batch, history": (counting_padding, PAST, "alone, 1 of 3 rows differ"),
+    "batch, history": (counting_padding, PAST, "alone, 1 of 2 rows differ"),
     "raised, young": (needing_a_past, PAST, "IndexError"),
     "memory": (reusing(), {}, "An answer lies in the memory of the one before"),
     "needs": (dark, {"needs": ("simulator",)}, "needs the simulator, which is handed to the oracle alone"),
@@ -156,7 +156,8 @@ def recalling(frames, observations, controls, seeds):
     history = observations.history
     for row, valid in enumerate(history.valid):
         assert (history.images[row, -1] == observations.image[row]).all()
-        frames[row, 1:] += np.uint8(40 * np.abs(history.poses[row, valid]).sum() + history.images[row, valid, 0, 0].sum())
+        shade = 40 * np.abs(history.poses[row, valid]).sum() + history.images[row, valid, 0, 0].sum()
+        frames[row, 1:] += np.uint8(int(shade) % 256)
 
 
 def found(model, scene, **options):
@@ -170,7 +171,7 @@ def test_each_breach_is_found_and_told(name, two_rooms):
     kind = name.partition(",")[0]
     assert findings[kind].serious, findings
     assert re.search(text, str(findings[kind])), str(findings[kind])
-    assert set(findings) <= {kind, "frame 0"}
+    assert set(findings) - {kind, "frame 0"} <= ({"history"} if declared is PAST else set())
 
 
 @pytest.mark.parametrize(
@@ -220,7 +221,9 @@ class Foreseeing(Arm):
         return poses[-1, :3] @ (1, 2, 1)
 
 
-@pytest.mark.parametrize("declared", [{}, {"frames": 5}, {"frames": 14}, {"best_batch": 1}, {"needs": ("depth",)}, PAST])
+@pytest.mark.parametrize(
+    "declared", [{}, {"frames": 5}, {"frames": 14}, {"best_batch": 1}, {"needs": ("depth",)}, PAST]
+)
 def test_models_of_grippers_are_asked_about_poses(declared):
     class Asked(Arm):
         accepts = wiw.accepts(**{**GRIPPER, "causal": True, **declared})

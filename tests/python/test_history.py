@@ -8,25 +8,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from history_models import Recalling, digest
 
 import wiw
-from history_models import Recalling, digest
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
 from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 from wiw.loop.agent import Query
 from wiw.loop.attempts import Attempts
 from wiw.loop.beam import moved
+from wiw.loop.clock import Clock
 from wiw.loop.history import EpisodeHistories, Frame, relative_poses, stack_histories
 from wiw.loop.imagine import imagine
-from wiw.loop.clock import Clock
-from wiw.loop.rollout_cache import RolloutCache, Remembered
+from wiw.loop.rollout_cache import Remembered, RolloutCache
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
 from wiw.serving.background import served
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import ArmObservation, Goal, History, Key, Observation, Proposal
-from wiw.world_models.remote import Remote
 
 SIZE = (24, 32)
 DECLARED = {
@@ -122,7 +121,7 @@ def test_a_row_sees_the_episodes_latest_observations_with_what_lies_between(task
 
 def compose(odometry, pose):
     cos, sin = np.cos(odometry[2]), np.sin(odometry[2])
-    return odometry[:2] + (cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1])
+    return odometry[:2] + np.array([cos * pose[0] - sin * pose[1], sin * pose[0] + cos * pose[1]])
 
 
 def test_after_leading_turns_the_present_observation_is_the_frame_before(task: ImageNav) -> None:
@@ -337,7 +336,8 @@ def test_frames_that_plans_share_are_found_where_they_were_made() -> None:
     straight, curved = [FORWARD] * 6, [FORWARD, FORWARD, FORWARD, TURN_LEFT, FORWARD, FORWARD]
     late = [*[FORWARD] * 5, TURN_LEFT]
     calls = imagined(Chunked(frames=5, history=4, causal=True), [straight, curved, late])
-    assert [[(c.length, c.shared) for c in controls] for _, controls in calls] == [[(4, 0), (4, 3)], [(2, 0), (2, 0), (2, 1)]]
+    shared = [[(control.length, control.shared) for control in controls] for _, controls in calls]
+    assert shared == [[(4, 0), (4, 3)], [(2, 0), (2, 0), (2, 1)]]
     history = calls[1][0].history
     assert [shades(history, row) for row in range(3)] == [[16, 32, 48, 64], [16, 32, 48, 80], [16, 32, 48, 64]]
     np.testing.assert_array_equal(history.images[:, -1], calls[1][0].image)
@@ -411,7 +411,7 @@ def test_rows_and_batches_are_the_same_history() -> None:
 def test_the_cache_tells_histories_apart_but_not_batches(tmp_path: Path) -> None:
     past = [grey(3, 0.0), grey(4, 0.2, FORWARD), grey(5, 0.4, FORWARD)]
     long = [grey(3, 0.0), grey(4, 0.2, *[FORWARD] * 5)]
-    (observations, controls), = imagined(Chunked(frames=0), [[FORWARD]])
+    ((observations, controls),) = imagined(Chunked(frames=0), [[FORWARD]])
     others = {
         "images": [grey(9, 0.0), *past[1:]],
         "poses": [grey(3, 0.1), *past[1:]],
@@ -438,7 +438,8 @@ def test_the_cache_tells_histories_apart_but_not_batches(tmp_path: Path) -> None
 
 
 def test_gripper_poses_are_absolute_and_their_actions_poses() -> None:
-    histories = EpisodeHistories(wiw.accepts("action", "perspective", SIZE, space="pose7", needs=("history",), history=3))
+    declared = {"space": "pose7", "needs": ("history",), "history": 3}
+    histories = EpisodeHistories(wiw.accepts("action", "perspective", SIZE, **declared))
     poses = np.array([[0.1, 0, 1, 0, 0, 0, 1], [0.2, 0, 1, 0, 0, 0, 1], [0.3, 0, 1, 0, 0, 0, 0]])
     carried, query = [poses[:1].repeat(2, 0), poses[1:2]], None
     executed = []

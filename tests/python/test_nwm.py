@@ -281,7 +281,7 @@ def test_the_loop_hands_it_what_was_seen(model: NWM, monkeypatch: pytest.MonkeyP
     """Each decision's context is the latest front views, oldest first."""
     assert model.accepts.needs == ("history",) and model.accepts.history == 4
     contexts, latents = [], model._first_context
-    monkeypatch.setattr(model, "_first_context", lambda given: contexts.append(latents(given)) or contexts[-1])
+    monkeypatch.setattr(model, "_first_context", lambda given: contexts.append(latents(given)) or contexts[-1].clone())
 
     class Ahead(wiw.Policy):
         def propose(self, situations, candidates, horizon):

@@ -237,7 +237,7 @@ class _Check:
         if self.accepts.history > 1 and not _off(young, frames, 0, steps).any():
             yield Finding(
                 "history",
-                "What was observed before makes no difference: the frames are the same as at an episode's first moment. "
+                "What was observed before makes no difference: at an episode's first moment its frames are the same. "
                 "Does `rollout` read `observations.history`? If it needs none, leave it out of `needs`.",
                 serious=False,
             )

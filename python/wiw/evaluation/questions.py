@@ -60,7 +60,7 @@ class Questions:
         self._model, self._attempts = model, Attempts(model, deadline)
         self._space = model.accepts.space
         queries = _at_tables() if self._space == "pose7" else _in_scenes(scenes)
-        self._queries = [_lived_through(model.accepts, *each) for each in queries]
+        self._queries = [_later_moment(model.accepts, *each) for each in queries]
         self.row_seconds = 0.0
         """What a row took in the last call."""
         self.changed: set[str] = set()
@@ -163,25 +163,21 @@ def _at_tables() -> list[tuple[Any, Any, Key]]:
     return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
 
 
-def _lived_through(accepts: Accepts, env: Any, observation: Any, key: Key) -> Query:
+def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> Query:
     """Return an episode's first moment; of a model with a memory, a moment some decisions later.
 
-    One episode is older than the other, and its segments are longer, so that histories differ in padding.
+    One episode is older than the other, and its segments are shorter, so that histories differ in padding.
     """
-    histories, executed, decision = EpisodeHistories(accepts), list[Any](), 0
-    while True:
-        now = key.at(decision)
-        query = Query(observation, env.goal, now, env.fork(), semantic=_semantic(accepts, env))
-        (query,) = histories.add([query], [executed])
-        if not accepts.history or decision > key.episode:
-            return query
-        plan = _segment(accepts.space, observation, 2 + key.episode)
-        observation, decision = env.run(plan).observation, decision + 1
+    histories, executed = EpisodeHistories(accepts), list[Any]()
+    decisions = 1 + key.episode if accepts.history else 0
+    for decision in range(decisions):
+        histories.add([Query(observation, env.goal, key.at(decision))], [executed])
+        plan = _segment(accepts.space, observation, 3 - key.episode)
+        observation = env.run(plan).observation
         executed += plan.tolist()
-
-
-def _semantic(accepts: Accepts, env: Any) -> Any:
-    return env.semantic() if accepts.space == "discrete" else None
+    semantic = env.semantic() if accepts.space == "discrete" else None
+    query = Query(observation, env.goal, key.at(decisions), env.fork(), semantic=semantic)
+    return histories.add([query], [executed])[0]
 
 
 def _segment(space: Space, observation: Any, length: int) -> NDArray[Any]:

@@ -167,7 +167,7 @@ def _turn(frames: Sequence[Frame], turns: int, image: NDArray[np.uint8]) -> Sequ
     """Add the view after leading turns, positive to the left."""
     if turns == 0:
         return frames
-    pose = frames[-1].pose + (0, 0, turns * ActionSpace().turn_rad)
+    pose = frames[-1].pose + np.array([0, 0, turns * ActionSpace().turn_rad])
     actions = np.full(abs(turns), int(TURN_LEFT if turns > 0 else TURN_RIGHT), np.int8)
     return [*frames, Frame(image, pose, actions)]
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which frames of a history make NWM's context.
 
-The network was trained on context frames one step apart, as far as its own predictions are, which become context in turn.
-An agent observes once per decision, after a varying number of actions; an action is one step. So for each step back the
-frame is taken that was seen nearest to it.
+The network was trained on context frames one step apart, and so are its own predictions, which become context in turn.
+An action is one step, but an agent observes once per decision, after a varying number of actions. So for each step back
+the frame is taken that was observed nearest to it.
 """
 
 from __future__ import annotations
