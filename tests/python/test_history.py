@@ -243,6 +243,26 @@ def test_an_episode_that_begins_again_remembers_nothing(task: ImageNav) -> None:
         assert again == {name: clean[name] for name in again}
 
 
+def test_an_episode_that_is_run_again_after_an_error_remembers_nothing(task: ImageNav, monkeypatch) -> None:
+    monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
+
+    class Small(Recalling):
+        """Has no memory for two rows with a past, so that episodes are run again by themselves."""
+
+        refused = 0
+
+        def rollout(self, observations, controls, seeds):
+            if len(controls) > 1 and observations.history.count.max() > 1:
+                type(self).refused += 1
+                raise MemoryError
+            return super().rollout(observations, controls, seeds)
+
+    def found(model, live):
+        return run(task, wiw.Agent(Brightest(), model, candidates=1, horizon=4), live=live)
+
+    assert found(Small(), 3) == found(Recalling(), 1) and Small.refused == 3
+
+
 def test_a_decision_that_is_asked_for_again_is_no_other_moment(task: ImageNav) -> None:
     model = Watching()
     agent = wiw.Agent(Walking(), model, candidates=1, horizon=4, execute=2)

@@ -2,9 +2,10 @@
 """Rollouts on disk, so that the same question is put to a world model once.
 
 An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: code, options, weights,
-precision), the observation's bytes, the control and the seed. It holds the frames of one row, raw: a panorama is read
-in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under their names whole, so
-any number of processes may share a folder. When it outgrows its budget, what was not used for longest goes first.
+precision), the bytes of the observation and its history, the control and the seed. It holds the frames of one row, raw:
+a panorama is read in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under
+their names whole, so any number of processes may share a folder. When it outgrows its budget, what was not used for
+longest goes first.
 """
 
 from __future__ import annotations

@@ -141,8 +141,8 @@ def _history(name: str, value: Any) -> History:
         raise RemoteError(f"{name}: expected finite poses", "message")
     if not 1 <= count <= most:
         raise RemoteError(f"{name}.count: expected 1 to {most} frames, got {count}", "message")
-    arrays = [np.array(array)[None] for array in (images, poses, actions, lengths)]
-    return History(*arrays, np.array([count], np.int64))
+    one = np.array([count], np.int64)
+    return History(images[None], poses[None], actions[None], lengths[None], one)  # views; `stack` copies them
 
 
 def _past_actions(name: str, value: Any) -> NDArray[Any]:
