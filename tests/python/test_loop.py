@@ -252,7 +252,6 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
         return type("Odd", (Stamp,), {"accepts": wiw.accepts(**{"control": "trajectory", **declared})})()
 
     for declared, said in [
-        ({"needs": ("history",)}, "needs history"),
         ({"needs": ("depth", "semantic")}, "needs semantic"),
         ({"needs": ("simulator",)}, "oracle alone"),
         ({"space": "pose7"}, "discrete primitives"),

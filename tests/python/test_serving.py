@@ -34,7 +34,7 @@ from wiw.serving.background import served
 from wiw.serving.known import Known
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, History
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
@@ -51,7 +51,20 @@ def seen(batch, needs=(), start=0):
         image,
         depth=np.broadcast_to(shades, (batch, *SIZE)).astype(np.float32) if "depth" in needs else None,
         semantic=np.broadcast_to(shades, (batch, *SIZE)).astype(np.uint32) if "semantic" in needs else None,
-        history=[image[:1].repeat(place + 1, 0) for place in range(batch)] if "history" in needs else None,
+        history=past(image) if "history" in needs else None,
+    )
+
+
+def past(image, most=3):
+    """A history that ends with the image, of one row more of the shade before than of the next."""
+    batch = len(image)
+    places = np.arange(batch)
+    return History(
+        np.stack([image - 1, image, image], 1)[:, :most],
+        np.repeat(places[:, None, None], 3, 1) * np.ones(3),
+        np.broadcast_to(np.arange(4, dtype=np.int8), (batch, 2, 4)) * (np.arange(4) < places[:, None, None] % 4 + 1),
+        np.repeat(places[:, None] % 4 + 1, 2, 1),
+        1 + places % 3,
     )
 
 
@@ -69,7 +82,7 @@ def plans(batch, count=5, length=None, shared=0):
 class Mixing(wiw.WorldModel):
     """Its frames are a function of all that a row is given; notes the batches that it is asked for."""
 
-    accepts = wiw.accepts("trajectory", size=SIZE, best_batch=8, needs=("depth", "semantic", "history"))
+    accepts = wiw.accepts("trajectory", size=SIZE, best_batch=8, needs=("depth", "semantic", "history"), history=3)
 
     def __init__(self, seconds=0.0):
         self.seconds, self.batches, self.gate = seconds, [], None
@@ -86,7 +99,10 @@ class Mixing(wiw.WorldModel):
                 seeds[row] % np.uint64(251),
                 observations.depth[row].sum(),
                 observations.semantic[row].sum(),
-                observations.history[row].sum(),
+                observations.history.images[row].sum(),
+                5 * observations.history.poses[row].sum(),
+                7 * (observations.history.actions[row] * np.arange(1, 3)[:, None]).sum(),
+                11 * observations.history.lengths[row].sum() + 13 * observations.history.count[row],
                 control.trajectory.sum() * 3,
             ]
             frames[row, 1:] += np.uint8(int(sum(map(int, facts))) % 256)
@@ -429,8 +445,10 @@ def test_a_client_that_was_closed_says_so_at_once():
 def test_a_row_that_is_too_large_is_told_of_at_once():
     with remote(Mixing()) as (client, _):
         observations = seen(1, ("depth", "semantic"))
-        observations = replace(observations, history=[np.zeros((3000, *SIZE, 3), np.uint8)])
-        with pytest.raises(RemoteError, match="a history may have 64 frames") as caught:
+        history = seen(1, ("history",)).history
+        history = replace(history, images=np.zeros((1, 3000, *SIZE, 3), np.uint8))
+        observations = replace(observations, history=history)
+        with pytest.raises(RemoteError, match="or a shorter history if it needs one") as caught:
             client.rollout(observations, plans(1), np.zeros(1, np.uint64))
         assert caught.value.kind == "row"
 

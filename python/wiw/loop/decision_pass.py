@@ -60,6 +60,11 @@ class DecisionPass:
         self._parts, self._queries = parts, queries
         self._ledger = Ledger(parts.count_spent, len(queries))
         self._proposing, self._revising = parts.memories.recall(queries, parts.imaginer)
+        with self._ledger.clock("platform"):
+            histories = parts.memories.histories.add(self._proposing)
+            self._inputs = [
+                ModelInput(query.observation, history=own) for query, own in zip(queries, histories, strict=True)
+            ]
 
     def propose(self) -> Search:
         """Let the policy propose plans."""
@@ -82,19 +87,17 @@ class DecisionPass:
         """Let the world model imagine every plan of every episode."""
         if self._parts.imaginer.model is None:
             return NothingImagined(len(self._queries))
-        observations = [query.observation for query in self._queries]
-        futures = self._parts.imaginer.imagine(
-            Request(
-                self._parts.space,
-                [query.key for query in self._queries],
-                observations,
-                [ModelInput(observation) for observation in observations],
-                search.plans,
-                search.origins,
-                self._parts.reviser.frames,
-                self._ledger.clock,
-            )
+        request = Request(
+            self._parts.space,
+            [query.key for query in self._queries],
+            [query.observation for query in self._queries],
+            self._inputs,
+            search.plans,
+            search.origins,
+            self._parts.reviser.frames,
+            self._ledger.clock,
         )
+        futures = self._parts.imaginer.imagine(request)
         search.add_costs(futures.costs)
         return futures
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.clock import Clock
+from wiw.loop.history import Frame
 from wiw.policies.base import FrameSpec
 from wiw.types import Key, Proposal, Rollout
 from wiw.world_models.base import Accepts, WorldModel
@@ -31,6 +32,8 @@ class ModelInput:
     """Fork of the environment, for the oracle alone."""
     semantic: NDArray[np.uint32] | None = None
     """uint32 [H, W]: category of each pixel of the panorama, for models that need it."""
+    history: tuple[Frame, ...] | None = None
+    """The episode's latest observations with this one, for models that need them; None stands for its first moment."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,9 @@ from numpy.typing import NDArray
 from wiw import action, panorama
 from wiw._core import core, planner
 from wiw.errors import ArgumentError, ContractError
+from wiw.loop.history import RowHistories
 from wiw.loop.imagination import Imagination, ModelInput, Request
+from wiw.loop.views import maker_of, view_maker
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel, check_rollout
@@ -47,7 +48,7 @@ class ImaginedPrimitives(Imagination):
         panoramas = np.stack([observation.panorama for observation in self.observations])
         sizes = panoramas.shape[1:3], self.observations[0].front.shape[:2]
         whole, front = (
-            self.batch.ends(candidates, panoramas, self.answers, _maker(view, size))
+            self.batch.ends(candidates, panoramas, self.answers, viewview_maker(view, size))
             for view, size in zip(("panorama", "front"), sizes, strict=True)
         )
         return whole, front
@@ -60,12 +61,18 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
         plans = [[plan.actions for plan in own] for own in request.plans]
         batch = planner.Batch.build(plans, make_model_spec(accepts))
         panoramas = np.stack([observation.panorama for observation in request.observations])
-        conditioning = _conditioning(accepts, batch, request.inputs)
+        parts, conditioning = batch.parts, _conditioning(accepts, batch, request.inputs)
+        histories = None
+        if accepts.history:
+            flat = [actions for own in plans for actions in own]
+            histories = RowHistories(accepts, batch, parts, flat, request.inputs, conditioning.image)
         seeds = _seeds(batch, request.keys, request.origins)
     answers: list[NDArray[np.uint8]] = []
-    for part in batch.parts:
+    for part in parts:
         with clock("platform"):
             observations = _at_start(conditioning, part, answers, accepts)
+            if histories is not None:
+                observations = replace(observations, history=histories.before(part, answers))
             controls = _controls(accepts, part)
         with clock("world_model"):
             found = check_rollout(model, observations, controls, seeds[part.rows])
@@ -82,7 +89,7 @@ def _show(
     """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
-    shown = batch.views(panoramas, answers, _maker(view, size), kind)
+    shown = batch.views(panoramas, answers, viewview_maker(view, size), kind)
     real, lengths = batch.real, batch.lengths
     rollouts: list[list[Rollout]] = [[] for _ in panoramas]
     for i, episode in enumerate(batch.candidate_episode):
@@ -95,14 +102,9 @@ def make_model_spec(accepts: Accepts) -> Any:
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
 
 
-@cache
-def _maker(view: str, size: tuple[int, int]) -> Any:
-    return planner.ViewMaker(view, size)
-
-
 def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:
     """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
-    maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
+    maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
         depth = batch.depths(stack_depths(inputs), maker)
@@ -123,7 +125,7 @@ def _labels(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArr
     """
     labels = np.stack([_require_labels(own) for own in inputs])
     if accepts.view == "panorama":  # small numbers survive as floats, and distances are turned by the nearest pixel
-        turned = batch.depths(labels.astype(np.float32), _maker("panorama", accepts.size))
+        turned = batch.depths(labels.astype(np.float32), view_maker("panorama", accepts.size))
         return np.asarray(turned, np.uint32)
     rows = zip(batch.row_episode, np.degrees(action.ActionSpace().turn_rad) * batch.row_turns, strict=True)
     return np.stack([panorama.to_perspective(labels[e], 90.0, accepts.size, yaw, 0.0, "nearest") for e, yaw in rows])
@@ -154,7 +156,7 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         semantic = None if whole.semantic is None else whole.semantic[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
         return Conditioning(whole.image[rows], depth=depth, semantic=semantic, simulators=simulators)
-    assert not accepts.needs  # check_model: an imagined frame has neither depth nor labels nor a simulator
+    assert not set(accepts.needs) - {"history"}  # check_model: imagined frames have no depth, labels or simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 

@@ -18,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import action
+from wiw.loop.history import frames_of, stack_histories
 from wiw.loop.imagination import Imagination, ModelInput, Request
 from wiw.loop.imagine import seed_of, stack_depths
+from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel, check_rollout
@@ -116,15 +118,14 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
 def _conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = np.stack([_resize(value, accepts.size, cv2.INTER_NEAREST) for value in stack_depths(inputs)])
+        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in stack_depths(inputs)])
     if "simulator" in accepts.needs:
         simulators = [own.simulator for own in inputs]
-    image = np.stack([_resize(own.observation.front, accepts.size) for own in inputs])
-    return Conditioning(image, depth=depth, simulators=simulators)
-
-
-def _resize(image: NDArray[Any], size: tuple[int, int], how: int = cv2.INTER_AREA) -> NDArray[Any]:
-    return image if image.shape[:2] == size else np.asarray(cv2.resize(image, size[::-1], interpolation=how))
+    image = np.stack([resize(own.observation.front, accepts.size) for own in inputs])
+    history = None
+    if accepts.history:
+        history = stack_histories([frames_of(accepts, own) for own in inputs], accepts.history)
+    return Conditioning(image, depth=depth, history=history, simulators=simulators)
 
 
 def _frames_of(row: _Row) -> NDArray[np.int64]:
@@ -133,7 +134,7 @@ def _frames_of(row: _Row) -> NDArray[np.int64]:
 
 
 def _rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
-    shown = np.stack([_resize(frame, size) for frame in frames])
+    shown = np.stack([resize(frame, size) for frame in frames])
     return Rollout(shown, np.zeros(len(frames), np.bool_), "front")
 
 

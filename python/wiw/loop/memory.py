@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.loop.contract import check_answerer
+from wiw.loop.history import EpisodeHistories
 from wiw.loop.imagination import Imaginer
 from wiw.policies.base import Policy, Situation
 from wiw.types import ArmObservation, Goal, Key, Observation
+from wiw.world_models.base import WorldModel
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,10 @@ class EpisodeMemory:
 class EpisodeMemories:
     """Memories of all live episodes; an episode's is made with its first decision."""
 
-    def __init__(self, policy: Policy, reviser: Policy) -> None:
+    def __init__(self, policy: Policy, reviser: Policy, model: WorldModel | None) -> None:
         self._policy, self._reviser = policy, reviser
+        self.histories = EpisodeHistories(None if model is None else model.accepts)
+        """What world models with a memory are shown."""
         self._by_episode: dict[tuple[int, int], EpisodeMemory] = {}
 
     def recall(self, queries: Sequence[Query], imaginer: Imaginer) -> tuple[list[Situation], list[Situation]]:
@@ -77,6 +81,7 @@ class EpisodeMemories:
     def forget(self, key: Key) -> None:
         """Drop the memory of an episode that has ended."""
         self._by_episode.pop((key.seed, key.episode), None)
+        self.histories.forget(key)
 
     def _begin_or_continue(self, query: Query) -> EpisodeMemory:
         """Return an episode's memory; its first decision begins anew, for a retried episode knows nothing."""

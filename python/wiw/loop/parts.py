@@ -49,7 +49,7 @@ class Parts:
             if config.depth > 1:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers
-        return Components(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser))
+        return Components(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, model))
 
     def _make_reviser(self, policy: Policy, space: str, imagines: bool) -> Policy:
         if self.reviser is not None:

@@ -39,9 +39,10 @@ class Primitives(PlanSpace):
         accepts, name = model.accepts, type(model.base).__name__
         check_kind(model, PRIMITIVES, self.words)
         check_needs(model)
-        if accepts.needs and accepts.frames and longest > accepts.frames - 1:
+        lacking = [need for need in accepts.needs if need != "history"]  # imagined frames make a history
+        if lacking and accepts.frames and longest > accepts.frames - 1:
             raise ArgumentError(
-                f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(accepts.needs)}, "
+                f"{name} imagines {accepts.frames - 1} primitives at a time and needs {', '.join(lacking)}, "
                 f"which an imagined frame does not have, but plans have up to {longest}; lower horizon or depth, or "
                 "raise frames"
             )

@@ -2,9 +2,10 @@
 """Rollouts on disk, so that the same question is put to a world model once.
 
 An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: code, options, weights,
-precision), the observation's bytes, the control and the seed. It holds the frames of one row, raw: a panorama is read
-in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under their names whole, so
-any number of processes may share a folder. When it outgrows its budget, what was not used for longest goes first.
+precision), the bytes of the observation and its history, the control and the seed. It holds the frames of one row, raw:
+a panorama is read in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under
+their names whole, so any number of processes may share a folder. When it outgrows its budget, what was not used for
+longest goes first.
 """
 
 from __future__ import annotations
@@ -222,8 +223,10 @@ def remember(ask: Attempts, cache: str | Path, budget_gb: float = BUDGET_GB) -> 
 def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:
     digest = blake2b(identity, digest_size=20)
     parts: list[Any] = [observations.image[row], control.actions, control.trajectory, control.viewpoints, seeds[row]]
-    optional = (observations.depth, observations.semantic, observations.history)
-    parts += [values[row] for values in optional if values is not None]
+    parts += [values[row] for values in (observations.depth, observations.semantic) if values is not None]
+    if observations.history is not None:
+        past = observations.history.rows([row])  # without the padding that the rest of the batch brings about
+        parts += [past.images, past.poses, past.actions, past.lengths, past.count]
     if control.ids is not None:
         parts.append(control.ids)
     for part in parts:
@@ -241,5 +244,5 @@ def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
     index = list(rows)
     depth = None if whole.depth is None else whole.depth[index]
     semantic = None if whole.semantic is None else whole.semantic[index]
-    history = None if whole.history is None else [whole.history[row] for row in index]
+    history = None if whole.history is None else whole.history.rows(index)
     return Conditioning(whole.image[index], depth=depth, semantic=semantic, history=history)

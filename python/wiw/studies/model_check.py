@@ -19,9 +19,10 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError, Error
 from wiw.loop.attempts import DEADLINE, LateError
 from wiw.loop.contract import check_model as check_needs
+from wiw.loop.history import Frame, stack_histories
 from wiw.registry import world_model
 from wiw.studies.questions import Frames, Questions, Row
-from wiw.types import Control, Space
+from wiw.types import Control, History
 from wiw.world_models.base import WorldModel
 
 PRIMITIVES = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
@@ -65,7 +66,7 @@ class Finding:
 
     kind: str
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "inputs", "random", "batch", "causal",
-    "plan", "describe", "fingerprint", or "slow"."""
+    "history", "plan", "describe", "fingerprint", or "slow"."""
     text: str
     """What is wrong, what was seen, and what to do."""
     serious: bool = True
@@ -85,7 +86,8 @@ def check_model(
 
     Looked at are type, dtype, shape, number of frames and NaN, frame 0, what it does to its inputs and to earlier
     answers, whether the same seeds give the same frames, whether a row depends on those beside it, whether `causal` is
-    true, whether the plan makes a difference, and how long it takes, if it answers at all.
+    true, whether the plan and, of a model that needs it, the history make a difference, and how long it takes, if it
+    answers at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
@@ -154,6 +156,7 @@ class _Check:
         if not again:  # else every comparison would fail
             yield from self._alone(rows, frames, steps)
             yield from self._causal(rows)
+            yield from self._history(rows, frames, steps)
         yield from self._plan(rows, frames, steps)
         yield from self._inputs()
         if not self.accepts.frames:
@@ -227,6 +230,18 @@ class _Check:
                 serious=False,
             )
 
+    def _history(self, rows: Sequence[Row], frames: Frames, steps: int) -> Iterator[Finding]:
+        if not self.accepts.history:
+            return
+        young = self.asking.ask([replace(row, history=_first_moment(row.history)) for row in rows])
+        if self.accepts.history > 1 and not _off(young, frames, 0, steps).any():
+            yield Finding(
+                "history",
+                "What was observed before makes no difference: at an episode's first moment its frames are the same. "
+                "Does `rollout` read `observations.history`? If it needs none, leave it out of `needs`.",
+                serious=False,
+            )
+
     def _inputs(self) -> Iterator[Finding]:
         if self.asking.changed:
             changed = ", ".join(sorted(self.asking.changed))
@@ -267,6 +282,14 @@ def _begin_alike(one: Control, other: Control) -> bool:
     if one.ids is None or other.ids is None or len(one.ids) == len(one.actions):
         return np.array_equal(one.actions[:ALIKE], other.actions[:ALIKE])
     return np.array_equal(one.ids[: 1 + ALIKE], other.ids[: 1 + ALIKE])
+
+
+def _first_moment(history: History | None) -> History:
+    """Return the history of one row as if its episode began with frame 0."""
+    assert history is not None  # the model needs one
+    most = history.images.shape[1]
+    now = Frame(history.images[0, -1], history.poses[0, -1], history.actions[0, :0, 0])
+    return stack_histories([[now]], most)
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:

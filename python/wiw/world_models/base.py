@@ -24,6 +24,8 @@ from wiw.types import PRIMITIVES, Conditioning, Control, ControlKind, View
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
+HISTORY = 4
+"""Frames of a history where a model does not say how many."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class Accepts:
     null_first: bool
     template: TextTemplate | None
     cacheable: bool = False
+    history: int = 0
+    """Frames of `Conditioning.history`, the observation included; 0 where the model needs none."""
 
 
 def accepts(
@@ -58,6 +62,7 @@ def accepts(
     null_first: bool = False,
     template: TextTemplate | None = None,
     cacheable: bool = False,
+    history: int | None = None,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
@@ -69,7 +74,8 @@ def accepts(
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
         space: what the actions are that it follows, a name of `wiw.loop.plan_space`: "discrete" primitives, or "pose7"
             poses of a gripper. An agent that plans in others refuses the model.
-        needs: any of "depth", "semantic", "history", likewise; "simulator" is for `oracle` alone.
+        needs: any of "depth", "semantic", "history" (the latest observations, `wiw.types.History`); "simulator" is for
+            `oracle` alone.
         causal: frame k depends on controls 1..k only, so shared prefixes are imagined once.
         best_batch: rows per call at which the model is most efficient.
         vocabulary: primitive id to the model's own id or vector, for control "action"; default: primitive ids.
@@ -77,9 +83,10 @@ def accepts(
         template: words of the prompt, for control "text"; see `wiw.action.TextTemplate`.
         cacheable: keep rollouts on disk and never ask twice. Say so for a model that takes long and whose answer is a
             function of what it is handed: not for one that draws without the seeds, nor for a server that may change.
+        history: frames of the history with needs=("history",), the observation included; None means 4.
 
     Raises:
-        ArgumentError: a value is not one of the above.
+        ArgumentError: a value is not one of the above, or a history is given that is not needed.
     """
     size = size or ((480, 480) if view == "perspective" else (576, 1024))
     _check("control", control, CONTROLS)
@@ -95,6 +102,7 @@ def accepts(
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
     if template is not None and not isinstance(template, TextTemplate):
         raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
+    history = _checked_history(history, needs)
     size = (int(size[0]), int(size[1]))
     return Accepts(
         control,
@@ -109,7 +117,23 @@ def accepts(
         null_first,
         template,
         cacheable,
+        history,
     )
+
+
+def _checked_history(history: int | None, needs: Sequence[str]) -> int:
+    if "history" not in needs:
+        if history:
+            raise ArgumentError(f"accepts: history={history} without needs=('history',); declare both, or neither")
+        return 0
+    if history is None:
+        return HISTORY
+    if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
+        raise ArgumentError(
+            f"accepts: history counts the observation too: with needs=('history',), expected a whole number of at "
+            f"least 1, got {history!r}"
+        )
+    return int(history)
 
 
 def _check(name: str, value: str, allowed: Sequence[str]) -> None:
