@@ -344,10 +344,8 @@ async def _send(client: ServerConnection, message: bytes) -> None:
 
 
 def _welcome(model: WorldModel, in_flight: int) -> Welcome:
-    try:
-        fingerprint, unknown = model.fingerprint(), ""
-    except ArgumentError as error:
-        fingerprint, unknown = "", str(error)
+    fingerprint = model.fingerprint()
+    unknown = "" if fingerprint else f"{type(model).__name__} declares no version"
     described = json.dumps(model.describe(), default=str)
     return Welcome(declaration(model.accepts), described, fingerprint, unknown, in_flight)
 
