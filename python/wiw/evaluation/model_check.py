@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, ContractError, Error
+from wiw.errors import ArgumentError, ConstructionError, ContractError
 from wiw.evaluation.questions import Frames, Questions, Row
-from wiw.loop.attempts import DEADLINE, LateError
+from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
 from wiw.loop.contract import check_model as check_needs
-from wiw.registry import world_model
 from wiw.types import Control, Space
 from wiw.world_models.base import WorldModel
 
@@ -65,7 +64,7 @@ class Finding:
 
     kind: str
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "inputs", "random", "batch", "causal",
-    "plan", "describe", "fingerprint", or "slow"."""
+    "plan", "describe", "version", or "slow"."""
     text: str
     """What is wrong, what was seen, and what to do."""
     serious: bool = True
@@ -100,12 +99,14 @@ def check_model(
         RegistryError: no such model; other errors of wiw where it cannot be made.
         ArgumentError: a deadline that is not above 0.
     """
+    if not deadline > 0:
+        raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
     try:
-        made = world_model(model, **options)
-    except Error:
-        raise
-    except Exception as error:
-        return [Finding("raised", f"It cannot be made: {_told(error)}.")]
+        made = make_model(model, deadline, **options)
+    except ConstructionError as error:
+        cause = error.__cause__
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_told(cause)}."
+        return [Finding(error.kind, text)]
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
@@ -136,6 +137,10 @@ class _Check:
                 f"No answer in {self.deadline:g} s, so it was asked no more. In a run such a call is made three times, "
                 "then its episode has failed. Does it wait for a download, a lock, a server or a prompt? If it is only "
                 "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
+            )
+        except ExitError as error:
+            yield Finding(
+                "raised", f"`rollout` raised {_told(error.__cause__ or error)}. Only an Exception may leave it."
             )
         except Exception as error:
             yield Finding("raised", f"`rollout` raised {_told(error)}.")
@@ -243,11 +248,12 @@ class _Check:
             json.dumps(self.model.describe())
         except Exception as error:
             yield Finding("describe", f"`describe` gives no JSON for the run's record: {_told(error)}.")
-        if self.accepts.cacheable:
-            try:
-                self.model.fingerprint()
-            except Exception as error:
-                yield Finding("fingerprint", f"It declares cacheable=True, but: {_told(error)}.")
+        if self.accepts.cacheable and not self.model.fingerprint():
+            yield Finding(
+                "version",
+                "It declares cacheable=True, but no version, so nothing is cached. Give the class one, as "
+                "`version = '1'`, and raise it whenever its answers change.",
+            )
 
     def _speed(self) -> Iterator[Finding]:
         run, rows = RUNS[self.accepts.space]
@@ -291,7 +297,7 @@ def _differing(kind: str, text: str, off: NDArray[np.int16]) -> Finding:
     return Finding(kind, f"{text} So little may come of the order in which a GPU adds up.", serious=False)
 
 
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     """What was raised, and where: the last line before libraries were entered, which is the model's own."""
     frames = traceback.extract_tb(error.__traceback__)
     place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]

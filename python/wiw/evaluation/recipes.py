@@ -81,12 +81,13 @@ class AgentRecipe:
         `limits` are what a run gives every agent beyond its identity: deadline, cache, fidelity and the like.
         """
         from wiw.loop.agent import Agent
-        from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+        from wiw.loop.attempts import DEADLINE, make_model
+        from wiw.registry import POLICIES, SEMANTICS
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
         options = given.pop("model_options")
         if options:
-            given["model"] = WORLD_MODELS.make(self.model, **options)
+            given["model"] = make_model(self.model, limits.get("deadline", DEADLINE), **options)
         semantics = given.pop("semantics_options")
         if self.model is None:  # nobody would look at them
             given.pop("semantics", None)
