@@ -52,7 +52,8 @@ class ConstructionError(Error):
 class ContractError(Error, TypeError):
     """A plugged-in model, policy or metric broke its contract (wrong shape, dtype, count, or NaN).
 
-    `kind` names a breach of a world model: "type", "dtype", "nan", "shape" or "frames" (another number of them).
+    `kind` names a breach of a world model: "type", "dtype", "nan", "shape", "frames" (another number of them),
+    "frame 0" (not the observation), "channels" (BGR), "scale" (0 to 1 cast to uint8) or "memory".
     """
 
     def __init__(self, message: str = "", kind: str = "contract") -> None:

@@ -150,7 +150,9 @@ class Spy(wiw.WorldModel):
     def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
         self._calls.append((observations, controls, seeds))
         frames = np.arange(len(controls[0].actions) + 1, dtype=np.uint8)[None, :, None, None, None]
-        return np.broadcast_to(frames, (len(controls), frames.shape[1], 32, 32, 3)).copy()
+        frames = np.broadcast_to(frames, (len(controls), frames.shape[1], 32, 32, 3)).copy()
+        frames[:, 0] = observations.image
+        return frames
 
 
 def asked(model: Any, plans: Any, episodes: int = 1) -> Any:

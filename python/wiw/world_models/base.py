@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.types import Conditioning, Control, ControlKind, Space, View
+from wiw.world_models.pictures import check_pictures, sample
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
@@ -294,8 +295,10 @@ def checked_rollout(
     """`model.rollout` with its answer held to the contract.
 
     Raises:
-        ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected.
+        ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected; frames that
+            are no pictures of what was observed (`pictures.check_pictures`).
     """
+    observed = sample(observations.image).copy()  # a model may write into what it is handed
     frames = model.rollout(observations, controls, seeds)
     expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
@@ -305,6 +308,7 @@ def checked_rollout(
             f"width, 3), got {came}",
             kind,
         )
+    check_pictures(type(model).__name__, observed, frames, controls)
     return frames
 
 
