@@ -165,7 +165,7 @@ class Leaving(BaseException):
 
 
 @pytest.mark.parametrize("deadline", [5.0, float("inf")])
-@pytest.mark.parametrize("stop", [SystemExit(0), GeneratorExit(), Leaving("enough")], ids=lambda stop: repr(stop))
+@pytest.mark.parametrize("stop", [SystemExit(0), GeneratorExit(), Leaving("enough")], ids=repr)
 def test_a_model_ends_no_process(stop, deadline) -> None:
     model = Scripted(stop)
     with pytest.raises(RolloutError, match=re.escape(repr(stop))) as caught:

@@ -20,6 +20,7 @@ from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_re
 from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, LostRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
+from wiw.evaluation.sources import require_sources
 from wiw.evaluation.store import RunStore
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.metrics import Lpips
@@ -83,7 +84,8 @@ def evaluate(
 
     Raises:
         ArgumentError: options for a task that is already made; a number out of range.
-        StoreError: `out` holds a run and `resume` is off, or a run of another configuration.
+        StoreError: `out` holds a run and `resume` is off, or a run of another configuration, or of source files that
+            have changed since.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
         WeightsError: those of LPIPS are not there; says which, and how to get them.
@@ -133,7 +135,8 @@ def resume_run(
     Raises:
         ArgumentError: fewer than one worker.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
-            its preset's file has changed, or the navigation mesh beside a scene has come or gone.
+            its preset's file or the source file of a model, policy or task of the user's own has changed, or the
+            navigation mesh beside a scene has come or gone.
         FileError: the scene of an episode that is left is not there; nothing is recorded.
     """
     if workers is not None:
@@ -144,6 +147,7 @@ def resume_run(
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
         task, agents = recipes_of(store)
+        require_own_sources(store, task, agents)
         built = task.build()
         store.require_task(built.describe())
     except Error:
@@ -167,6 +171,27 @@ def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
             "wiw.evaluation.recipes.AgentRecipe, or `wiw run`"
         )
     return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+
+
+def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:
+    """Return digests, by path, of the user's own source files that a run of these recipes depends on."""
+    found = dict(task.sources())
+    for recipe in agents.values():
+        found |= recipe.sources()
+    return found
+
+
+def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
+    """Hold a run to the user's own source files that it was begun with; closes the store where they have changed.
+
+    Raises:
+        StoreError: a file has changed since.
+    """
+    try:
+        require_sources(store.path.parent, store.info.get("sources"), sources_of(task, agents))
+    except StoreError:
+        store.close()
+        raise
 
 
 USUAL = 20
@@ -264,6 +289,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     if options.resume and options.out is not None and RunStore.begun(options.out):
         store = RunStore.resume(options.out, config)
         _require_left(built, store, agents)
+        require_own_sources(store, task, agents)
     else:
         started = time.perf_counter()
         episodes = built.episodes(options.episodes)
@@ -273,6 +299,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
+            "sources": sources_of(task, agents),
             "pictures": _with_pictures(episodes, options.pictures),
             "scenes": used,
             "stage": getattr(built, "stage", None),
@@ -350,7 +377,9 @@ def run_pending(
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
-    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes)
+    plan = Plan(
+        task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes, info.get("sources", {})
+    )
     board = make_board(progress and any(pending.values()))
     try:
         for arm, indices in pending.items():
