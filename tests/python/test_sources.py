@@ -55,7 +55,7 @@ def test_a_part_counts_with_what_it_derives_from_and_imports(folder: Path, monke
         "net.py": "from . import blocks\nimport json\n",
         "blocks.py": "import mine.net\n",
         "unread.py": "",
-        "policy.py": "from mine.base import Base\n\n\nclass Mine(Base):\n    def f(self):\n        from .net import x\n",
+        "policy.py": "from mine.base import Base\n\n\nclass Mine(Base):\n    def f(_):\n        from .net import x\n",
     }.items():
         (package / name).write_text(text)
     monkeypatch.syspath_prepend(str(folder))

@@ -282,7 +282,7 @@ class _Check:
             yield Finding(
                 "frame 0",
                 f"Frame 0 is the observation only nearly: {difference}, as of a picture that was encoded and decoded. "
-                "No agent reads frame 0, so this costs nothing; frames[:, 0] = observations.image mends it.",
+                "That costs next to nothing; frames[:, 0] = observations.image mends it.",
                 serious=False,
             )
         else:

@@ -16,12 +16,9 @@ import wiw
 from wiw.errors import StoreError
 from wiw.world_models.function import Function
 
-LIBRARIES = tuple(
-    Path(folder).resolve()
-    for folder in (
-        Path(wiw.__file__).parent,
-        *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-    )
+LIBRARIES = (
+    Path(wiw.__file__).resolve().parent,
+    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")),
 )
 """Folders of code whose versions are known otherwise."""
 
