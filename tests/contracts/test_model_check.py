@@ -14,8 +14,8 @@ import pytest
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, RegistryError
-from wiw.evaluation.model_check import CHECKS, examine_model
 from wiw.serving.background import served
+from wiw.studies.model_check import CHECKS, examine_model
 from wiw.types import Conditioning
 from wiw.world_models.warp import Warp
 
@@ -261,7 +261,7 @@ def test_models_of_grippers_are_asked_about_poses(declared):
 
 
 def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     class Blind(Arm):
         def rollout(self, observations, controls, seeds):
@@ -274,7 +274,7 @@ def test_a_gripper_that_is_not_looked_at_is_noted(monkeypatch):
 
 
 def test_what_is_good_to_know_breaks_nothing(two_rooms, monkeypatch):
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     findings = found(spoilt(nearly), two_rooms)
     assert not findings["batch"].serious and "a CPU adds up in another order" in str(findings["batch"])

@@ -13,7 +13,7 @@ from wiw.cli import main
 from wiw.cli.doctor import examine
 from wiw.cli.options import parsed
 from wiw.errors import ArgumentError
-from wiw.evaluation.runlog import load_run
+from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
 
 FAKES = Path(__file__).with_name("fakes.py")

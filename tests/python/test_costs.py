@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import wiw
+from wiw.analysis.costs import Costs
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
-from wiw.evaluation.costs import Costs
-from wiw.evaluation.evaluate import run_arms
-from wiw.evaluation.store import RunStore
 from wiw.loop.attempts import TRIES
+from wiw.runs.store import RunStore
+from wiw.studies.evaluate import run_arms
 
 
 class Counted(wiw.WorldModel):

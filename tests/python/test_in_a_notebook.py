@@ -10,7 +10,7 @@ import pytest
 MODEL = """
 import numpy as np
 import wiw
-from wiw.evaluation.recipes import TaskRecipe
+from wiw.runs.recipes import TaskRecipe
 
 class Mine(wiw.WorldModel):
     accepts = wiw.accepts(control="trajectory", size=(48, 96), cacheable=True)

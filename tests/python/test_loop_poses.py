@@ -14,12 +14,12 @@ import wiw
 from wiw._core import core
 from wiw.action import NULL, resample
 from wiw.errors import ArgumentError, ContractError
-from wiw.evaluation.evaluate import evaluate
 from wiw.loop.agent import Query
 from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
 from wiw.loop.imagine_poses import imagine_poses
 from wiw.policies.base import FrameSpec
+from wiw.studies.evaluate import evaluate
 from wiw.types import ArmObservation, Episode, Goal, Key, Proposal, Truth
 
 SIDE = 48

@@ -15,9 +15,9 @@ import pytest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import TaskRecipe
 from wiw.loop.attempts import Attempts
 from wiw.loop.rollout_cache import Remembered, RolloutCache, default_folder, remember
+from wiw.runs.recipes import TaskRecipe
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts
 
@@ -286,7 +286,7 @@ class Logged(wiw.WorldModel):
 def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     (tmp_path / "logged.py").write_text(MODEL)
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = wiw.evaluation.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", revision="matcher")
+    agent = wiw.runs.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", revision="matcher")
 
     def run(name, **options):
         log = wiw.evaluate(task, agent, 3, out=tmp_path / name, progress=False, cache=tmp_path / "cache", **options)

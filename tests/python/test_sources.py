@@ -12,12 +12,12 @@ import pytest
 
 import wiw
 from wiw.errors import StoreError
-from wiw.evaluation.evaluate import evaluate, resume_run
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.evaluation.sources import require_sources, source_digests
-from wiw.evaluation.store import store_path
-from wiw.evaluation.verify import verify
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.sources import require_sources, source_digests
+from wiw.runs.store import store_path
+from wiw.runs.verify import verify
 from wiw.serving.background import served
+from wiw.studies.evaluate import evaluate, resume_run
 
 MODEL = """
 import numpy as np

@@ -47,7 +47,7 @@ def check_model(
     from rich.console import Console
     from rich.markup import escape
 
-    from wiw.evaluation import model_check
+    from wiw.studies import model_check
 
     options = model_options(model, world_model_option)
     checks = model_check.examine_model(model, scenes, deadline=deadline, **options)

@@ -126,8 +126,8 @@ def run(
         prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
     """
-    from wiw.evaluation.evaluate import evaluate
-    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.studies.evaluate import evaluate
 
     flags = {
         "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
@@ -175,7 +175,7 @@ def resume(
         retry_failed: Whether to run episodes again whose infrastructure failed.
         report: Whether to write report.html at the end.
     """
-    from wiw.evaluation.evaluate import resume_run
+    from wiw.studies.evaluate import resume_run
 
     return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
 
@@ -213,7 +213,7 @@ def vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:
-    from wiw.evaluation.recipes import absolute
+    from wiw.runs.recipes import absolute
 
     if arms is None:
         return None

@@ -89,8 +89,8 @@ def scale(
         semantics_option: An option of --semantics; may be given again.
     """
     from wiw.cli.run import stoppable, vlm_options
-    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
-    from wiw.evaluation.scale import scale as run_scale
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.studies.scale import scale as run_scale
 
     policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)

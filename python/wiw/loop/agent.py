@@ -419,15 +419,16 @@ class Agent:
         """Each episode as its proposer and as its reviser know it; the same object where one policy is both."""
         proposing, revising = [], []
         for query in queries:
-            life = self._life(query)
+            life = self._begin_or_continue(query)
             imagines = self._ask is not None and consults(query.key, self.imagine_fraction)
             known = query.observation, query.goal, query.key
             proposing.append(Situation(*known, life.proposer, tuple(life.executed), imagines))
             revising.append(Situation(*known, life.reviser, tuple(life.executed), imagines))
         return proposing, revising
 
-    def _life(self, query: Query) -> _Life:
-        name = (query.key.seed, query.key.episode)
+    def _begin_or_continue(self, query: Query) -> _Life:
+        """What is kept of an episode: once a decision, for its first begins anew."""
+        name = query.key.seed, query.key.episode
         if query.key.decision == 0 or name not in self._lives:
             check_answerer(self.revision, query.goal)
             memory = self.policy.begin(query.goal, query.key)
@@ -449,7 +450,7 @@ class Agent:
             actions = future.proposals[chosen].actions
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
-        self._life(query).executed += actions[:execute].tolist()
+        self._lives[query.key.seed, query.key.episode].executed += actions[:execute].tolist()
         exchanges = tuple(each for policy in self._policies for each in policy.exchanges(query.key))
         return Decision(
             actions=actions,

@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
-from wiw.evaluation.sources import source_digests
+from wiw.runs.sources import source_digests
 from wiw.serving.known import Known
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
