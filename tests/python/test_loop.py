@@ -52,9 +52,10 @@ class Stamp(wiw.WorldModel):
 
     def rollout(self, observations, controls, seeds):
         frames = np.zeros((len(controls), len(controls[0].actions) + 1, 576, 1024, 3), np.uint8)
+        frames[:, 0] = observations.image
         for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
             for k in range(len(control.actions)):
-                frames[row, k + 1] = 1 + int(seed) % 200 if k == control.length - 1 else 0
+                frames[row, k + 1] = 2 + int(seed) % 200 if k == control.length - 1 else 0
         return frames
 
 

@@ -35,6 +35,7 @@ class Reader(wiw.WorldModel):
     """Paints what it is told that things are."""
 
     accepts = wiw.accepts("trajectory", needs=("semantic",), cacheable=True)
+    version = "1"
     seen = []
 
     def rollout(self, observations, controls, seeds):

@@ -112,7 +112,7 @@ def run(
         deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
-            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
+            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
         fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
         lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where

@@ -6,27 +6,33 @@ the process ends, with its memory, and on a GPU with its place in the queue. The
 that a model that is merely slow is never entered twice at a time; then it asks in a new thread, which mends a lost
 request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
 that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
+
+A model cannot end the process: `sys.exit()` in it is an error of its own like any exception. Threads that it starts in
+its constructor or in a call are daemons unless it says otherwise, for they are started in one.
 """
 
 from __future__ import annotations
 
+import inspect
 import queue
 import sys
 import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ContractError, RolloutError
+from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
+from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel, check_rollout, patience
+from wiw.world_models.base import Accepts, WorldModel, check_rollout, patience
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
@@ -35,8 +41,8 @@ DEADLINE = 300.0
 """Seconds a call may take unless the user says otherwise: room for a first call that loads and compiles."""
 
 
-class Attempts:
-    """A world model's answers, held to the contract and to a deadline.
+class Attempted(WorldModel):
+    """A world model whose answers are held to the contract and to a deadline.
 
     Args:
         model: what is asked.
@@ -48,20 +54,43 @@ class Attempts:
         if not deadline > 0:
             raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
         self.model, self.deadline = model, deadline
-        self.tally: Counter[str] = Counter()
-        """What was asked so far: `calls` that the model has answered or not, their `rows` and `frames` (padding and
-        frames that other rows answer left out), and `retries`, calls that repeat one that gave nothing."""
-        self.cache_seconds = 0.0
-        """Nothing is cached here."""
+        self._tally: Counter[str] = Counter()
         self._helper: _Helper | None = None
 
     def __reduce__(self) -> Any:
-        return Attempts, (self.model, self.deadline)
+        return Attempted, (self.model, self.deadline)
 
-    def __call__(
+    @property
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's."""
+        return self.model.accepts
+
+    @property
+    def base(self) -> WorldModel:
+        """The model behind everything that wraps it."""
+        return self.model.base
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What was asked so far, on top of what the model says itself.
+
+        `calls` that the model has answered or not, their `rows` and `frames` (padding and frames that other rows answer
+        left out), and `retries`, calls that repeat one that gave nothing.
+        """
+        return {**self.model.spent, **self._tally}
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the model."""
+        return self.model.describe()
+
+    def fingerprint(self) -> str:
+        """Return the model's."""
+        return self.model.fingerprint()
+
+    def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Frames as `WorldModel.rollout` promises them.
+        """Ask the model until it answers as agreed.
 
         Raises:
             RolloutError: every try failed. An answer that breaks the contract in the same way twice is not asked for a
@@ -74,32 +103,33 @@ class Attempts:
                 return self.once(observations, controls, seeds)
             except Exception as error:
                 said.append(_said(error))
-                hopeless = isinstance(error, ContractError) and said.count(said[-1]) > 1
-                if attempt + 1 == TRIES or hopeless:
+                in_vain = isinstance(error, ContractError) and said.count(said[-1]) > 1
+                if attempt + 1 == TRIES or in_vain:
                     raise self._failure(error, said) from error
-                self.tally["retries"] += 1
+                self._tally["retries"] += 1
                 time.sleep(PAUSES[attempt])
         raise AssertionError("unreachable")
 
     def once(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Likewise, in a single try that counts nowhere.
+        """Ask in a single try that counts nowhere.
 
         Raises:
             LateError: no answer within the deadline.
-            ContractError: the answer breaks the contract; and whatever the model raises.
+            ContractError: the answer breaks the contract.
+            ExitError: the model tried to end the process; and whatever else the model raises.
         """
-        return self._ask(lambda: check_rollout(self.model, observations, controls, seeds))
+        return self._ask(lambda: _contain(lambda: check_rollout(self.model, observations, controls, seeds)))
 
     def _count(self, controls: Sequence[Control]) -> None:
-        self.tally["calls"] += 1
-        self.tally["rows"] += len(controls)
-        self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
+        self._tally["calls"] += 1
+        self._tally["rows"] += len(controls)
+        self._tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
-        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError) else "raised"
-        name = type(self.model).__name__
+        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
+        name = type(self.model.base).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
     def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
@@ -113,10 +143,57 @@ class Attempts:
             return self._helper.do(work, self.deadline)
 
 
+def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldModel | None:
+    """Make a world model as `wiw.world_model` does, within a deadline; None for "none".
+
+    A model whose class declares published weights (`requires.weights`) has no deadline: fetching them the first time
+    may take hours, and whoever fetches them has timeouts of their own.
+
+    Raises:
+        RegistryError: unknown name, or options that do not fit.
+        ConstructionError: the constructor raised, or did not return in time; and other errors of wiw that it raises.
+    """
+    found = WORLD_MODELS.find(what) if isinstance(what, str) else what
+    makes = inspect.isclass(found) or isinstance(found, partial) or inspect.isfunction(found)
+    fetches = inspect.isclass(found) and issubclass(found, WorldModel) and bool(found.requires.weights)
+    make = partial(world_model, what, **options)
+    if not makes or fetches or deadline > threading.TIMEOUT_MAX:
+        made: WorldModel | None = make()
+        return made
+    try:
+        made = _Helper().do(make, deadline)
+    except LateError as error:
+        name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
+        raise ConstructionError(
+            f"world model '{name}' cannot be made: its constructor did not return within {deadline:g} s (deadline). "
+            "Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+            "deadline",
+        ) from error
+    return made
+
+
 class LateError(Exception):
     """The deadline has passed."""
 
     kind = "deadline"
+
+
+class ExitError(Exception):
+    """A model has raised what is meant to end the process, such as `SystemExit`."""
+
+    kind = "raised"
+
+
+def _contain(work: Callable[[], Any]) -> Any:
+    """Return what the work returns; a model's attempt to end the process becomes an `ExitError`."""
+    try:
+        return work()
+    except BaseException as error:
+        if isinstance(error, Exception) or asks_to_stop(error):
+            raise
+        raise ExitError(
+            f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
+        ) from error
 
 
 class _Errand:
@@ -172,7 +249,7 @@ def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
 
 def _said(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, ContractError | LateError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
 
 
 def _torch_state() -> tuple[bool, bool, int | None] | None:

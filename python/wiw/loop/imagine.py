@@ -18,7 +18,7 @@ from wiw.loop.imagination import Imagination, ModelInput, Request
 from wiw.loop.views import maker_of, view_maker
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
-from wiw.world_models.base import Accepts, WorldModel, check_rollout
+from wiw.world_models.base import Accepts, WorldModel, ask
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
                 observations = replace(observations, history=histories.before(part, answers))
             controls = _controls(accepts, part)
         with clock("world_model"):
-            found = check_rollout(model, observations, controls, seeds[part.rows])
+            found = ask(model, observations, controls, seeds[part.rows])
             answers.append(_require_own_memory(found, answers, model))
     with clock("platform"):
         rollouts = _show(batch, panoramas, answers, accepts.view, request.frames)

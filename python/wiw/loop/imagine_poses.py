@@ -24,7 +24,7 @@ from wiw.loop.imagine import seed_of, stack_depths
 from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Proposal, Rollout, View
-from wiw.world_models.base import Accepts, WorldModel, check_rollout
+from wiw.world_models.base import Accepts, WorldModel, ask
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
             observations = _conditioning(accepts, [request.inputs[rows[i].episode] for i in part])
             seeds = np.array([rows[i].seed for i in part], np.uint64)
         with clock("world_model"):
-            found = check_rollout(model, observations, [rows[i].control for i in part], seeds)
+            found = ask(model, observations, [rows[i].control for i in part], seeds)
         for i, own in zip(part, found, strict=True):
             answers[i] = own[_frames_of(rows[i])]
     with clock("platform"):

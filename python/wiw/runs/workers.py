@@ -21,6 +21,7 @@ from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, Error, InfrastructureError
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
+from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
 Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
@@ -53,6 +54,8 @@ class Plan:
     """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
     episodes: Sequence[Episode] = ()
     """All episodes of the run, for agents that are shown another one's."""
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the user's own source files, which every agent is built of."""
 
     def strangers(self, agent: Any, indices: Iterable[int]) -> dict[int, Episode]:
         """For an agent with placebo="swapped" the next episode of each, counted round; else nothing.
@@ -116,6 +119,7 @@ class Runner:
         if self._arm != job.arm:
             self._agent = None
             self._agent = self._plan.agents[job.arm].build(self._task.defaults, self._plan.limits)
+            require_unchanged(self._plan.sources)
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
         sink = RowSink(job, self._plan, send)

@@ -16,6 +16,7 @@ class Copy(WorldModel):
     """Predicts that every future frame equals the present one. A model that scores no better has added nothing."""
 
     accepts = accepts(control="image", view="panorama", causal=True, best_batch=64)
+    version = "1"
 
     def for_space(self, space: Space) -> WorldModel:
         """The front view, repeated, where plans are poses."""
