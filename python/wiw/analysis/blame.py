@@ -22,8 +22,8 @@ from typing import Any
 from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
+from wiw.experiments.ground_truth import STAGES
 from wiw.files import whole_file
-from wiw.loop.swaps import STAGES
 from wiw.metrics.headlines import SUCCESS
 from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore

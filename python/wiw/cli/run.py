@@ -140,7 +140,8 @@ def run(
     speaking = [policy, revision or "", *(name.partition("+")[0] for name in names or [])]
     given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
-        absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
+        absolute(policy), model, revision and absolute(revision),
+        candidates=candidates, horizon=horizon, depth=depth, width=width,
         model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
         semantics_options=semantics_options(semantics, semantics_option),
         policy_options=policy_options(absolute(policy), policy_option, vlm_options(given, speaking)),

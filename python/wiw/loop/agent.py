@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig, set_numbers
 from wiw.loop.decision_pass import DecisionPass
 from wiw.loop.memory import Query, read_observation
@@ -19,7 +20,7 @@ from wiw.types import Decision, Goal, Key
 from wiw.world_models.base import WorldModel
 
 
-class Agent:
+class Agent(BaseAgent):
     """A policy, with or without a world model.
 
         agent = wiw.Agent("matcher", "warp", candidates=3)
@@ -57,9 +58,10 @@ class Agent:
         """Decide once for each live episode; model and reviser see all candidates of all of them at once."""
         step = DecisionPass(self.components, queries)
         search = step.propose()
-        for level in range(self.config.depth):
-            if level:
-                step.extend(search, futures, scores)
+        futures = step.imagine(search)
+        scores = step.score(search, futures)
+        for _ in range(1, self.config.depth):
+            step.extend(search, futures, scores)
             futures = step.imagine(search)
             scores = step.score(search, futures)
         return step.revise(search, futures, scores)
@@ -99,7 +101,7 @@ class Agent:
         return self.components.reviser
 
     @property
-    def needs(self) -> tuple[str, ...]:
+    def needs(self) -> tuple[str, ...]:  # type: ignore[override]
         """What observations must carry beyond images: "depth"."""
         return tuple(sorted({*self.policy.needs, *self.reviser.needs, *self.components.imaginer.needs}))
 

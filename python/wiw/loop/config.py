@@ -4,16 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 from wiw.errors import ArgumentError
 
-
 DESCRIBED = ("candidates", "horizon", "execute", "depth", "width")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class AgentConfig:
     """Numbers of the search; None leaves one to the task, and without a task to the paper's ImageNav.
 
@@ -59,9 +58,8 @@ class AgentConfig:
         A task's number of executed actions belongs to the task's horizon: it is not taken where `horizon` is given
         here and the task carries out more than one action.
         """
-        known = {field.name for field in fields(self)}
-        open_numbers = {name for name, value in asdict(self).items() if value is None}
-        taken = {name: value for name, value in defaults.items() if name in known & open_numbers}
+        open_names = {name for name, value in self.numbers.items() if value is None}
+        taken = {name: value for name, value in defaults.items() if name in open_names}
         if self.horizon is not None and defaults.get("execute", 0) > 1:
             taken.pop("execute", None)
         return replace(self, **taken)
@@ -72,9 +70,12 @@ class AgentConfig:
         horizon = self.horizon or 5
         execute = max(1, horizon - 2) if self.execute is None else self.execute
         width, pool = self.width or candidates, self.pool or candidates
-        return replace(
-            self, candidates=candidates, horizon=horizon, execute=execute, width=width, pool=pool
-        )
+        return replace(self, candidates=candidates, horizon=horizon, execute=execute, width=width, pool=pool)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """All settings by name."""
+        return {field.name: getattr(self, field.name) for field in fields(AgentConfig)}
 
     @property
     def longest(self) -> int:
@@ -83,7 +84,8 @@ class AgentConfig:
 
     def describe(self) -> dict[str, int]:
         """Return the numbers that a run's manifest names: those of a complete config, and a pool that is given."""
-        numbers = {name: getattr(self.complete(), name) for name in DESCRIBED}
+        complete = self.complete()
+        numbers = {name: getattr(complete, name) for name in DESCRIBED}
         return numbers if self.pool is None else {**numbers, "pool": self.pool}
 
     def count_executed(self, length: int) -> int:

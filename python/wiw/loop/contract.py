@@ -22,6 +22,7 @@ class PlanChecker(Protocol):
     def check_plan(self, source: str, actions: Any, longest: int) -> NDArray[Any]:
         """See `wiw.loop.plan_space.PlanSpace.check_plan`."""
 
+
 def check_kind(model: WorldModel, space: str, words: str) -> None:
     """See that a model which follows actions follows those that plans are made of.
 
@@ -49,9 +50,7 @@ def check_needs(model: WorldModel) -> None:
         )
 
 
-def check_proposals(
-    policy: Policy, space: PlanChecker, proposals: Any, episodes: int, most: int, horizon: int
-) -> None:
+def check_proposals(policy: Policy, space: PlanChecker, proposals: Any, episodes: int, most: int, horizon: int) -> None:
     """Hold `propose` and `extend` to at most `most` plans of 1 to `horizon` actions for each episode.
 
     Raises:

@@ -20,7 +20,7 @@ from wiw.loop.observers import Futures, Observer
 from wiw.loop.plan_space import PlanSpace
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.loop.search import Search
-from wiw.policies.base import Policy, Situation
+from wiw.policies.base import Policy
 from wiw.types import Answer, Decision, Proposal
 
 
@@ -112,9 +112,7 @@ class DecisionPass:
             scores = reviser.score_or_prefer(self._revising, search.plans, futures.rollouts)
             return check_scores(reviser, scores, search.plans)
 
-    def revise(
-        self, search: Search, futures: Imagination, scores: Sequence[NDArray[np.float64]]
-    ) -> list[Decision]:
+    def revise(self, search: Search, futures: Imagination, scores: Sequence[NDArray[np.float64]]) -> list[Decision]:
         """Let the reviser answer and decide."""
         reviser = self._parts.reviser
         with self._ledger.clock("revise"):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wiw.loop.clock import Clock
 from wiw.loop.history import Frame
 from wiw.policies.base import FrameSpec
-from wiw.types import Key, Proposal, Rollout
+from wiw.types import Key, Proposal, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel
 
 
@@ -62,6 +62,8 @@ class Imagination(ABC):
     """[episode][candidate]; None for an episode of which nothing was imagined."""
     costs: Sequence[Mapping[str, int]]
     """What each episode asked for: consultations, rows and frames."""
+    view: View = "perspective"
+    """That the model imagines."""
 
     @abstractmethod
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
@@ -124,7 +126,7 @@ class Imaginer(ABC):
         """JSON-able identity for the run's manifest: the model's, under "model", and what is changed of it."""
         return {"model": None if self.model is None else self.model.describe()}
 
-    def forget(self, key: Key) -> None:
+    def forget(self, key: Key) -> None:  # noqa: B027 - most keep nothing
         """Drop what is kept of an episode that has ended."""
 
 

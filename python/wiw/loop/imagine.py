@@ -48,7 +48,7 @@ class ImaginedPrimitives(Imagination):
         panoramas = np.stack([observation.panorama for observation in self.observations])
         sizes = panoramas.shape[1:3], self.observations[0].front.shape[:2]
         whole, front = (
-            self.batch.ends(candidates, panoramas, self.answers, viewview_maker(view, size))
+            self.batch.ends(candidates, panoramas, self.answers, view_maker(view, size))
             for view, size in zip(("panorama", "front"), sizes, strict=True)
         )
         return whole, front
@@ -89,7 +89,7 @@ def _show(
     """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
-    shown = batch.views(panoramas, answers, viewview_maker(view, size), kind)
+    shown = batch.views(panoramas, answers, view_maker(view, size), kind)
     real, lengths = batch.real, batch.lengths
     rollouts: list[list[Rollout]] = [[] for _ in panoramas]
     for i, episode in enumerate(batch.candidate_episode):
@@ -164,8 +164,8 @@ def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.ui
     """Return the answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
     if any(np.may_share_memory(found, answer) for answer in before):
         raise ContractError(
-            f"{type(model.base).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by that; "
-            "return a new array from every call",
+            f"{type(model.base).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
+            "that; return a new array from every call",
             "memory",
         )
     return found

@@ -88,7 +88,8 @@ class EpisodeMemories:
         name = query.key.seed, query.key.episode
         if query.key.decision == 0 or name not in self._by_episode:
             check_answerer(self._reviser, query.goal)
-            memory = self._policy.begin(query.goal, query.key)
-            one = self._reviser.base is self._policy.base
-            self._by_episode[name] = EpisodeMemory(memory, memory if one else self._reviser.begin(query.goal, query.key))
+            proposer = reviser = self._policy.begin(query.goal, query.key)
+            if self._reviser.base is not self._policy.base:
+                reviser = self._reviser.begin(query.goal, query.key)
+            self._by_episode[name] = EpisodeMemory(proposer, reviser)
         return self._by_episode[name]

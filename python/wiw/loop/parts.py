@@ -53,11 +53,11 @@ class Parts:
 
     def _make_reviser(self, policy: Policy, space: str, imagines: bool) -> Policy:
         if self.reviser is not None:
-            reviser = POLICIES.make(self.reviser, **_space_option(POLICIES, self.reviser, space))
+            reviser = POLICIES.make(self.reviser, **space_option(POLICIES, self.reviser, space))
         elif policy.can_revise or not imagines:
             return policy
         elif policy.default_revision is not None:
-            reviser = POLICIES.make(policy.default_revision, **_space_option(POLICIES, policy.default_revision, space))
+            reviser = POLICIES.make(policy.default_revision, **space_option(POLICIES, policy.default_revision, space))
         else:
             raise ArgumentError(
                 f"Agent: policy {type(policy.base).__name__} only proposes; give `reviser=` a policy that scores"
@@ -77,7 +77,7 @@ def _space_of(policy: Any) -> str:
 
 
 def _make_policy(policy: Any, space: str) -> Policy:
-    made: Policy = POLICIES.make(policy, **_space_option(POLICIES, policy, space))
+    made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
             f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.base).__name__} makes "
@@ -89,11 +89,11 @@ def _make_policy(policy: Any, space: str) -> Policy:
 def _make_imaginer(model: Any, space: str) -> Imaginer:
     if model is None or isinstance(model, Imaginer):
         return model or NoModel()
-    made = WORLD_MODELS.make(model, **_space_option(WORLD_MODELS, model, space))
+    made = WORLD_MODELS.make(model, **space_option(WORLD_MODELS, model, space))
     return NoModel() if made is None else as_imaginer(made)
 
 
-def _space_option(registry: Registry, what: Any, space: str) -> dict[str, str]:
+def space_option(registry: Registry, what: Any, space: str) -> dict[str, str]:
     """Return the plan space as an option, for a name whose factory makes parts for several."""
     found = registry.find(what) if isinstance(what, str) else what
     if not (inspect.isclass(found) or inspect.isfunction(found)):

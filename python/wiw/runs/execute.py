@@ -32,7 +32,7 @@ def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
             "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
             "wiw.runs.recipes.AgentRecipe, or `wiw run`"
         )
-    return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+    return TaskRecipe(**info["task"]), {arm: AgentRecipe.from_json(recipe) for arm, recipe in info["agents"].items()}
 
 
 def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:

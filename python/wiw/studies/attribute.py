@@ -40,7 +40,7 @@ def attribute(
         found["warp"].verdicts      # {"imagination": 3, "scoring": 12, "proposals": 7, "joint": 1, "beyond": 0}
 
     Each failed episode is run again with the oracle world model, with plans scored by the truth, with a true plan among
-    the proposals, and with all three (`wiw.loop.swaps`). What is run is kept in the folder `blame` of the run; calling
+    the proposals, and with all three (`wiw.experiments.ground_truth`). What is run is kept in the folder `blame`; calling
     it again goes on where it was stopped, and runs nothing twice.
 
     Args:
@@ -122,7 +122,7 @@ def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[
 def _told(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRecipe:
     """The agent with stages told the truth; a model that the oracle stands in for need not be made."""
     own = replace(recipe.with_model("oracle"), placebo=None) if "imagination" in stages else recipe
-    return replace(own, swaps=stages)
+    return replace(own, ground_truth=stages)
 
 
 def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
@@ -156,7 +156,7 @@ def _given(recipe: AgentRecipe) -> dict[str, Any]:
 def _expected(base: RunStore) -> dict[str, Any]:
     """What swapped agents must say of themselves, so that one of other weights than the run's is refused."""
     return {
-        swapped(arm, swap): {**agent, "swaps": list(SWAPS[swap])}
+        swapped(arm, swap): {**agent, "ground_truth": list(SWAPS[swap])}
         for arm, agent in base.info.get("built", {}).items()
         for swap in ("scoring", "proposals")
     }

@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.action import FORWARD, TURN_LEFT
-from wiw.loop.attempts import DEADLINE, Attempts
+from wiw.loop.attempts import DEADLINE, Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.history import EpisodeHistories
+from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.imagine import seed_of
-from wiw.policies.base import FrameSpec
+from wiw.loop.plan_space import plan_space
+from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import TASKS
-from wiw.types import Conditioning, Control, History, Key, Proposal, View
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, History, Key, Proposal, View
 from wiw.world_models.base import Accepts, WorldModel
 from wiw.world_models.pictures import sample
 
@@ -48,10 +50,11 @@ class Row:
     history: History | None
     """Of one row."""
     simulator: Any
+    """As the model is handed it, if it is."""
     control: Control
     seed: np.uint64
-    query: Query
-    """The episode that asks."""
+    truth: Any
+    """Fork of the simulator where the episode stands."""
     plan: NDArray[Any]
     """Its actions, without padding."""
 
@@ -69,10 +72,10 @@ class Questions:
     """
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
-        self._model, self._attempts = model, Attempts(model, deadline)
+        self._model, self._attempts = model, Attempted(model, deadline)
         self._space = model.accepts.space
-        queries = _at_tables() if self._space == "pose7" else _in_scenes(scenes)
-        self._queries = [_later_moment(model.accepts, *each) for each in queries]
+        episodes = _at_tables() if self._space == GRIPPER_POSES else _in_scenes(scenes)
+        self._moments = [_later_moment(model.accepts, *each) for each in episodes]
         self.row_seconds = 0.0
         """What a row took in the last call."""
         self.changed: set[str] = set()
@@ -85,14 +88,18 @@ class Questions:
         """The latest answers themselves, and what a sample of their pixels was when they came."""
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
-        """The rows of these plans, of primitives or poses, in each episode."""
+        """Return the rows of these plans, of primitives or poses, in each episode."""
         recorder = _Recorder(self._model)
-        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._queries]
+        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._moments]
         origins = [range(len(plans)) for _ in proposals]
-        IMAGINE[self._space](recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        space, keys = plan_space(self._space), [moment.key for moment in self._moments]
+        observations = [moment.shown.observation for moment in self._moments]
+        inputs = [moment.shown for moment in self._moments]
+        frames = FrameSpec("front", (48, 48))
+        space.imagine(recorder, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
         asked = {
-            seed_of(query.key, number): (query, np.array(plan))
-            for query in self._queries
+            seed_of(moment.key, number): (moment.shown.simulator, np.array(plan))
+            for moment in self._moments
             for number, plan in enumerate(plans)
         }
         return [
@@ -163,24 +170,38 @@ class Questions:
         uint8 [K, H, W, 3], in the model's view, of some small size.
         """
         accepts = self._model.accepts
-        truth = _true_fronts if self._space == "pose7" else _true_views
+        truth = _true_fronts if self._space == GRIPPER_POSES else _true_views
         height, width = accepts.size
         small = max(1, round(SMALL * height / width)), SMALL
-        return [truth(row.query.simulator, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
+        return [truth(row.truth, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
 
 
-class _Recorder(Attempts):
+class _Recorder(WorldModel):
     """Notes what the loop asks of a model, and answers that nothing moves."""
 
     def __init__(self, model: WorldModel) -> None:
-        super().__init__(model)
+        self._model = model
         self.asked: list[tuple[Conditioning, Sequence[Control], NDArray[np.uint64]]] = []
 
-    def __call__(
+    @property
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's."""
+        return self._model.accepts
+
+    def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
+        """Note the question."""
         self.asked.append((observations, controls, seeds))
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+
+
+@dataclass(frozen=True)
+class _Moment:
+    """Where an episode stands."""
+
+    key: Key
+    shown: ModelInput
 
 
 def _history_of(rows: Sequence[Row]) -> History:
@@ -216,7 +237,7 @@ def _at_tables() -> list[tuple[Any, Any, Key]]:
     return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
 
 
-def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> Query:
+def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Moment:
     """Return an episode's first moment; of a model with a memory, a moment some decisions later.
 
     One episode is older than the other, and its segments are shorter, so that histories differ in padding.
@@ -224,18 +245,18 @@ def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> Que
     histories, executed = EpisodeHistories(accepts), list[Any]()
     decisions = 1 + key.episode if accepts.history else 0
     for decision in range(decisions):
-        histories.add([Query(observation, env.goal, key.at(decision))], [executed])
+        histories.add([Situation(observation, env.goal, key.at(decision), None, tuple(executed))])
         plan = _segment(accepts.space, observation, 3 - key.episode)
         observation = env.run(plan).observation
         executed += plan.tolist()
-    semantic = env.semantic() if accepts.space == "discrete" else None
-    query = Query(observation, env.goal, key.at(decisions), env.fork(), semantic=semantic)
-    return histories.add([query], [executed])[0]
+    semantic = env.semantic() if accepts.space == PRIMITIVES else None
+    (history,) = histories.add([Situation(observation, env.goal, key.at(decisions), None, tuple(executed))])
+    return _Moment(key.at(decisions), ModelInput(observation, env.fork(), semantic, history))
 
 
-def _segment(space: Space, observation: Any, length: int) -> NDArray[Any]:
+def _segment(space: str, observation: Any, length: int) -> NDArray[Any]:
     """Return what is carried out at a decision: some way ahead and a turn, or a gripper's way up."""
-    if space == "discrete":
+    if space == PRIMITIVES:
         return np.array([FORWARD] * (length - 1) + [TURN_LEFT], np.int8)
     ways = np.arange(1, length + 1)[:, None] * (0, 0, 0.01, 0, 0, 0, 0)
     return np.asarray(observation.pose + ways, np.float64)

@@ -19,7 +19,7 @@ from wiw.analysis.costs import costs
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
-from wiw.runs.recipes import AgentRecipe, task_recipe
+from wiw.runs.recipes import agent_recipe, task_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
@@ -172,7 +172,7 @@ def _amounts(
 
 
 def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
-    return replace(agent, **changes) if isinstance(agent, AgentRecipe) else agent.but(**changes)
+    return replace(agent_recipe(agent), **changes)
 
 
 def _points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:

@@ -21,7 +21,7 @@ from wiw.policies.base import Policy, Situation
 from wiw.policies.diffuser.paths import dense, moving, thinned, to_poses, to_vectors
 from wiw.policies.diffuser.sight import Lens
 from wiw.tabletop.workbench import CAMERAS
-from wiw.types import Proposal, Space
+from wiw.types import GRIPPER_POSES, Proposal
 
 if TYPE_CHECKING:
     from wiw.policies.diffuser.network import Network
@@ -47,7 +47,7 @@ class Diffuser(Policy):
         WeightsError: no such file, damaged, or of another version.
     """
 
-    space: Space = "pose7"
+    space = GRIPPER_POSES
     needs = ("depth",)
     default_revision = "scripted"
 

@@ -20,7 +20,7 @@ from wiw.physics import place
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.tabletop.kind import Kind
 from wiw.tabletop.kinds import kind_of
-from wiw.types import ArmObservation, Proposal, Rollout
+from wiw.types import GRIPPER_POSES, ArmObservation, Proposal, Rollout
 
 MISTAKEN = 0.55
 """Chance that a plan is made for another target; high, because what went wrong is often put right by the next plan."""
@@ -40,7 +40,7 @@ class Scripted(Policy):
     manipulation tasks (`docs/results.md`): there is as much to win as to lose by choosing.
     """
 
-    space = "pose7"
+    space = GRIPPER_POSES
     frames = FrameSpec("front", (240, 240))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:

@@ -20,7 +20,7 @@ from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import looks, plans, presets
 from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.base import Part
 from wiw.vlm.cache import reply_cache
@@ -125,12 +125,6 @@ class VLM(Policy):
         self.tracker = TRACKERS.make(tracker)
         self.needs = tuple(self.tracker.needs)
         self._journal: dict[tuple[int, int], list[Exchange]] = {}
-
-    def for_space(self, space: Space) -> Policy:
-        """The same model asked for poses of a gripper."""
-        from wiw.policies.vlm.arm import ArmVLM
-
-        return self if space == "discrete" else ArmVLM(self)
 
     def describe(self) -> dict[str, Any]:
         """With the model and a digest of the prompts."""

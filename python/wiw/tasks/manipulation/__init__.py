@@ -20,7 +20,7 @@ from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import Robot, own_panda, robot_of
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
-from wiw.types import ArmObservation, Episode, Goal, Wording, checked_seed
+from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Goal, Wording, checked_seed
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
@@ -114,7 +114,7 @@ class Manipulation:
         """Options for `wiw.Agent` that the task prescribes."""
         rules = self.rules
         numbers = {"candidates": rules.candidates, "horizon": rules.horizon, "execute": rules.execute}
-        return {**numbers, "space": "pose7"}
+        return {**numbers, "space": GRIPPER_POSES}
 
     @property
     def stage(self) -> dict[str, Any]:

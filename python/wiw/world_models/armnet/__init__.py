@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.networks import one_thread
-from wiw.types import Conditioning, Control
+from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import accepts
 from wiw.world_models.trained import Trained
 
@@ -41,7 +41,7 @@ class ArmNet(Trained):
     """
 
     accepts = accepts(
-        control="action", space="pose7", view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
+        control="action", space=GRIPPER_POSES, view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
     )
 
     @classmethod

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Conditioning, Control, Space
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -20,10 +20,6 @@ class Oracle(WorldModel):
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
-
-    def for_space(self, space: Space) -> WorldModel:
-        """The fork of a manipulator's world, where plans are poses."""
-        return self if space == "discrete" else ArmOracle()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -51,7 +47,7 @@ class Oracle(WorldModel):
 class ArmOracle(Oracle):
     """The same where plans are poses: a fork of the physics goes to each of them, one after another."""
 
-    accepts = accepts(control="action", space="pose7", view="perspective", needs=("simulator",), best_batch=64)
+    accepts = accepts(control="action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -65,3 +61,8 @@ class ArmOracle(Oracle):
             assert control.ids is not None
             frames[row, 1:] = simulator.fork().fronts_after(control.ids[1:], image.shape[1:3])
         return frames
+
+
+def make_oracle(space: str = PRIMITIVES) -> Oracle:
+    """Return the oracle of a plan space."""
+    return ArmOracle() if space == GRIPPER_POSES else Oracle()

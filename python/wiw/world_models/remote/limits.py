@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from wiw.errors import RemoteError
-from wiw.types import History
+from wiw.types import GRIPPER_POSES, History
 from wiw.wire.messages import MOST_BYTES
 from wiw.wire.rows import Row
 from wiw.world_models.base import Accepts
@@ -52,6 +52,6 @@ def _check_history(history: History, accepts: Accepts) -> None:
     if images != expected:
         raise RemoteError(f"row.history: expected images {expected}, got {images}", "row")
     follows = accepts.control not in ("image", "text")  # those know nothing of primitives or poses
-    width = 7 if accepts.space == "pose7" else 3
+    width = 7 if accepts.space == GRIPPER_POSES else 3
     if follows and history.poses.shape[2] != width:
         raise RemoteError(f"row.history: expected poses of {width} numbers, got {history.poses.shape[2]}", "row")

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from wiw._core import core
-from wiw.policies.base import FrameSpec, Policy, Situation
+from wiw.policies.base import FrameSpec, Situation
 from wiw.policies.vlm import DRAW, DRAWN, REVISE, TOKENS, VLM, cut, seed_of
 from wiw.policies.vlm.arm import looks, plans
 from wiw.policies.vlm.arm.plans import GRID
 from wiw.tabletop.kind import PALETTE
-from wiw.types import Proposal, Rollout, Space
+from wiw.types import GRIPPER_POSES, Proposal, Rollout
 from wiw.vlm import Reply, Request, user
 from wiw.vlm.base import Part
 
@@ -30,24 +30,16 @@ class ArmVLM(VLM):
     an example of the same sort of task. With a world model a second question shows what each plan is imagined to lead
     to; the answer is one of these plans or another. Plans of other policies, which are not made of whole numbers, are
     chosen among as with revision="select".
-
-    Args:
-        policy: the client, prompts and options to ask with.
     """
 
-    space: Space = "pose7"
+    space = GRIPPER_POSES
     frames = FrameSpec("front", (384, 384))
     tasks = ("manipulation",)
     drawn = "a pose was drawn"
 
-    def __init__(self, policy: VLM) -> None:
-        self.__dict__.update(vars(policy))
+    def __init__(self, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
         self.needs = ()
-        self._walking = policy
-
-    def for_space(self, space: Space) -> Policy:
-        """The same model asked for primitives."""
-        return self if space == "pose7" else self._walking
 
     def describe(self) -> dict[str, Any]:
         """With the model and a digest of the prompts."""
