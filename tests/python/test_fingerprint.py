@@ -234,9 +234,9 @@ def test_a_module_that_was_edited_and_not_imported_again_is_another_model(tmp_pa
 @pytest.mark.parametrize(
     ("module", "name", "beside"),
     [
-        ("wiw.world_models.nwm", "NWM", "motion.py"),
-        ("wiw.world_models.warpnet", "WarpNet", "network.py"),
-        ("wiw.world_models.actions.variants", "SVDAction", "injection.py"),
+        ("wiw.world_models.nwm.model", "NWM", "motion.py"),
+        ("wiw.world_models.warpnet.model", "WarpNet", "network.py"),
+        ("wiw.world_models.video.actions.variants", "SVDAction", "injection.py"),
     ],
 )
 def test_all_files_of_a_built_in_model_count(module, name, beside, monkeypatch):

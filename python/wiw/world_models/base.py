@@ -153,6 +153,8 @@ class WorldModel(ABC):
 
     accepts: Accepts
     requires: ClassVar[Requirements] = Requirements()
+    credits: float | None = None
+    """What a paid service has charged so far, in its credits; None where imagining costs nothing."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
