@@ -45,14 +45,14 @@ class Function(WorldModel):
         return frames
 
     def describe(self) -> dict[str, Any]:
-        """Return the function's name."""
+        """The function's name."""
         return {"name": getattr(self.function, "__qualname__", type(self.function).__name__)}
 
     def fingerprint(self) -> str:
-        """Refuse: what a function reads outside itself is unknown.
+        """Nothing.
 
         Raises:
-            ArgumentError: always.
+            ArgumentError: always; what a function reads outside itself cannot be told.
         """
         raise ArgumentError(
             "rollouts of a function cannot be cached: nobody can tell what it reads outside itself. Write a class with "

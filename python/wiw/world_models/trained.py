@@ -61,7 +61,7 @@ class Trained(WorldModel):
         }
 
     def fingerprint(self) -> str:
-        """Return a digest of code, weights and torch's version, wherever the weights lie."""
+        """Digest of code, weights and torch's version; where the weights lie does not count."""
         said = {**self.describe(), "weights": None}
         return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 

@@ -104,7 +104,7 @@ class Remote(WorldModel):
         return {"name": "Remote", "model": model, "fingerprint": self._welcome.fingerprint or None}
 
     def fingerprint(self) -> str:
-        """Return the served model's own fingerprint.
+        """The served model's own.
 
         Raises:
             ArgumentError: the server cannot tell it.

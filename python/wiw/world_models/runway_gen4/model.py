@@ -128,7 +128,7 @@ class RunwayGen4(WorldModel):
         }
 
     def fingerprint(self) -> str:
-        """Return a digest of code and options; the service may change without notice."""
+        """Digest of code and options; the service may change without notice."""
         said = {name: value for name, value in self.describe().items() if name not in ("batch", "budget", "poll")}
         return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 

@@ -86,7 +86,7 @@ class VideoModel(WorldModel):
     """Rows that one call of the pipeline can take."""
     frame_per_action: ClassVar[bool] = False
     """Whether frame k of a clip follows action k, however long the plan: for models that do not read it."""
-    ignored_in_fingerprint: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
+    immaterial: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
     """Options that frames do not depend on: where the weights lie, which have a digest, and how they are run."""
 
     weights: str
@@ -205,8 +205,8 @@ class VideoModel(WorldModel):
         return {**super().describe(), "pipeline": self.pipeline_class, **self._weights.identity, **loading.versions()}
 
     def fingerprint(self) -> str:
-        """Return a digest of code, options, weights and versions, whatever place the weights are loaded from."""
-        said = {name: value for name, value in self.describe().items() if name not in self.ignored_in_fingerprint}
+        """Digest of code, options, weights and versions; where the weights lie and how they are kept does not count."""
+        said = {name: value for name, value in self.describe().items() if name not in self.immaterial}
         said["device"] = str(self.device).partition(":")[0]
         return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from wiw.world_models.video.actions.conditioning import ActionConditioning
 
 PANORAMA = (576, 1024)
+POSES = {"space": "pose7", "view": "perspective", "null_first": False}
+"""What a model of poses accepts otherwise than one of primitives."""
 
 
 class ActionConditioned(WorldModel):
@@ -85,14 +87,10 @@ class ActionConditioned(WorldModel):
         pipeline = getattr(diffusers, self.generator_class.pipeline_class)
         self._lora = has_lora(self._folder, self.denoisers, pipeline)
         self.generator = self.generator_class.with_networks(self._load_denoisers, **options)
-        declared: dict[str, Any] = {
-            name: getattr(self.generator.accepts, name) for name in ("size", "frames", "best_batch")
-        }
-        if discrete:
-            self.accepts = replace(type(self).accepts, **declared, vocabulary=self._config.ids)
-        else:
-            poses = {"space": "pose7", "view": "perspective", "null_first": False}
-            self.accepts = replace(type(self).accepts, **declared, **poses)
+        control = {"vocabulary": self._config.ids} if discrete else POSES
+        clip = self.generator.accepts
+        dimensions = {"size": clip.size, "frames": clip.frames, "best_batch": clip.best_batch}
+        self.accepts = replace(type(self).accepts, **dimensions, **control)  # type: ignore[arg-type]
         with memory_guard(self.generator):
             self.conditioning = self._condition_denoisers()
 

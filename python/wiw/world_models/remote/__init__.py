@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: Apache-2.0
-"""A world model that another process or machine computes; `wiw serve` is the other end."""
