@@ -26,7 +26,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import RegistryError
+from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,10 @@ class Registry:
 
         Raises:
             RegistryError: see `find`; also when the options do not fit the constructor.
+            ConstructionError: the constructor raised something else than an error of wiw (the cause).
         """
         found = self.fitting(what, **options)
-        return self._checked(what, found(**options) if _makes(found) else found)
+        return self._checked(what, self._construct(what, found, options) if _makes(found) else found)
 
     def fitting(self, what: Any, **options: Any) -> Any:
         """What `make` would call with these options, or the instance that it would return.
@@ -96,13 +97,26 @@ class Registry:
             raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
         return found
 
+    def _construct(self, what: Any, factory: Callable[..., Any], options: dict[str, Any]) -> Any:
+        try:
+            return factory(**options)
+        except BaseException as error:
+            if isinstance(error, Error) or asks_to_stop(error):
+                raise
+            name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
+            raise ConstructionError(
+                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_where(error)}"
+            ) from error
+
     def _plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
 
     def _load(self, name: str, load: Callable[[], Any]) -> Any:
         try:
             found = load()
-        except Exception as error:
+        except BaseException as error:  # SystemExit too: a module must not end the process that imports it
+            if asks_to_stop(error):
+                raise
             raise RegistryError(
                 f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
             ) from error

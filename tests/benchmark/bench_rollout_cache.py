@@ -20,9 +20,9 @@ import numpy as np
 from harness import spread
 
 import wiw
-from wiw.evaluation.recipes import TaskRecipe
 from wiw.loop import clock, rollout_cache, scheduler
 from wiw.loop.agent import Agent
+from wiw.runs.recipes import TaskRecipe
 
 SECONDS, EPISODES, DECISIONS, REPEATS = 1.0, 8, 20, 3
 STAGES = {

@@ -14,8 +14,8 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError, FileError
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
+from wiw.runs.recipes import AgentRecipe
 from wiw.tabletop.kinds import KINDS
 from wiw.tabletop.robot import own_panda, robot_of
 from wiw.tabletop.workbench import TABLE, Thing, Workbench

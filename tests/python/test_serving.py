@@ -182,7 +182,7 @@ def test_rows_of_different_lengths_never_share_a_batch():
 
 
 def test_a_whole_run_is_the_same_as_at_home(two_rooms, tmp_path):
-    from wiw.evaluation.store import RunStore
+    from wiw.runs.store import RunStore
     from wiw.tasks.imagenav import ImageNav
 
     def facts(model, name):

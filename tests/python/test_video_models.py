@@ -24,7 +24,7 @@ from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.cli import main
 from wiw.errors import ArgumentError, ContractError, DependencyError, DeviceMemoryError, RegistryError, WeightsError
-from wiw.evaluation.runlog import load_run
+from wiw.studies.run_log import load_run
 from wiw.types import Conditioning, Control
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")

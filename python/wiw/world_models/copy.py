@@ -16,6 +16,7 @@ class Copy(WorldModel):
     """Predict that every future frame equals the present one. A model that scores no better has added nothing."""
 
     accepts = accepts(control="image", view="panorama", causal=True, best_batch=64)
+    version = "1"
 
     def for_space(self, space: Space) -> WorldModel:
         """Return the copy of the front view where plans are poses."""

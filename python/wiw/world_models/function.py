@@ -47,14 +47,3 @@ class Function(WorldModel):
     def describe(self) -> dict[str, Any]:
         """The function's name."""
         return {"name": getattr(self.function, "__qualname__", type(self.function).__name__)}
-
-    def fingerprint(self) -> str:
-        """Nothing.
-
-        Raises:
-            ArgumentError: always; what a function reads outside itself cannot be told.
-        """
-        raise ArgumentError(
-            "rollouts of a function cannot be cached: nobody can tell what it reads outside itself. Write a class with "
-            "`fingerprint`, or leave the cache off"
-        )

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel
-from wiw.world_models.fingerprint import code_digest
 
 if TYPE_CHECKING:
     from torch import nn
@@ -29,6 +28,8 @@ class Trained(WorldModel):
         WeightsError: no such file, damaged, or of another version.
     """
 
+    version = "1"
+    immaterial = ("weights",)
     requires = Requirements(("torch", "safetensors"), "torch")
     _network: Any
 
@@ -59,11 +60,6 @@ class Trained(WorldModel):
             "digest": self._digest(),
             "torch": torch.__version__,
         }
-
-    def fingerprint(self) -> str:
-        """Digest of code, weights and torch's version; where the weights lie does not count."""
-        said = {**self.describe(), "weights": None}
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 
     def _digest(self) -> str:
         digest = blake2b(digest_size=8)

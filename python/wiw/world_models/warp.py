@@ -21,6 +21,7 @@ class Warp(WorldModel):
     """
 
     accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64)
+    version = "1"
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

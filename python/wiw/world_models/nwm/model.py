@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,7 +15,6 @@ from wiw.errors import ArgumentError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
-from wiw.world_models.fingerprint import code_digest
 from wiw.world_models.nwm.motion import SHIFT, motions
 from wiw.world_models.video.loading import versions
 
@@ -57,6 +55,8 @@ class NWM(WorldModel):
     """
 
     accepts = accepts(control="trajectory", view="perspective", size=(480, 480), cacheable=True)
+    version = "1"
+    immaterial = ("weights", "file", "revision", "vae", "vae_revision", "batch")
     requires = Requirements(("torch", "diffusers", "safetensors"), "diffusers", HUB, gpu=True)
 
     weights: str = HUB
@@ -100,12 +100,9 @@ class NWM(WorldModel):
 
         return {**super().describe(), "digest": digest(self._network, self._codec), **versions()}
 
-    def fingerprint(self) -> str:
-        """Digest of code, options, weights and versions; where the weights lie does not count."""
-        apart = {"weights", "file", "revision", "vae", "vae_revision", "batch"}
-        said = {name: value for name, value in self.describe().items() if name not in apart}
-        said["device"] = self._place.type
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+    def identity(self) -> dict[str, Any]:
+        """Return options, weights and versions; which GPU it is does not count."""
+        return {**super().identity(), "device": self._place.type}
 
     def __reduce__(self) -> Any:
         """As options: another process loads the weights itself."""

@@ -35,7 +35,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 HANDSHAKE = 10.0
 HEARTBEAT, SILENCE = 10.0, 30.0
 """Seconds between pings, and without an answer to one until the connection counts as lost."""
-BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "contract"})
+BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "frame 0", "channels", "scale", "contract"})
 """Kinds of `ContractError`."""
 
 Frames = NDArray[np.uint8]

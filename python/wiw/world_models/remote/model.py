@@ -104,13 +104,7 @@ class Remote(WorldModel):
         return {"name": "Remote", "model": model, "fingerprint": self._welcome.fingerprint or None}
 
     def fingerprint(self) -> str:
-        """The served model's own.
-
-        Raises:
-            ArgumentError: the server cannot tell it.
-        """
-        if not self._welcome.fingerprint:
-            raise ArgumentError(f"the server says: {self._welcome.unknown}")
+        """Return the served model's own; empty where it declares no version."""
         return self._welcome.fingerprint
 
     def close(self) -> None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from hashlib import blake2b
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +16,6 @@ from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.clips import frames_after_actions
-from wiw.world_models.fingerprint import code_digest
 from wiw.world_models.runway_gen4.tasks import Tasks
 from wiw.world_models.runway_gen4.videos import encode_data_uri, fetch_video
 
@@ -51,6 +49,8 @@ class RunwayGen4(WorldModel):
     """
 
     accepts = accepts(control="text", view="perspective", frames=25)
+    version = "1"
+    immaterial = ("batch", "budget", "poll")
     requires = Requirements(("runwayml",), "runway", variables=("RUNWAYML_API_SECRET",))
 
     model: Literal["gen4_turbo", "gen4.5"] = "gen4_turbo"
@@ -126,11 +126,6 @@ class RunwayGen4(WorldModel):
             "duration": self.duration,
             "seed": seed % 2**32,
         }
-
-    def fingerprint(self) -> str:
-        """Digest of code and options; the service may change without notice."""
-        said = {name: value for name, value in self.describe().items() if name not in ("batch", "budget", "poll")}
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 
     def __reduce__(self) -> Any:
         """Pickle the options: another process opens its own connection."""

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from hashlib import blake2b
 from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
@@ -18,7 +17,6 @@ from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
 from wiw.world_models.clips import frames_after_actions
-from wiw.world_models.fingerprint import code_digest
 from wiw.world_models.video import loading
 from wiw.world_models.video.loading import Offload, Precision
 from wiw.world_models.video.weights import fetch_weights, require_kind
@@ -66,6 +64,7 @@ class VideoModel(WorldModel):
     """
 
     accepts = accepts(control="text", view="perspective", cacheable=True)
+    version = "1"
     pipeline_class: ClassVar[str]
     """Name in `diffusers`."""
     compatible_pipelines: ClassVar[tuple[str, ...]] = ()
@@ -204,11 +203,9 @@ class VideoModel(WorldModel):
         """Return the options, and what identifies the weights: the hub's commit or a digest of the folder."""
         return {**super().describe(), "pipeline": self.pipeline_class, **self._weights.identity, **loading.versions()}
 
-    def fingerprint(self) -> str:
-        """Digest of code, options, weights and versions; where the weights lie and how they are kept does not count."""
-        said = {name: value for name, value in self.describe().items() if name not in self.immaterial}
-        said["device"] = str(self.device).partition(":")[0]
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+    def identity(self) -> dict[str, Any]:
+        """Return options, weights and versions; which GPU it is does not count."""
+        return {**super().identity(), "device": str(self.device).partition(":")[0]}
 
     @property
     def options(self) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from hashlib import blake2b
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -18,7 +17,6 @@ from wiw.errors import WeightsError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import WorldModel, accepts
-from wiw.world_models.fingerprint import code_digest
 from wiw.world_models.video.actions.config import ActionConfig
 from wiw.world_models.video.loading import memory_guard
 from wiw.world_models.video.model import VideoModel
@@ -51,6 +49,8 @@ class ActionConditioned(WorldModel):
     """
 
     accepts = accepts(control="action", null_first=True, cacheable=True)
+    version = "1"
+    immaterial = (*VideoModel.immaterial, "checkpoint")
     generator_class: ClassVar[type[VideoModel]]
     """The generator that was trained."""
     base: ClassVar[str]
@@ -160,10 +160,10 @@ class ActionConditioned(WorldModel):
             "checkpoint_digest": digest_folder(self._folder),
         }
 
-    def fingerprint(self) -> str:
-        """Return a digest of the generator's fingerprint and the checkpoint, wherever that lies."""
-        content = f"{code_digest(type(self))}{self.generator.fingerprint()}{digest_folder(self._folder)}"
-        return blake2b(content.encode(), digest_size=20).hexdigest()
+    def identity(self) -> dict[str, Any]:
+        """Return options, checkpoint, weights and versions; which GPU it is does not count."""
+        generator = {"device": self.generator.identity()["device"], "generator_version": self.generator.version}
+        return {**super().identity(), **generator}
 
     def __reduce__(self) -> Any:
         """Pickle the options: another process loads the weights itself."""
