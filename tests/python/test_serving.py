@@ -38,8 +38,9 @@ from wiw.types import Conditioning, Control
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
-from wiw.world_models.remote import Remote, link
+from wiw.world_models.remote import link
 from wiw.world_models.remote.limits import check_row
+from wiw.world_models.remote.model import Remote
 
 SIZE = (8, 16)
 

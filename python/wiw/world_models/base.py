@@ -163,6 +163,8 @@ class WorldModel(ABC):
     immaterial: ClassVar[tuple[str, ...]] = ()
     """Options in `describe()` that the answers do not depend on, such as where the weights lie."""
     requires: ClassVar[Requirements] = Requirements()
+    credits: float | None = None
+    """What a paid service has charged so far, in its credits; None where imagining costs nothing."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
