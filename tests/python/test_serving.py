@@ -593,6 +593,15 @@ def test_a_server_that_says_nothing_is_given_up_when_patience_ends(monkeypatch):
         mute.shutdown()
 
 
+@pytest.mark.parametrize("description", ["no JSON", "[" * 100_000 + "]" * 100_000, '"a name"'])
+def test_a_server_that_describes_its_model_in_nonsense_is_refused(description):
+    with served(Plain()) as server:
+        server._welcome = replace(server._welcome, model=description)
+        with pytest.raises(RemoteError, match="description of its model") as caught:
+            Remote(server.address)
+        assert caught.value.kind == "message"
+
+
 def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
     other_size = pack_row(Conditioning(np.zeros((1, 4, 4, 3), np.uint8)), 0, plans(1)[0], 7)
     wrong = {
