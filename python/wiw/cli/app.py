@@ -27,6 +27,7 @@ from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, terminable
+from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
 from wiw.cli.view import view
@@ -102,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Error as error:
         if debug:
             raise
-        print(f"wiw: {error}", file=sys.stderr)
+        print(f"wiw: {printable(error)}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

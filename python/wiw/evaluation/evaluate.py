@@ -20,7 +20,7 @@ from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, agent_recipe, arm_re
 from wiw.evaluation.rows import AgainRow, AgentRow, DecisionRow, LostRow
 from wiw.evaluation.runlog import RunLog
 from wiw.evaluation.scene_map import keep_scene_maps
-from wiw.evaluation.store import RunStore
+from wiw.evaluation.store import RunStore, removed_if_empty
 from wiw.evaluation.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.metrics import Lpips
 from wiw.types import Episode, EpisodeResult, Wording, checked_seed
@@ -284,6 +284,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes)
+        with removed_if_empty(store.path):
+            return _finish(store, task, agents, options.workers, options.progress)
     return _finish(store, task, agents, options.workers, options.progress)
 
 

@@ -12,7 +12,7 @@ import json
 import math
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -408,6 +408,29 @@ class RunStore:
         if not rows:
             raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
         return rows[0][column]
+
+
+@contextmanager
+def removed_if_empty(path: Path) -> Iterator[None]:
+    """Around the work on a new run: where an error ends it before anything was recorded, the run is removed.
+
+    So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
+    interruption leaves it.
+    """
+    try:
+        yield
+    except Exception:
+        with suppress(StoreError), RunStore.read(path) as store:
+            (counted,) = store._rows(
+                "SELECT (SELECT count(*) FROM decision) + (SELECT count(*) FROM outcome) + (SELECT count(*) FROM lost) n"
+            )
+            if counted["n"] == 0:
+                for name in ("", "-wal", "-shm"):
+                    path.with_name(path.name + name).unlink(missing_ok=True)
+                path.with_suffix(".lock").unlink(missing_ok=True)
+                with suppress(OSError):  # other files are in it
+                    path.parent.rmdir()
+        raise
 
 
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
