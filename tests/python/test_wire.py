@@ -130,16 +130,16 @@ def test_declarations_come_out_as_they_went_in(model):
             assert getattr(found.template, name) == getattr(model.template, name)
 
 
-DEEP = "[" * 100_000 + "]" * 100_000
+LONG, DEEP = "x" * 2**20, "[" * 100_000 + "]" * 100_000
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"control": "flying"}', "null", DEEP, '{"vocabulary": %s}' % DEEP])
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"control": "flying"}', "null", DEEP, f'{{"vocabulary": {DEEP}}}'])
 def test_a_declaration_that_is_none_is_refused(text):
     with pytest.raises(RemoteError, match="declaration"):
         declared(text)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", "null", '{"a": "\\ud800"}', DEEP, '{"a": "%s"}' % ("x" * 2**20)])
+@pytest.mark.parametrize("text", ["", "[]", "{", "null", '{"a": "\\ud800"}', DEEP, f'{{"a": "{LONG}"}}'])
 def test_a_description_that_is_none_is_refused(text):
     with pytest.raises(RemoteError, match="description") as caught:
         described(text)
