@@ -20,6 +20,7 @@ from wiw.loop.clock import Clock
 from wiw.loop.contract import (
     PLANS,
     check_answerer,
+    check_depth,
     check_model,
     check_proposals,
     checked_answers,
@@ -229,6 +230,7 @@ class Agent:
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
         """One decision for each live episode; model and reviser see all candidates of all of them at once."""
+        check_depth(self.needs, [query.observation for query in queries])
         clock, meter = Clock(), self.meter()
         proposing, revising = self._situations(queries)
         with clock("propose"):

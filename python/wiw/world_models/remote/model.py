@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import time
@@ -19,7 +18,7 @@ from wiw.errors import ArgumentError, RemoteError
 from wiw.types import Conditioning, Control
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
-from wiw.world_models.remote.declaration import parse_declaration
+from wiw.world_models.remote.declaration import parse_declaration, parse_description
 from wiw.world_models.remote.limits import HISTORY, most_bytes
 from wiw.world_models.remote.link import Link
 
@@ -53,6 +52,7 @@ class Remote(WorldModel):
         try:
             self._welcome = self._link.welcome(patience)
             served = parse_declaration(self._welcome.accepts)
+            self._described = parse_description(self._welcome.model)
         except RemoteError:
             self._close()
             raise
@@ -100,8 +100,7 @@ class Remote(WorldModel):
 
     def describe(self) -> dict[str, Any]:
         """Return what is served, wherever that is: a run may go on with the same model at another address."""
-        model = json.loads(self._welcome.model)
-        return {"name": "Remote", "model": model, "fingerprint": self._welcome.fingerprint or None}
+        return {"name": "Remote", "model": self._described, "fingerprint": self._welcome.fingerprint or None}
 
     def fingerprint(self) -> str:
         """Return the served model's own; empty where it declares no version."""
