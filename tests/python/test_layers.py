@@ -21,6 +21,7 @@ FACES = {
     "weight_file",
     "errors",
     "files",
+    "json_text",
     "registry",
     "networks",
     "panorama",

@@ -152,6 +152,14 @@ def test_without_a_model_the_policy_takes_its_own_best(task: ImageNav) -> None:
     assert decision.rollouts is None and decision.chosen == 0
 
 
+def test_an_observation_without_the_depth_that_is_needed_is_named(task: ImageNav) -> None:
+    env = task.environment()
+    observation, info = env.reset()
+    for agent in (wiw.Agent("matcher"), wiw.Agent("heuristic", "warp", revision="matcher")):
+        with pytest.raises(ArgumentError, match="make the environment with depth=True"):
+            agent.decide(observation, env.goal, key=info["key"])
+
+
 def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) -> None:
     class Flaky(Stamp):
         calls = 0

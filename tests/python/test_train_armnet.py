@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from wiw.training.armnet import CHANGED, Recipe, drawn, followed, led, measured, train, ways  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.plays import FIELDS, POSES, Plays, demonstrated, gathered_plays, played, spoilt  # noqa: E402
-from wiw.world_models.armnet import ArmNet  # noqa: E402
+from wiw.world_models.armnet.model import ArmNet  # noqa: E402
 from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
 from wiw.world_models.armnet.weights import load  # noqa: E402
 

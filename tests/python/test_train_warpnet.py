@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.training.walks import WalkRules, Walks, merged, straight_ways, walk_about  # noqa: E402
 from wiw.training.warpnet import Recipe, drawn, measured, train  # noqa: E402
-from wiw.world_models.warpnet import WarpNet  # noqa: E402
+from wiw.world_models.warpnet.model import WarpNet  # noqa: E402
 from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")

@@ -97,6 +97,13 @@ def test_a_server_without_logprobs_is_asked_for_votes_and_the_reply_says_so() ->
     assert len({call.seed for call in client.asked}) == 6 and {call.temperature for call in client.asked[1:]} == {1.0}
 
 
+@pytest.mark.parametrize("finish", ["content_filter", "refusal"])
+def test_a_withheld_answer_is_no_choice_whatever_tokens_it_lists(finish: str) -> None:
+    likely = (("A", -0.01), ("B", -5.0))
+    reply = ask(MockClient(lambda call: Completion("A", finish, likely)), "Which?", choices=("left", "right"))
+    assert reply.problem is not None and reply.problem.kind == "refusal" and reply.probabilities is None
+
+
 def test_mass_below_one_half_is_doubtful() -> None:
     reply = ask(MockClient(lambda call: {"A": 0.2, " B": 0.1, "The": 0.7}), "Which?", choices=("x", "y"))
     assert reply.doubtful and reply.mass == pytest.approx(0.3)

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import pickle
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -210,6 +212,42 @@ def test_an_error_that_does_not_end_is_not_read_to_its_end(pause: float) -> None
     http.shutdown()
     http.server_close()
     assert error.value.kind == "status" and len(written) < 1000
+
+
+@pytest.mark.parametrize("dripped", ["headers", "status line", "body"])
+def test_a_reply_that_drips_in_takes_no_longer_than_the_timeout(dripped: str) -> None:
+    """The server would need hours; each byte comes well within the time that a single read may take."""
+    opening = {
+        "headers": b"HTTP/1.1 200 OK\r\nX-Drip: ",
+        "status line": b"HTTP/1.1 2",
+        "body": b"HTTP/1.1 200 OK\r\n\r\n",
+    }
+    ended = threading.Event()
+
+    def drip(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            connection.recv(1 << 16)
+            connection.sendall(opening[dripped])
+            while not ended.wait(0.05):
+                connection.sendall(b"0")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    threading.Thread(target=drip, args=(listener.accept()[0],), daemon=True).start()
+
+        threading.Thread(target=serve, daemon=True).start()
+        client = connect(f"http://127.0.0.1:{listener.getsockname()[1]}/v1", model="m", attempts=2, timeout=0.5)
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(client.ask, REQUESTS[2:3])
+            done = wait([asked], 60).done
+            ended.set()
+        assert done, "the client still waits for the headers"
+        with pytest.raises(VlmError, match=r"not complete within 0\.5 s \(2 tries\)") as error:
+            asked.result()
+        assert error.value.kind == "timeout"
 
 
 def test_a_reply_that_is_cut_off_is_asked_for_again() -> None:

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
 from wiw.cli.stop import stoppable
+from wiw.cli.terminal import printable
 
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
@@ -189,7 +190,7 @@ def finish(log: Any, report: bool) -> int:
         count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
         first, cause = failed[0], failed[0]["error"].strip().splitlines()[-1]
         print(
-            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {cause}",
+            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {printable(cause)}",
             file=sys.stderr,
         )
         print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)

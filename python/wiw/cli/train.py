@@ -173,7 +173,7 @@ def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, An
     from wiw.training import warpnet as training
     from wiw.training.gather import gathered_walks
     from wiw.training.walks import WalkRules
-    from wiw.world_models.warpnet import WarpNet
+    from wiw.world_models.warpnet.model import WarpNet
     from wiw.world_models.warpnet.weights import load, save
 
     rules, recipe = WalkRules(**rule), training.Recipe(seed=asked.seed, **how)

@@ -103,7 +103,7 @@ class Agent(BaseAgent):
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
         """What observations must carry beyond images: "depth"."""
-        return tuple(sorted({*self.policy.needs, *self.reviser.needs, *self.components.imaginer.needs}))
+        return self.components.needs
 
     def count_spent(self) -> Counter[str]:
         """Return what the agent's model and policies have been asked for so far."""

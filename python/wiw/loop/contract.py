@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +21,18 @@ class PlanChecker(Protocol):
 
     def check_plan(self, source: str, actions: Any, longest: int) -> NDArray[Any]:
         """See `wiw.loop.plan_space.PlanSpace.check_plan`."""
+
+
+def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
+    """Hold observations to the depth that an agent with these `needs` reads.
+
+    Raises:
+        ArgumentError: an observation has none.
+    """
+    if "depth" in needs and any(observation.depth is None for observation in observations):
+        raise ArgumentError(
+            "this agent needs observations with depth, and got one without: make the environment with depth=True"
+        )
 
 
 def check_kind(model: WorldModel, space: str, words: str) -> None:

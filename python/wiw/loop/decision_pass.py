@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.config import AgentConfig
-from wiw.loop.contract import check_answers, check_proposals, check_scores
+from wiw.loop.contract import check_answers, check_depth, check_proposals, check_scores
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NothingImagined, Request
 from wiw.loop.ledger import Ledger
 from wiw.loop.memory import EpisodeMemories, Query
@@ -37,6 +37,11 @@ class Components:
     observers: Sequence[Observer]
     memories: EpisodeMemories
 
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """What observations must carry beyond images: "depth"."""
+        return tuple(sorted({*self.policy.needs, *self.reviser.needs, *self.imaginer.needs}))
+
     def count_spent(self) -> Counter[str]:
         """Return what model and policies have been asked for so far."""
         counts = Counter[str](self.policy.spent)
@@ -58,6 +63,7 @@ class DecisionPass:
 
     def __init__(self, parts: Components, queries: Sequence[Query]) -> None:
         self._parts, self._queries = parts, queries
+        check_depth(parts.needs, [query.observation for query in queries])
         self._ledger = Ledger(parts.count_spent, len(queries))
         self._proposing, self._revising = parts.memories.recall(queries, parts.imaginer)
         with self._ledger.clock("platform"):

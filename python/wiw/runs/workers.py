@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -275,14 +276,21 @@ def _threads_shared(workers: int) -> Iterator[None]:
 
 
 def _work(pipe: Connection) -> None:
-    """A worker's life: None means "give me a job"; an end of the pipe means that the parent has gone."""
+    """A worker's life: None means "give me a job"; an end of the pipe means that the parent has gone.
+
+    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:
         _serve(pipe)
     except (EOFError, BrokenPipeError):
-        return
+        pass
     except Exception as error:
         pipe.send(_portable(error))
+    pipe.close()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _serve(pipe: Connection) -> None:

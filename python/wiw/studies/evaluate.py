@@ -24,7 +24,7 @@ from wiw.runs.execute import (
 )
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
-from wiw.runs.store import RunStore
+from wiw.runs.store import RunStore, removed_if_empty
 from wiw.studies.run_log import RunLog
 from wiw.types import Wording, checked_seed
 
@@ -276,6 +276,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes)
+        with removed_if_empty(store.path):
+            return _finish(store, task, agents, options.workers, options.progress)
     return _finish(store, task, agents, options.workers, options.progress)
 
 

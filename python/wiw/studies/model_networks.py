@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 from wiw.world_models.base import WorldModel
-from wiw.world_models.remote import Remote
+from wiw.world_models.remote.model import Remote
 
 NESTED = 3
 """Objects inside each other that are looked into for networks."""

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from wiw.physics import Articulation, read_surface
 from wiw.tabletop.shapes import Mesh, joined, mesh_of, painted
 
+Looks = tuple[tuple[int, Mesh], ...]
+"""(link, mesh in the link's frame) of every link that is seen."""
+
 
 @cache
-def looks_of(robot: Articulation) -> tuple[tuple[int, Mesh], ...]:
+def looks_of(robot: Articulation) -> Looks:
     """(link, mesh in the link's frame) of every link that is seen; primitives have their edges broken.
 
     Raises:

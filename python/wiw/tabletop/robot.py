@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from os import PathLike
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Gripper, InverseKinematics, World, panda
-from wiw.tabletop.looks import looks_of
-from wiw.tabletop.shapes import Mesh
+from wiw.tabletop.description import read_description
+from wiw.tabletop.looks import Looks, looks_of
 
 TOOLS = ("tcp", "grasptarget", "grasp_target", "tool", "tip", "ee")
 """Words in the name of the link between the finger tips, the most telling first."""
@@ -41,11 +42,13 @@ class Robot:
     finger_joints: tuple[str, str]
     identity: dict[str, Any] = field(default_factory=dict)
     """JSON-able: equal for equal robots."""
+    file_looks: Looks | None = field(default=None, compare=False, repr=False)
+    """What the links look like, of a robot whose files were read in a process of their own."""
 
     @cached_property
-    def looks(self) -> tuple[tuple[int, Mesh], ...]:
+    def looks(self) -> Looks:
         """(link, mesh in the link's frame) of every link that is seen."""
-        return looks_of(self.description)
+        return looks_of(self.description) if self.file_looks is None else self.file_looks
 
     @cached_property
     def tcp_index(self) -> int:
@@ -102,24 +105,41 @@ def robot_of(file: str | PathLike[str], tcp: str = "") -> Robot:
             for and what there is.
     """
     path = Path(file).expanduser().absolute()
-    description = Articulation(path)
-    digest = hashlib.sha256(path.read_bytes())
-    for mesh in description.meshes:
-        digest.update(Path(mesh).read_bytes() if Path(mesh).is_file() else b"")
-    key = path, digest.hexdigest()[:16], tcp
-    if key not in _MADE:
-        identity = {"name": path.name, "digest": key[1], **({"tcp": tcp} if tcp else {})}
-        robot = _robot(description, tcp, identity)
-        _ = robot.looks, robot.ready  # what cannot be drawn or used is told here
-        _MADE[key] = robot
-    return _MADE[key]
+    known = _KNOWN.get((path, tcp))
+    if known is not None and known.digest == _digest_of(path, known.meshes):
+        return known.robot
+    description = read_description(path)
+    meshes = tuple(map(Path, description.articulation.meshes))
+    digest = _digest_of(path, meshes)
+    identity = {"name": path.name, "digest": digest, **({"tcp": tcp} if tcp else {})}
+    robot = _robot(description.articulation, tcp, identity, description.looks)
+    _ = robot.ready  # an arm that does not come there is refused here
+    _KNOWN[path, tcp] = _Known(digest, meshes, robot)
+    return robot
 
 
-_MADE: dict[tuple[Path, str, str], Robot] = {}
-"""By file, digest of it and its meshes, and link between the finger tips."""
+@dataclass(frozen=True)
+class _Known:
+    """A robot, and what it was read from."""
+
+    digest: str
+    meshes: tuple[Path, ...]
+    robot: Robot
 
 
-def _robot(description: Articulation, tcp: str, identity: dict[str, Any]) -> Robot:
+_KNOWN: dict[tuple[Path, str], _Known] = {}
+"""By file and link between the finger tips."""
+
+
+def _digest_of(path: Path, meshes: Sequence[Path]) -> str:
+    """Digest of a description and its meshes."""
+    state = hashlib.sha256(path.read_bytes() if path.is_file() else b"")
+    for mesh in meshes:
+        state.update(mesh.read_bytes() if mesh.is_file() else b"")
+    return state.hexdigest()[:16]
+
+
+def _robot(description: Articulation, tcp: str, identity: dict[str, Any], looks: Looks | None = None) -> Robot:
     left, right = _fingers(description)
     hand = left["parent"]
     robot = Robot(
@@ -129,6 +149,7 @@ def _robot(description: Articulation, tcp: str, identity: dict[str, Any]) -> Rob
         (left["child"], right["child"]),
         (left["name"], right["name"]),
         identity,
+        looks,
     )
     _check_frame(robot)
     return robot

@@ -26,9 +26,9 @@ from wiw.world_models.armnet.network import (
     Arm,
     Motion,
     Network,
-    cleared,
-    composed,
-    imagined_in_sight,
+    clear_arm,
+    compose_view,
+    find_visible_arm,
     in_sight,
     sources,
     still,
@@ -193,13 +193,13 @@ def followed(network: Network, ways: Ways, bfloat16: bool = False) -> Iterator[S
     for k, motion in enumerate(ways.motions):
         before, arm = ways.arms[k : k + 2]
         step = _step(network, canvas, before.mask, arm, motion, ways.seen[k + 1], bfloat16)
-        canvas = cleared(step.made.detach(), arm, imagined_in_sight(step.shares.detach(), arm), plate, canvas)
+        canvas = clear_arm(step.made.detach(), arm, find_visible_arm(step.shares.detach(), arm), plate, canvas)
         yield step
 
 
 def clear_view(seen: Tensor, arm: Arm, before: Tensor) -> Tensor:
     """The canvas after a true view."""
-    return cleared(seen, arm, in_sight(seen, arm), bare_table(), before)
+    return clear_arm(seen, arm, in_sight(seen, arm), bare_table(), before)
 
 
 def led(network: Network, ways: Ways, bfloat16: bool = False) -> Iterator[Step]:
@@ -222,7 +222,7 @@ def _step(
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         mixture = network(canvas, arm, before, motion, plate)
     parts = sources(mixture, canvas, arm, motion, plate)
-    return Step(composed(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
+    return Step(compose_view(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
 
 
 def _loss(step: Step, recipe: Recipe) -> Tensor:

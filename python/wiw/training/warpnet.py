@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.reproject import pose, warp
 from wiw.training.course import taught, up_and_down
 from wiw.training.walks import Walks, straight_ways
-from wiw.world_models.warpnet import WarpNet, to_network
+from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
 
 STRIDE = 0.2
@@ -204,7 +204,7 @@ def _scene(model: WarpNet, name: str, seed: int, ways: int) -> list[dict[tuple[s
         for steps, target in zip(STEPS, color[1:], strict=True):
             shown = {
                 "copy": color[0],
-                "warpnet": model.moved(color[0], steps * STRIDE, 0.0),
+                "warpnet": model.imagine_move(color[0], steps * STRIDE, 0.0),
                 "warp": warp(color[:1], depth, pose(forward=steps * STRIDE)[None, None])[0, 0],
             }
             for made, image in shown.items():

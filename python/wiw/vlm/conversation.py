@@ -124,7 +124,7 @@ def _ballots(
     if listed:
         completions = yield calls
         found = [
-            _counted(choices.from_logprobs(completion.logprobs or (), own), completion, "logprobs")
+            _counted(choices.from_logprobs(_listed(completion), own), completion, "logprobs")
             for completion, own in zip(completions, labels, strict=True)
         ]
     open_ = [place for place, reply in enumerate(found) if reply is None]
@@ -143,6 +143,11 @@ def _ballots(
             detail = f"none of {votes} answers begins with one of the {len(labels[place])} letters"
             return Reply(texts[0].text, problem=refused or structured.problem("no_option", detail, texts[0]))
     return found
+
+
+def _listed(completion: Completion) -> tuple[tuple[str, float], ...]:
+    """What counts as listed tokens: none of an answer that was withheld."""
+    return () if completion.finish in structured.REFUSED else completion.logprobs or ()
 
 
 def _text(completion: Completion) -> str:

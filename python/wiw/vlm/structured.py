@@ -17,6 +17,8 @@ MOST = 1 << 16
 """Characters of an answer; longer ones are not looked into."""
 RAW = 500
 """Characters of an unusable answer that are kept."""
+REFUSED = ("refusal", "content_filter")
+"""Ends of an answer that the model or its server withheld."""
 _SYNTAX = re.compile(r"""\\["'\\/bfnrt]|[\s"'`,:;\[\]{}\u2018\u2019\u201c\u201d]""")
 _REFUSALS = ("i'm sorry", "i am sorry", "i can't", "i cannot", "sorry,", "i'm unable", "i am unable", "as an ai")
 
@@ -30,7 +32,7 @@ def unfit(completion: Completion) -> Problem | None:
     """What is wrong with a completion whatever was asked for; None where it may be looked into."""
     if completion.finish == "huge" or len(completion.text) > MOST:
         return problem("huge", f"more than {MOST} characters", completion)
-    if completion.finish in ("refusal", "content_filter"):
+    if completion.finish in REFUSED:
         return problem("refusal", f"the model refused ({completion.finish})", completion)
     if not completion.text.strip():
         return problem("empty", "no text", completion)

@@ -189,6 +189,8 @@ class WorldModel(ABC):
     immaterial: ClassVar[tuple[str, ...]] = ()
     """Options in `describe()` that the answers do not depend on, such as where the weights lie."""
     requires: ClassVar[Requirements] = Requirements()
+    credits: float | None = None
+    """What a paid service has charged so far, in its credits; None where imagining costs nothing."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -220,7 +222,7 @@ class WorldModel(ABC):
     @property
     def spent(self) -> Mapping[str, float]:
         """What the model has used up so far, for the cost ledger (`Decision.spent`)."""
-        return {}
+        return {} if self.credits is None else {"credits": self.credits}
 
     @classmethod  # noqa: B027 - most models have nothing to say
     def require(cls, task: Mapping[str, Any]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the world models of `wiw train` share: weights that come with wiw or from a file, and what they are told by."""
+"""What the world models of `wiw train` share: weights that come with wiw or from a file, and their identity."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ class Trained(WorldModel):
     @staticmethod
     @abstractmethod
     def _load(weights: str | Path | None) -> tuple[nn.Module, dict[str, Any]]:
-        """Network and card of a file, or of the built-in one. Imports torch."""
+        """Return network and card of a file, or of the built-in one. Imports torch."""
 
     @classmethod
     def of(cls: type[T], network: nn.Module) -> T:
-        """The world model of a network at hand, such as one in training."""
+        """Make the world model of a network at hand, such as one in training."""
         model = cls.__new__(cls)
         model.weights, model._network, model.card = None, network.eval(), {}
         return model
 
     def describe(self) -> dict[str, Any]:
-        """The weights' file and a digest of them, and torch's version."""
+        """Return the weights' file, a digest of them, and torch's version."""
         import torch
 
         return {
