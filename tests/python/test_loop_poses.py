@@ -214,6 +214,28 @@ def test_words_are_the_policys_or_made_of_the_poses() -> None:
     assert model._calls[-1][1][0].text == wiw.action.to_text(plan_of(2))
 
 
+def test_a_model_with_a_memory_sees_the_front_views_and_gripper_poses_of_earlier_decisions() -> None:
+    model = Spy(control="action", space="pose7", frames=14, best_batch=9, needs=("history",), history=3)
+    reacher = Reacher()
+    reacher.score = lambda situations, *_: [np.array([1.0, 0.0]) for _ in situations]
+    agent = wiw.Agent(reacher, model, candidates=2, horizon=5, execute=2)
+    env = DotEnv(DotTask())
+    observation, seen, carried = env.begin(DotTask().episodes(1)[0]), [], []
+    for decision in range(4):
+        seen.append(observation)
+        chosen = agent.decide(observation, env.goal, Key(0, 0, decision))
+        carried.append(chosen.actions[: chosen.execute])
+        observation = env.run(carried[-1]).observation
+    young, old = model._calls[1][0].history, model._calls[3][0].history
+    assert young.count.tolist() == [2, 2] and old.count.tolist() == [3, 3]
+    np.testing.assert_array_equal(old.poses, [[each.pose for each in seen[1:]]] * 2)
+    np.testing.assert_array_equal(young.poses[:, 0], young.poses[:, 1])
+    np.testing.assert_array_equal(old.actions, [carried[1:3]] * 2)
+    np.testing.assert_array_equal(old.images[:, -1], model._calls[3][0].image)
+    np.testing.assert_array_equal(old.images[:, :2], [[model._calls[k][0].image[0] for k in (1, 2)]] * 2)
+    assert (old.images[0, 0] != old.images[0, 1]).any()
+
+
 def test_choosing_by_imagination_pays(tmp_path: Path) -> None:
     arms = {
         name: wiw.Agent(Reacher(), model, placebo=placebo)
