@@ -39,8 +39,8 @@ def attribute(
         found.summary()
         found["warp"].verdicts      # {"imagination": 3, "scoring": 12, "proposals": 7, "joint": 1, "beyond": 0}
 
-    Each failed episode is run again with the oracle world model, with plans scored by the truth, with a true plan among
-    the proposals, and with all three (`wiw.experiments.ground_truth`). What is run is kept in the folder `blame`; calling
+    Each failed episode is run again with the oracle world model, with plans scored by the truth, with a true plan
+    among the proposals, and with all three (`wiw.experiments.ground_truth`). What is run is kept in `blame`; calling
     it again goes on where it was stopped, and runs nothing twice.
 
     Args:

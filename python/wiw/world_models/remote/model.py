@@ -19,7 +19,7 @@ from wiw.types import Conditioning, Control
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
 from wiw.world_models.remote.declaration import parse_declaration, parse_description
-from wiw.world_models.remote.limits import HISTORY, most_bytes
+from wiw.world_models.remote.limits import most_bytes
 from wiw.world_models.remote.link import Link
 
 TOKEN = "WIW_TOKEN"
