@@ -24,9 +24,9 @@ from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.policies.base import Situation
 from wiw.policies.diffuser import paths
 from wiw.policies.diffuser.sight import CELL, NOWHERE, WORKSPACE, Lens
-from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE
-from wiw.training.demonstrate import Collection, demonstrated
+from wiw.training.recording import Collection, record_demonstration
 from wiw.types import ArmObservation, Goal, Key
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
@@ -37,7 +37,7 @@ from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised, sampled  # noqa
 from wiw.policies.diffuser.network import Network, Scene, Shape  # noqa: E402
 from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
-from wiw.training.diffuser import Moments, Recipe, moments, train  # noqa: E402
+from wiw.training.diffuser import Recipe, Samples, extract_samples, train  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -50,13 +50,14 @@ HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
 def shown() -> list[Demonstration]:
     """A block slid, and a ring put on a peg."""
     return [
-        demonstrated(KINDS[name], 3, Collection(frames=16, depth=True))[0] for name in ("slide_block", "insert_peg")
+        record_demonstration(TABLETOP_TASKS[name], 3, Collection(frames=16, depth=True))[0]
+        for name in ("slide_block", "insert_peg")
     ]
 
 
 @pytest.fixture(scope="module")
-def seen(shown: list[Demonstration]) -> Moments:
-    return moments(shown, LENS)
+def seen(shown: list[Demonstration]) -> Samples:
+    return extract_samples(shown, LENS)
 
 
 def untrained(seed: int = 0) -> Diffuser:
@@ -74,20 +75,20 @@ def situation(each: Demonstration, key: Key, imagines: bool = True) -> Situation
 
 def test_points_are_where_the_renderer_has_them() -> None:
     """The pixels of a square that lies on the table, by its id, against where it was put; and back into the picture."""
-    setup = KINDS["slide_block"].setup(1, 0)
-    bench = setup.bench()
-    picture = bench.picture("front", (480, 480), ("depth", "instance"))
+    setup = TABLETOP_TASKS["slide_block"].create_setup(1, 0)
+    bench = setup.build_workbench()
+    picture = bench.render_view("front", (480, 480), ("depth", "instance"))
     points = LENS.points(picture["depth"])
     for name in ("green", "blue"):
         ids = [number for number, other in enumerate(bench.names, 1) if other == name]
         found = points[np.isin(picture["instance"], ids)]
         assert len(found) > 100
         np.testing.assert_allclose(
-            (found[:, :2].min(0) + found[:, :2].max(0)) / 2, bench.place_of(name)[:2, 3], atol=4e-3
+            (found[:, :2].min(0) + found[:, :2].max(0)) / 2, bench.get_pose(name)[:2, 3], atol=4e-3
         )
         np.testing.assert_allclose(found[:, 2], TABLE + 0.002, atol=2e-3)
     rows, columns = np.nonzero(points[..., 2] > 0)
-    back = CAMERAS["front"].pixels_of(points[rows, columns], (480, 480))
+    back = CAMERAS["front"].project_points(points[rows, columns], (480, 480))
     np.testing.assert_allclose(back, np.stack([columns, rows], axis=1) + 0.5, atol=1e-6)
 
 
@@ -225,9 +226,9 @@ def test_vectors_are_poses(poses: Any) -> None:
 
 def test_a_dense_path_leads_through_its_poses_and_is_thinned_to_them() -> None:
     """For each kind's expert; the gripper changes where it gets to, no sooner."""
-    for kind in KINDS.values():
-        setup = kind.setup(5, 1)
-        plan = kind.expert(setup.bench().places(setup.objects), setup.target)[:6]
+    for kind in TABLETOP_TASKS.values():
+        setup = kind.create_setup(5, 1)
+        plan = kind.plan_expert(setup.build_workbench().get_poses(setup.objects), setup.target)[:6]
         path = paths.dense(HERE, plan, 50)
         assert path.shape == (50, 7)
         ends = np.rint(50 * np.arange(1, len(plan) + 1) / len(plan)).astype(int) - 1
@@ -293,30 +294,30 @@ def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstra
 # -- training ----------------------------------------------------------------------------------------------------------
 
 
-def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: Moments) -> None:
+def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: Samples) -> None:
     assert len(seen) == 2 and seen.path.shape == (2, 6, 7)
-    setup = KINDS["slide_block"].setup(shown[0].seed, shown[0].variation)
-    plan = KINDS["slide_block"].expert(shown[0].places, setup.target)
+    setup = TABLETOP_TASKS["slide_block"].create_setup(shown[0].seed, shown[0].variation)
+    plan = TABLETOP_TASKS["slide_block"].plan_expert(shown[0].places, setup.target)
     np.testing.assert_allclose(seen.path[0][[0, 1, 2, 3, 5], :6], plan[[0, 1, 2, 3, 3], :6], atol=1e-6)
     np.testing.assert_array_equal(seen.pose[0], shown[0].poses[0])
     rows, columns = LENS.window((480, 480))
     np.testing.assert_array_equal(seen.sight.image[0], shown[0].images[0][rows, columns])
-    pushes, _ = demonstrated(KINDS["push_buttons"], 1, Collection(frames=16, depth=True))
-    two = moments([pushes], LENS)
+    pushes, _ = record_demonstration(TABLETOP_TASKS["push_buttons"], 1, Collection(frames=16, depth=True))
+    two = extract_samples([pushes], LENS)
     assert len(two) == 2
     np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
     np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
     lit = two.sight.image[1].astype(int) - two.sight.image[0]
     assert np.abs(lit).max() > 60
     with pytest.raises(ArgumentError, match="--depth"):
-        moments([replace(shown[0], encoded_depths=None)], LENS)
+        extract_samples([replace(shown[0], encoded_depths=None)], LENS)
     with pytest.raises(ArgumentError, match="push_buttons"):
-        moments([replace(shown[0], task="juggle")], LENS)
+        extract_samples([replace(shown[0], task="juggle")], LENS)
     with pytest.raises(ArgumentError, match="got none"):
-        moments([], LENS)
+        extract_samples([], LENS)
 
 
-def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Moments) -> None:
+def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Samples) -> None:
     recipe = Recipe(epochs=150, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
     network, _ = train(seen, recipe)
     policy = Diffuser.of(network)
@@ -327,7 +328,7 @@ def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen:
         assert (stops[..., 6] == path[:, 6]).mean() > 0.8
 
 
-def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_path: Path) -> None:
+def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_path: Path) -> None:
     recipe = Recipe(epochs=3, batch=1, levels=2, width=24, layers=1)
     whole, _ = train(seen, recipe)
     file = tmp_path / "checkpoint"
@@ -337,17 +338,17 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(seen, recipe, show=stop, checkpoint=Checkpoint(file, {"a": 1}, seconds=0))
+        train(seen, recipe, on_step=stop, checkpoint=Checkpoint(file, {"a": 1}, seconds=0))
     steps: list[int] = []
-    on, _ = train(seen, recipe, show=lambda step, *_: steps.append(step), checkpoint=Checkpoint(file, {"a": 1}))
+    on, _ = train(seen, recipe, on_step=lambda step, *_: steps.append(step), checkpoint=Checkpoint(file, {"a": 1}))
     assert steps == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, on.state_dict()[name])
-    with pytest.raises(ArgumentError, match="another training"):
-        Checkpoint(file, {"a": 2}).stand()
+    with pytest.raises(ArgumentError, match="other data or options"):
+        Checkpoint(file, {"a": 2}).load()
     file.write_bytes(file.read_bytes()[:50])
     with pytest.raises(FileError, match="delete it"):
-        Checkpoint(file, {"a": 1}).stand()
+        Checkpoint(file, {"a": 1}).load()
     with pytest.raises(ArgumentError, match="epochs"):
         Recipe(epochs=0)
 
@@ -365,19 +366,19 @@ class _Bytes:
 def test_a_checkpoint_damaged_anyhow_is_told(tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
     checkpoint = Checkpoint(file, {"a": 1}, seconds=0)
-    checkpoint.keep(_Bytes(), 3, 2)
-    assert checkpoint.stand().step == 2
+    checkpoint.save_if_due(_Bytes(), 3, 2)
+    assert checkpoint.load().step == 2
     whole = file.read_bytes()
     rng = np.random.default_rng(0)
     for _ in range(300):
         at, bits = int(rng.integers(len(whole))), int(rng.integers(1, 256))
         file.write_bytes(whole[:at] + bytes([whole[at] ^ bits]) + whole[at + 1 :])
         with suppress(FileError, ArgumentError):
-            checkpoint.stand()
+            checkpoint.load()
     for data in (b"", b"PK", b"\x80\x02]q\x00.", b"\x80\x02X\x01\x00\x00\x00\xff.", whole[:900], rng.bytes(99)):
         file.write_bytes(data)
-        with pytest.raises(FileError, match="delete it to begin anew"):
-            checkpoint.stand()
+        with pytest.raises(FileError, match="delete it to start again"):
+            checkpoint.load()
 
 
 def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
@@ -386,7 +387,7 @@ def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, kept[1]))
     try:
         with pytest.raises(FileError, match="free space"):
-            Checkpoint(tmp_path / "checkpoint", {}, seconds=0).keep(_Bytes(), 3, 2)
+            Checkpoint(tmp_path / "checkpoint", {}, seconds=0).save_if_due(_Bytes(), 3, 2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, kept)
         signal.signal(signal.SIGXFSZ, handler)
@@ -399,14 +400,22 @@ def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFi
     assert "--demonstrations" in capsys.readouterr().err
     assert main(["train", "warpnet", *out, "--demonstrations", str(tmp_path)]) == 2
     assert "leave it out" in capsys.readouterr().err
-    needless = {"scenes": "a.glb", "val": "a.glb", "categories": "bed", "places": "3", "plays": "3", "cache": "c"}
+    needless = {
+        "scenes": "a.glb",
+        "val": "a.glb",
+        "categories": "bed",
+        "places": "3",
+        "plays": "3",
+        "workers": "3",
+        "cache": "c",
+    }
     for flag, value in needless.items():
         assert main(["train", "diffuser", *out, f"--{flag}", value, "--demonstrations", str(tmp_path)]) == 2
         assert f"--{flag}: diffuser " in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "armnet or diffuser" in said and "for a night" in said
+    assert "armnet or diffuser" in said and "takes a night" in said
 
 
 def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
 from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
 from wiw.tabletop.workbench import CAMERAS, TABLE
-from wiw.tasks.manipulation import KINDS, Manipulation
+from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Goal, Key, Proposal
 from wiw.vlm.base import Call
 from wiw.vlm.mock import MockClient
@@ -198,20 +198,20 @@ def test_slips_of_syntax_are_mended() -> None:
 
 
 @pytest.mark.parametrize("size", [480, 448])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TABLETOP_TASKS)
 def test_marks_are_on_their_objects_and_hide_little_of_them(kind: str, size: int) -> None:
     task = Manipulation(kind, seed=2)
     for index in range(4):
         table = task.table(task.episode(index))
-        seen = table.bench.picture("front", (size, size), ("color", "instance"))
+        seen = table.bench.render_view("front", (size, size), ("color", "instance"))
         observation = wiw.types.ArmObservation(
-            seen["color"], table.bench.pose, places=table.bench.places(table.objects)
+            seen["color"], table.bench.pose, places=table.bench.get_poses(table.objects)
         )
         drawn = looks.now(observation)
         changed = (drawn != seen["color"]).any(-1)
         assert changed.mean() < 0.03
         spots = plans.indexed(observation.places)
-        points = CAMERAS["front"].pixels_of(np.array([*spots.values()]), (size, size))
+        points = CAMERAS["front"].project_points(np.array([*spots.values()]), (size, size))
         for name, (column, row) in zip(sorted(observation.places), np.floor(points).astype(int), strict=True):
             near = drawn[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
             assert (np.abs(near - (220, 40, 40)).max(-1) < 70).any(), f"{name} has no point"
@@ -238,14 +238,14 @@ EXAMPLES = {"push_buttons": (12, 1), "slide_block": (11, 1), "insert_peg": (12, 
 """Seed and variation of the tables that the examples were taken from."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TABLETOP_TASKS)
 def test_examples_are_true_and_work(kind: str) -> None:
     seed, variation = EXAMPLES[kind]
-    setup = KINDS[kind].setup(seed, variation)
+    setup = TABLETOP_TASKS[kind].create_setup(seed, variation)
     text = Prompts().text("manipulation", "examples", **{**ARM_SLOTS, "instruction": setup.instruction})
     assert text.count("Example") == 1 and f"Instruction: {setup.instruction}\n" in text
-    bench = setup.bench()
-    places = plans.dictionary(bench.places(setup.objects))
+    bench = setup.build_workbench()
+    places = plans.dictionary(bench.get_poses(setup.objects))
     assert re.findall(r"object (\d+): (\[.*\])", text) == [(str(index), str(place)) for index, place in places.items()]
     shown = plans.plan_schema(5).model_validate_json(text.split("Answer:\n")[1])
     (plan,) = plans.plans_in(shown)
@@ -253,11 +253,11 @@ def test_examples_are_true_and_work(kind: str) -> None:
     for index, name in enumerate(sorted(setup.objects), 1):
         assert re.search(rf"object {index}\b[^,]* {name}|{name}, object {index}\b", sight), f"{name} is not named"
     for pose in plan.actions:
-        bench.go(pose)
+        bench.move_to(pose)
     if kind == "stack_cups":  # five actions stack one of two
-        assert np.linalg.norm((bench.place_of("navy") - bench.place_of("gray"))[:2, 3]) < 0.015
+        assert np.linalg.norm((bench.get_pose("navy") - bench.get_pose("gray"))[:2, 3]) < 0.015
     else:
-        assert KINDS[kind].succeeded(bench, setup)
+        assert TABLETOP_TASKS[kind].is_success(bench, setup)
 
 
 def test_each_instruction_has_the_example_of_its_sort() -> None:
@@ -266,13 +266,13 @@ def test_each_instruction_has_the_example_of_its_sort() -> None:
     def shown(**slots: Any) -> str:
         return prompts.text("manipulation", "examples", **{**ARM_SLOTS, **slots})
 
-    for kind in KINDS.values():
-        setups = (kind.setup(seed, variation) for seed in range(3) for variation in range(kind.variations))
+    for kind in TABLETOP_TASKS.values():
+        setups = (kind.create_setup(seed, variation) for seed in range(3) for variation in range(kind.variations))
         found = {shown(instruction=setup.instruction) for setup in setups}
         assert len(found) == 1
         texts |= found
-    assert len(texts) == len(KINDS)
-    assert shown(instruction="open the drawer").count("Example") == len(KINDS)
+    assert len(texts) == len(TABLETOP_TASKS)
+    assert shown(instruction="open the drawer").count("Example") == len(TABLETOP_TASKS)
     assert shown(look_ahead_action_num=2).count('"action"') == 2
 
 

@@ -18,8 +18,8 @@ from scipy.special import ndtri
 from wiw._core import core
 from wiw.physics import place
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.tabletop.kind import Kind
-from wiw.tabletop.kinds import kind_of
+from wiw.tabletop.base import TabletopTask
+from wiw.tabletop.tasks import find_task
 from wiw.types import ArmObservation, Proposal, Rollout
 
 MISTAKEN = 0.55
@@ -59,37 +59,37 @@ class Scripted(Policy):
         """How much each plan's last frame looks as if the instruction were followed, from 0 to 1."""
         scores = []
         for situation, plans in zip(situations, rollouts, strict=True):
-            kind, target = _asked(situation)
+            task, target = _asked(situation)
             places = situation.observation.places
-            scores.append(np.array([kind.looks_done(plan.frames[-1], places, target) for plan in plans]))
+            scores.append(np.array([task.estimate_completion(plan.frames[-1], places, target) for plan in plans]))
         return scores
 
 
-def _asked(situation: Situation) -> tuple[Kind, Any]:
+def _asked(situation: Situation) -> tuple[TabletopTask, Any]:
     """The kind of task and the target that an instruction asks for."""
     text = situation.goal.text or ""
-    kind = kind_of(text)
-    return kind, kind.target_of(text)
+    task = find_task(text)
+    return task, task.parse_target(text)
 
 
 def _plan(situation: Situation, number: int, horizon: int) -> Proposal:
     """One plan, or staying where nothing is left to do."""
-    (kind, target), key = _asked(situation), situation.key
+    (task, target), key = _asked(situation), situation.key
     seen: ArmObservation = situation.observation
     whether, which, *draws = core.uniform(
         core.fold_key([key.seed, key.episode, key.decision, number, PURPOSE]), 2 + 3 * len(seen.places)
     )
-    left = kind.left(seen, target)
+    left = task.find_remaining_target(seen, target)
     if left is None:
         return Proposal(np.tile(seen.pose, (horizon, 1)), text="keep still", note="nothing left to do")
-    rests = [kind.left(seen, other) for other in kind.alternatives(list(seen.places), target)]
+    rests = [task.find_remaining_target(seen, other) for other in task.list_alternatives(list(seen.places), target)]
     others = [rest for rest in rests if rest is not None]
     mistaken = bool(others) and whether < MISTAKEN
     if mistaken:
         left = others[int(which * len(others))]
     believed = _believed(seen.places, np.array(draws).reshape(-1, 3))
-    plan = kind.expert(believed, left, seen.pose)[:horizon]
-    return Proposal(plan, text=kind.say(left), note="another target" if mistaken else "")
+    plan = task.plan_expert(believed, left, seen.pose)[:horizon]
+    return Proposal(plan, text=task.phrase_instruction(left), note="another target" if mistaken else "")
 
 
 def _believed(places: Mapping[str, NDArray[np.float64]], draws: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:

@@ -14,7 +14,7 @@ from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import DRAW, DRAWN, REVISE, TOKENS, VLM, cut, seed_of
 from wiw.policies.vlm.arm import looks, plans
 from wiw.policies.vlm.arm.plans import GRID
-from wiw.tabletop.kind import PALETTE
+from wiw.tabletop.base import PALETTE
 from wiw.types import Proposal, Rollout, Space
 from wiw.vlm import Reply, Request, user
 from wiw.vlm.base import Part

@@ -25,10 +25,10 @@ def now(observation: ArmObservation) -> Image:
     image = observation.front
     size = (image.shape[0], image.shape[1])
     origin = np.array([*GRID.low[:2], TABLE])
-    corner, *ends = CAMERAS["front"].pixels_of(origin + np.vstack([np.zeros(3), AXIS * np.eye(3)]), size)
+    corner, *ends = CAMERAS["front"].project_points(origin + np.vstack([np.zeros(3), AXIS * np.eye(3)]), size)
     image = annotate.axes(image, corner, ends)
     spots = indexed(observation.places)
-    points = CAMERAS["front"].pixels_of(np.array([*spots.values()]).reshape(-1, 3), size)
+    points = CAMERAS["front"].project_points(np.array([*spots.values()]).reshape(-1, 3), size)
     for index, at, side in zip(spots, points, sides_of(points), strict=True):
         image = annotate.mark(image, at, str(index), radius=DOT, gap=side * GAP)
     return image
