@@ -221,9 +221,9 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
     mask = wiw.panorama.to_perspective(observation.target.mask.astype(np.uint8), 90.0, (480, 480), 0.0, 0.0, "nearest")
     track = Track(mask[None] > 0, (observation.target.front_box,))
     look = policy(weights)._looks(Rollout(frames, np.zeros(1, bool), "front"), track)
-    from wiw.perception.glimpses import glimpses
+    from wiw.perception.glimpses import extract_glimpses
 
-    real, _ = glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
+    real, _ = extract_glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
     np.testing.assert_allclose(look.scalars, real.scalars, atol=0.02)
     inside = look.images[0, 0].max(axis=-1) > 0  # nothing is known of what lies beyond the front view
     assert 0.3 < inside.mean() < 1

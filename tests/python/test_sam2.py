@@ -116,7 +116,7 @@ def test_masks_are_read_back_and_lost_targets_left_out(
 
     monkeypatch.setattr(tracker._model, "propagate_in_video_iterator", answer)
     track = follow(tracker, observation())
-    assert track.found.tolist() == [found] * 3
+    assert track.visible.tolist() == [found] * 3
     if found:
         left, top, right, bottom = track.boxes[0]
         shift = 4  # the target's middle is 4 columns right of the panorama's

@@ -75,11 +75,11 @@ def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
     assert accuracy["start + 3 warped"] > accuracy["start"] + 0.06  # half of them help
     looks = lesson[1].glimpses
     red = looks.images[..., 0].mean(axis=(1, 2, 3)) > 1.5 * looks.images[..., 1].mean(axis=(1, 2, 3))
-    from wiw.perception.recognition_network import pictures
+    from wiw.perception.recognition_network import to_network_input
 
     with torch.inference_mode():
-        shown = pictures(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
-        weights = lesson[0].network.looks(shown, torch.from_numpy(looks.scalars))[1].numpy()
+        shown = to_network_input(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
+        weights = lesson[0].network.encode_glimpses(shown, torch.from_numpy(looks.scalars))[1].numpy()
     blocks = looks.images[:, 0, ..., 1].reshape(-1, SIDE // 4, 4, SIDE // 4, 4).mean(axis=(2, 4))
     telling = ~red & (blocks.std(axis=(1, 2)) > 15)
     assert weights[red].mean() < 0.7 * weights[telling].mean()

@@ -218,7 +218,7 @@ def _train_diffuser(
     from wiw.datasets.demonstrations import Demonstrations
     from wiw.envs.sensors import Sensors
     from wiw.errors import ArgumentError
-    from wiw.networks import one_thread
+    from wiw.networks import single_thread
     from wiw.policies.diffuser.sight import Lens
     from wiw.policies.diffuser.weights import save
     from wiw.training import diffuser as training
@@ -239,7 +239,7 @@ def _train_diffuser(
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
-    with one_thread(), _StepBar() as steps:
+    with single_thread(), _StepBar() as steps:
         network, recipe = training.train(samples, recipe, minutes, steps, checkpoint)
     save(out, network, {**card, "recipe": asdict(recipe)})
     checkpoint.remove()
@@ -255,7 +255,7 @@ def _train_armnet(
     recipe_options: dict[str, Any],
 ) -> None:
     from wiw.datasets.demonstrations import read_manifest
-    from wiw.networks import one_thread
+    from wiw.networks import single_thread
     from wiw.training import armnet as training
     from wiw.training.checkpoint import Checkpoint
     from wiw.training.plays import gather_plays, merge_plays, read_demonstration_plays
@@ -271,7 +271,7 @@ def _train_armnet(
         plays = merge_plays([plays, demonstrated])
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
-    with one_thread(), _StepBar() as steps:
+    with single_thread(), _StepBar() as steps:
         network, recipe = training.train(plays, recipe, minutes, steps, checkpoint)
     card["recipe"] = asdict(recipe)
     save(out, network, card)  # before the evaluation, which takes another minute

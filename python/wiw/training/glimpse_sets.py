@@ -16,8 +16,8 @@ from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.visibility import COARSE, seen
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
-from wiw.perception.glimpses import Glimpses, glimpses, joined
-from wiw.perception.tracking import moved_masks, without_specks
+from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
+from wiw.perception.tracking import remove_specks, reproject_masks
 from wiw.reproject import warp
 
 START, NEAR, PERFECT, WARPED = 0, 1, 2, 3
@@ -70,7 +70,7 @@ def merge_glimpse_sets(parts: Sequence[GlimpseSets]) -> GlimpseSets:
         raise ArgumentError("expected scenes that show things of the categories, got none; name others (--scenes)")
     shifts = np.cumsum([0, *counts[:-1]])
     return GlimpseSets(
-        joined([part.glimpses for part in parts]),
+        join_glimpses([part.glimpses for part in parts]),
         np.concatenate([part.owners + shift for part, shift in zip(parts, shifts, strict=True)]),
         np.concatenate([part.kinds for part in parts]),
         np.concatenate([part.labels for part in parts]),
@@ -112,7 +112,7 @@ def collect_glimpse_sets(
         parts += _collect_at_place(world, points[place], labels, tally, core.fold_key([key, number]), rules)
         sizes[place] = 0
     if not parts:
-        return GlimpseSets(joined([]), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
+        return GlimpseSets(join_glimpses([]), np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64))
     return merge_glimpse_sets(parts)
 
 
@@ -148,11 +148,11 @@ def _collect_at_place(
     if not things:
         return []
     here = np.array([ids[0] == thing for thing in things])
-    moved = moved_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
+    moved = reproject_masks(here, depth, relative, depth.shape)[0] if len(relative) else here[:, None][:, :0]
     sets = []
     for thing, masks in zip(things, moved, strict=True):
-        tracked = without_specks(masks)
-        found, frames = glimpses(panoramas, np.concatenate([ids == thing, tracked, tracked]), kinds <= NEAR)
+        tracked = remove_specks(masks)
+        found, frames = extract_glimpses(panoramas, np.concatenate([ids == thing, tracked, tracked]), kinds <= NEAR)
         sets.append(GlimpseSets(found, np.zeros(len(frames), np.int64), kinds[frames], labels[[thing]]))
         tally[int(labels[thing])] += 1
     return sets

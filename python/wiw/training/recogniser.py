@@ -14,9 +14,9 @@ from torch import Tensor
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.perception.calibration import calibration_error, fitted_temperature, softmax
+from wiw.perception.calibration import calibration_error, fit_temperature, softmax
 from wiw.perception.recogniser import Recogniser
-from wiw.perception.recognition_network import Network, pictures
+from wiw.perception.recognition_network import Network, to_network_input
 from wiw.training.glimpse_sets import NEAR, PERFECT, START, WARPED, GlimpseSets
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
@@ -111,11 +111,11 @@ def _compute_loss(
 ) -> Tensor:
     rows, owners = _sample_rows(data, sets, rng)
     shown, scalars = _augment(data, rows, owners, rng)
-    logits, weights = network.train().looks(shown, scalars)
+    logits, weights = network.train().encode_glimpses(shown, scalars)
     places = torch.from_numpy(owners)
     targets = torch.from_numpy(data.labels[sets])
     entropy = torch.nn.functional.cross_entropy
-    together = entropy(network.fused(logits, weights, places, len(sets)), targets, label_smoothing=recipe.smoothing)
+    together = entropy(network.fuse(logits, weights, places, len(sets)), targets, label_smoothing=recipe.smoothing)
     return together + recipe.alone * entropy(logits, targets[places], label_smoothing=recipe.smoothing)
 
 
@@ -150,7 +150,7 @@ def _augment(
     off = rng.uniform(-0.04, 0.04, (len(rows), 1, 4)) * np.concatenate([extent, extent], axis=-1)
     scalars = found.scalars * rng.uniform(0.96, 1.04, found.scalars.shape)
     scalars[:, REAL_COLUMN] = found.scalars[:, REAL_COLUMN]
-    shown = pictures(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
+    shown = to_network_input(torch.from_numpy(found.images), torch.from_numpy((found.boxes + off).astype(np.float32)))
     light = rng.uniform(0.8, 1.2, (owners.max() + 1, 1)) * rng.uniform(0.92, 1.08, (owners.max() + 1, 3))
     gain = torch.from_numpy(np.tile(light[owners], 2).astype(np.float32))[:, :, None, None]
     shown[:, COLOUR_CHANNELS] = (shown[:, COLOUR_CHANNELS] + 1) * gain - 1
@@ -177,10 +177,10 @@ def compute_set_logits(network: Network, data: GlimpseSets, rows: NDArray[np.int
     with torch.inference_mode():
         for i in range(0, len(rows), 256):
             part = slice(i, i + 256)
-            shown = pictures(torch.from_numpy(found.images[part]), torch.from_numpy(found.boxes[part]))
-            parts.append(network.eval().looks(shown, torch.from_numpy(found.scalars[part])))
+            shown = to_network_input(torch.from_numpy(found.images[part]), torch.from_numpy(found.boxes[part]))
+            parts.append(network.eval().encode_glimpses(shown, torch.from_numpy(found.scalars[part])))
         logits, weights = (torch.cat(column) for column in zip(*parts, strict=True))
-        return network.fused(logits, weights, torch.from_numpy(data.owners[rows]), len(data)).double().numpy()
+        return network.fuse(logits, weights, torch.from_numpy(data.owners[rows]), len(data)).double().numpy()
 
 
 GLIMPSE_MIXES = {"start": (START, 0)} | {
@@ -199,7 +199,7 @@ def calibrate(
     fitting = np.concatenate(
         [compute_set_logits(network, calibration, select_rows(calibration, *view)) for view in GLIMPSE_MIXES.values()]
     )
-    recogniser.temperature = fitted_temperature(fitting, np.tile(calibration.labels, len(GLIMPSE_MIXES)))
+    recogniser.temperature = fit_temperature(fitting, np.tile(calibration.labels, len(GLIMPSE_MIXES)))
     logits = {
         name: compute_set_logits(network, held_out, select_rows(held_out, *view))
         for name, view in GLIMPSE_MIXES.items()

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError, DependencyError
-from wiw.networks import one_thread
+from wiw.networks import single_thread
 from wiw.policies.base import Policy, Situation
 from wiw.policies.diffuser.paths import dense, moving, thinned, to_poses, to_vectors
 from wiw.policies.diffuser.sight import Lens
@@ -90,7 +90,7 @@ class Diffuser(Policy):
         observation, pose, network = situation.observation, situation.observation.pose, self._network
         sight = Lens.of(CAMERAS["front"], observation.depth.shape).sight(observation.front, observation.depth)
         drawn = [torch.randn(network.shape.poses, 9, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-        with one_thread(), torch.inference_mode():
+        with single_thread(), torch.inference_mode():
             seen = sight.image, sight.height, sight.places, to_vectors(pose)
             image, height, places, now = (torch.from_numpy(each)[None] for each in seen)
             scene = network.look(image, height, places, now)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from wiw.action import FORWARD
 from wiw.panorama import from_cubemap
-from wiw.perception.glimpses import Glimpses, glimpses, joined
+from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
 from wiw.perception.recogniser import Recogniser
-from wiw.perception.tracking import Track, target_of, track_rollouts
+from wiw.perception.tracking import Track, get_target, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.recogniser import steering
 from wiw.registry import TRACKERS
@@ -102,7 +102,9 @@ class Recognition(Policy):
         """Takes a real look where the target is in sight; one a place, the latest."""
         for situation in situations:
             observation, memory = situation.observation, situation.memory
-            found, _ = glimpses(observation.panorama[None], target_of(observation).mask[None], np.ones(1, bool))
+            found, _ = extract_glimpses(
+                observation.panorama[None], get_target(observation).mask[None], np.ones(1, bool)
+            )
             if not len(found):
                 continue
             here = observation.odometry[:2]
@@ -116,7 +118,7 @@ class Recognition(Policy):
     def _plans(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         observation, memory = situation.observation, situation.memory
         assert observation.depth is not None
-        seen = steering.sight(target_of(observation).mask, observation.depth)
+        seen = steering.sight(get_target(observation).mask, observation.depth)
         if seen is not None:
             memory.place = steering.place_of(observation, seen)
             memory.side = memory.side or seen.side
@@ -142,8 +144,8 @@ class Recognition(Policy):
             situation.memory.imagined = (_name(situation, plans), looks)
             real = _real(situation)
             choices = situation.goal.choices
-            sure = self.recogniser([joined([*real, each]) for each in looks], choices).max(axis=1)
-            boxless = np.array([1 - track.found.mean() for track in followed])
+            sure = self.recogniser([join_glimpses([*real, each]) for each in looks], choices).max(axis=1)
+            boxless = np.array([1 - track.visible.mean() for track in followed])
             turns = np.array([np.count_nonzero(plan.actions != FORWARD) for plan in plans])
             rank = np.array([sum(other.prior > plan.prior for other in plans) for plan in plans])
             scores.append(sure - self.lost * boxless - self.turning * turns - self.trust * rank)
@@ -162,7 +164,7 @@ class Recognition(Policy):
             if futures is not None:
                 looks += self._imagined(situation, plans, futures)
             choices = situation.goal.choices
-            answers.append(Answer(choices, self.recogniser([joined(looks)], choices)[0]) if choices else None)
+            answers.append(Answer(choices, self.recogniser([join_glimpses(looks)], choices)[0]) if choices else None)
         return answers
 
     def _imagined(self, situation: Situation, plans: Sequence[Proposal], futures: Sequence[Rollout]) -> list[Glimpses]:
@@ -175,11 +177,11 @@ class Recognition(Policy):
 
     def _looks(self, rollout: Rollout, track: Track) -> Glimpses:
         """The last imagined frames in which the target is in sight; turned real ones show nothing new."""
-        wanted = np.flatnonzero(track.found & ~rollout.real)[len(track.boxes) and -self.views :]
+        wanted = np.flatnonzero(track.visible & ~rollout.real)[len(track.boxes) and -self.views :]
         frames, masks = rollout.frames[wanted], track.masks[wanted]
         if rollout.view == "front" and len(wanted):
             frames, masks = _around(frames), _around(masks[..., None].astype(np.uint8))[..., 0] > 0
-        return glimpses(frames, masks, np.zeros(len(wanted), bool))[0]
+        return extract_glimpses(frames, masks, np.zeros(len(wanted), bool))[0]
 
 
 def _real(situation: Situation) -> list[Glimpses]:

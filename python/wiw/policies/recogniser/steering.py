@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
-from wiw.perception.boxes import Mask, box_of, width_of
+from wiw.perception.boxes import Mask, box_width, find_box
 from wiw.types import Observation
 
 TURN = ActionSpace().turn_rad
@@ -54,11 +54,11 @@ class Sight:
 
 def sight(mask: Mask, depth: NDArray[np.float32]) -> Sight | None:
     """What a target's mask [H, W] and the depth there tell; None where nothing of it is seen."""
-    box = box_of(mask, wraps=True)
+    box = find_box(mask, wraps=True)
     if box is None:
         return None
     rows, columns = mask.shape
-    wide = width_of(box, columns)
+    wide = box_width(box, columns)
     left, right = _cuts(mask, depth)
     return Sight(
         bearing=_wrapped(np.pi - 2 * np.pi * (box[0] + wide / 2) / columns),

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from wiw import annotate
 from wiw.panorama import PerspectivePlan
-from wiw.perception.boxes import box_of
+from wiw.perception.boxes import find_box
 from wiw.perception.tracking import Track
-from wiw.perception.views import target_views
+from wiw.perception.views import cut_target_views
 from wiw.policies.vlm.plans import in_words
 from wiw.types import Observation, Proposal, Rollout
 
@@ -32,7 +32,7 @@ def plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> 
     """Front views along a plan, side by side; each under a bar with its action and number, with the target's box."""
     fronts, masks = _fronts(rollout, track)
     if masks is not None:
-        boxes = [box_of(mask) for mask in masks]
+        boxes = [find_box(mask) for mask in masks]
         fronts = np.stack(
             [
                 front if box is None else annotate.box(front, box, outside=True)
@@ -46,7 +46,7 @@ def plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> 
 def target_now(observation: Observation) -> Image | None:
     """The view centred on the target, boxed; None where it is out of sight."""
     assert observation.target is not None
-    views = target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
+    views = cut_target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
     return views.images[0] if len(views.images) else None
 
 
@@ -55,11 +55,11 @@ def target_strip(rollout: Rollout, track: Track) -> Image | None:
 
     Front views, which is all that a perspective model gives, are shown as they are.
     """
-    wanted = np.flatnonzero(track.found & ~rollout.real)
+    wanted = np.flatnonzero(track.visible & ~rollout.real)
     if not len(wanted):
         return None
     if rollout.view == "panorama":
-        images = target_views(rollout.frames[wanted], track.masks[wanted], (VIEW, VIEW)).images
+        images = cut_target_views(rollout.frames[wanted], track.masks[wanted], (VIEW, VIEW)).images
     else:
         boxes = [track.boxes[k] for k in wanted]
         images = np.stack(
