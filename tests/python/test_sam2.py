@@ -82,7 +82,7 @@ def test_a_panorama_is_turned_so_that_the_target_is_in_the_middle(weights: Path)
         marked[:, 20:40, 56:72] = True
         return marked
 
-    tracker._follow = spy
+    tracker._track_video = spy
     for across in (False, True):
         view = observation(across)
         track = follow(tracker, view)

@@ -219,8 +219,8 @@ def _train_diffuser(
     from wiw.envs.sensors import Sensors
     from wiw.errors import ArgumentError
     from wiw.networks import single_thread
-    from wiw.policies.diffuser.sight import Lens
     from wiw.policies.diffuser.weights import save
+    from wiw.policies.diffuser.workspace import PinholeCamera
     from wiw.training import diffuser as training
     from wiw.training.checkpoint import Checkpoint
 
@@ -234,7 +234,7 @@ def _train_diffuser(
             f"--demonstrations: diffuser needs views of {Sensors.size} x {Sensors.size} pixels, got demonstrations of "
             f"{collection.config.get('size')}; collect with --size {Sensors.size}"
         )
-    lens = Lens(collection.camera.intrinsics, collection.camera.T_world_camera)
+    lens = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
     samples = training.extract_samples(_show_bar(collection, "reading", len(collection)), lens)
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}

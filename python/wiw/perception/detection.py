@@ -54,7 +54,7 @@ class Detector(ABC):
 
         Args:
             images: perspective views. An object across the seam of a panorama is found in two halves; use views
-            instead. names: e.g. ["chair", "coffee table"]; without names nothing is found.
+            instead. names: the objects to find, e.g. ["chair", "coffee table"]; an empty list finds nothing.
             ids: the simulator's instance ids of the images, for detectors that need them; others never see them.
 
         Raises:

@@ -84,7 +84,8 @@ def extract_glimpses(
     """
     if panoramas.ndim != 4 or panoramas.shape[3] != 3 or masks.shape != panoramas.shape[:3]:
         raise ArgumentError(
-            f"extract_glimpses: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape}, {masks.shape}"
+            f"extract_glimpses: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape} and "
+            f"{masks.shape}"
         )
     if np.shape(real) != (len(panoramas),):
         raise ArgumentError(f"extract_glimpses: expected one flag a panorama [{len(panoramas)}], got {np.shape(real)}")

@@ -62,7 +62,8 @@ def cut_target_views(
     """
     if panoramas.ndim != 4 or panoramas.shape[3] != 3 or masks.shape != panoramas.shape[:3]:
         raise ArgumentError(
-            f"cut_target_views: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape}, {masks.shape}"
+            f"cut_target_views: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape} and "
+            f"{masks.shape}"
         )
     images, boxes, frames, angles = [], [], [], []
     for frame, (panorama, mask) in enumerate(zip(panoramas, masks, strict=True)):

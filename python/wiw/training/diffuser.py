@@ -18,10 +18,10 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised
+from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise
 from wiw.policies.diffuser.network import Network, Shape
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
-from wiw.policies.diffuser.sight import Lens, Sight
+from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
@@ -36,7 +36,7 @@ SUBTASK_LENGTHS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "inse
 class Samples:
     """N training samples: what was seen, and the path that the expert took next."""
 
-    sight: Sight
+    sight: WorkspaceView
     """The views of N frames."""
     pose: NDArray[np.float64]
     """float64 [N, 7]: the gripper's pose."""
@@ -75,7 +75,7 @@ class Recipe:
             raise ArgumentError(f"Recipe: epochs, batch, levels, width and layers must be positive, got {self}")
 
 
-def extract_samples(demonstrations: Iterable[Demonstration], lens: Lens) -> Samples:
+def extract_samples(demonstrations: Iterable[Demonstration], lens: PinholeCamera) -> Samples:
     """Return a training sample for each subtask of the demonstrations, as a camera sees its beginning.
 
     Raises:
@@ -85,13 +85,15 @@ def extract_samples(demonstrations: Iterable[Demonstration], lens: Lens) -> Samp
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
     sights, poses, paths = zip(*found, strict=True)
-    sight = Sight(*(np.stack([getattr(each, name) for each in sights]) for name in ("image", "height", "places")))
+    sight = WorkspaceView(
+        *(np.stack([getattr(each, name) for each in sights]) for name in ("image", "height", "places"))
+    )
     return Samples(sight, np.stack(poses), np.stack(paths))
 
 
 def _split_into_subtasks(
-    demonstration: Demonstration, lens: Lens
-) -> Iterator[tuple[Sight, NDArray[np.float64], NDArray[np.float64]]]:
+    demonstration: Demonstration, lens: PinholeCamera
+) -> Iterator[tuple[WorkspaceView, NDArray[np.float64], NDArray[np.float64]]]:
     """Yield the view at the beginning of each subtask, the gripper's pose there, and the poses that it goes to.
 
     A demonstration ends with its success. Where that comes before the hand has withdrawn, a pose straight above is
@@ -177,11 +179,11 @@ class _Trainer(ResumableTrainer):
     def _compute_loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         recipe, network = self.recipe, self.network.train()
         count = len(batch.now), recipe.levels
-        level = torch.randint(STEPS, count, generator=generator)
+        level = torch.randint(NOISE_LEVELS, count, generator=generator)
         clean = batch.path[:, None].expand(-1, recipe.levels, -1, -1)
         noise = torch.randn(*count, *clean.shape[2:-1], 9, generator=generator)
-        scene = network.look(batch.image, batch.height, batch.places, batch.now)
-        found, gripper = network.denoise(scene, noised(clean[..., :9], noise, level), level)
+        scene = network.encode_scene(batch.image, batch.height, batch.places, batch.now)
+        found, gripper = network.denoise(scene, add_noise(clean[..., :9], noise, level), level)
         off = _compute_huber_errors(found - clean[..., :9], level)
         grip = functional.binary_cross_entropy_with_logits(gripper, clean[..., 9])
         return off[..., :3].mean() + recipe.turn * off[..., 3:].mean() + recipe.grip * grip
@@ -198,7 +200,7 @@ def _compute_huber_errors(off: Tensor, level: Tensor) -> Tensor:
     Where noise leaves open which of several paths is meant, squared errors ask for their mean, so that sampling prefers
     none of them; absolute errors would ask for the median. Where noise is low, absolute errors make for precision.
     """
-    ratio = ((1 - KEPT[level]) / KEPT[level]).sqrt().clamp(0.02, 2.0)[..., None, :]
+    ratio = ((1 - ALPHA_BARS[level]) / ALPHA_BARS[level]).sqrt().clamp(0.02, 2.0)[..., None, :]
     size = off.abs()
     return torch.where(size < ratio, size * size / (2 * ratio), size - ratio / 2)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures that a language model is shown: what is seen now, and strips of what was imagined."""
+"""The images shown to a language model: the present observation, and strips of imagined views."""
 
 from __future__ import annotations
 
@@ -14,23 +14,25 @@ from wiw.panorama import PerspectivePlan
 from wiw.perception.boxes import find_box
 from wiw.perception.tracking import Track
 from wiw.perception.views import cut_target_views
-from wiw.policies.vlm.plans import in_words
+from wiw.policies.vlm.plans import describe_actions
 from wiw.types import Observation, Proposal, Rollout
 
 VIEW = 384
-"""Pixels of the sides of frames, the paper's."""
+"""Side of frames in pixels, as in the paper."""
 Image = NDArray[np.uint8]
 
 
-def now(observation: Observation) -> tuple[Image, Image]:
-    """Front view and panorama, with the target's box where something is pointed out."""
+def render_observation(observation: Observation) -> tuple[Image, Image]:
+    """Return front view and panorama, with the target's box where there is a target."""
     shown = observation.as_dict()
     return shown["front"], shown["panorama"]
 
 
-def plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> Image:
-    """Front views along a plan, side by side; each under a bar with its action and number, with the target's box."""
-    fronts, masks = _fronts(rollout, track)
+def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> Image:
+    """Return front views along a plan, side by side; each under a bar with its action and number, with the target's
+    box.
+    """
+    fronts, masks = _cut_front_views(rollout, track)
     if masks is not None:
         boxes = [find_box(mask) for mask in masks]
         fronts = np.stack(
@@ -39,19 +41,19 @@ def plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> 
                 for front, box in zip(fronts, boxes, strict=True)
             ]
         )
-    titles = [f"Imagined action {k}: {word}" for k, word in enumerate(in_words(plan.actions[: len(fronts)]), 1)]
+    titles = [f"Imagined action {k}: {word}" for k, word in enumerate(describe_actions(plan.actions[: len(fronts)]), 1)]
     return annotate.strip(fronts, titles)
 
 
-def target_now(observation: Observation) -> Image | None:
-    """The view centred on the target, boxed; None where it is out of sight."""
+def render_target(observation: Observation) -> Image | None:
+    """Return the view centred on the target, boxed; None where it is out of sight."""
     assert observation.target is not None
     views = cut_target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
     return views.images[0] if len(views.images) else None
 
 
-def target_strip(rollout: Rollout, track: Track) -> Image | None:
-    """Views centred on the target, boxed, of the imagined frames that show it; None where none does.
+def render_target_strip(rollout: Rollout, track: Track) -> Image | None:
+    """Return views centred on the target, boxed, of the imagined frames that show it; None where none does.
 
     Front views, which is all that a perspective model gives, are shown as they are.
     """
@@ -65,18 +67,18 @@ def target_strip(rollout: Rollout, track: Track) -> Image | None:
         images = np.stack(
             [annotate.box(rollout.frames[k], box or (), outside=True) for k, box in zip(wanted, boxes, strict=True)]
         )
-    return annotate.strip(images, _numbered(len(images))) if len(images) else None
+    return annotate.strip(images, _number_views(len(images))) if len(images) else None
 
 
-def _numbered(count: int) -> Sequence[str]:
+def _number_views(count: int) -> Sequence[str]:
     return [f"Imagined view {k + 1}" for k in range(count)]
 
 
-def _fronts(rollout: Rollout, track: Track | None) -> tuple[Image, NDArray[np.bool_] | None]:
+def _cut_front_views(rollout: Rollout, track: Track | None) -> tuple[Image, NDArray[np.bool_] | None]:
     masks = None if track is None else track.masks
     if rollout.view != "panorama":
         return rollout.frames, masks
-    plan = _plan(rollout.frames.shape[1:3])
+    plan = _get_plan(rollout.frames.shape[1:3])
     fronts = np.asarray(plan(rollout.frames, 0.0))
     if masks is None:
         return fronts, None
@@ -85,5 +87,5 @@ def _fronts(rollout: Rollout, track: Track | None) -> tuple[Image, NDArray[np.bo
 
 
 @cache
-def _plan(size: tuple[int, int]) -> PerspectivePlan:
+def _get_plan(size: tuple[int, int]) -> PerspectivePlan:
     return PerspectivePlan(size, (VIEW, VIEW), 90.0)
