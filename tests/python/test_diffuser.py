@@ -105,9 +105,9 @@ def test_the_window_shows_the_whole_workspace_and_knows_where_it_is() -> None:
     np.testing.assert_allclose(
         LENS.crop(rows, columns).unproject(depth[rows, columns]), points[rows, columns], atol=1e-9
     )
-    sight = LENS.sight(np.zeros((480, 480, 3), np.uint8), depth)
-    np.testing.assert_allclose(sight.places, points[rows, columns][CELL // 2 :: CELL, CELL // 2 :: CELL], atol=1e-6)
-    assert sight.image.shape[:2] == sight.height.shape == tuple(CELL * side for side in sight.places.shape[:2])
+    view = LENS.view_workspace(np.zeros((480, 480, 3), np.uint8), depth)
+    np.testing.assert_allclose(view.places, points[rows, columns][CELL // 2 :: CELL, CELL // 2 :: CELL], atol=1e-6)
+    assert view.image.shape[:2] == view.height.shape == tuple(CELL * side for side in view.places.shape[:2])
     away = np.eye(4)
     away[2, 3] = 0.5
     with pytest.raises(ArgumentError, match="not in view"):
@@ -309,13 +309,13 @@ def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: S
     np.testing.assert_allclose(seen.path[0][[0, 1, 2, 3, 5], :6], plan[[0, 1, 2, 3, 3], :6], atol=1e-6)
     np.testing.assert_array_equal(seen.pose[0], shown[0].poses[0])
     rows, columns = LENS.find_window((480, 480))
-    np.testing.assert_array_equal(seen.sight.image[0], shown[0].images[0][rows, columns])
+    np.testing.assert_array_equal(seen.view.image[0], shown[0].images[0][rows, columns])
     pushes, _ = record_demonstration(TABLETOP_TASKS["push_buttons"], 1, Collection(frames=16, depth=True))
     two = extract_samples([pushes], LENS)
     assert len(two) == 2
     np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
     np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
-    lit = two.sight.image[1].astype(int) - two.sight.image[0]
+    lit = two.view.image[1].astype(int) - two.sight.image[0]
     assert np.abs(lit).max() > 60
     with pytest.raises(ArgumentError, match="--depth"):
         extract_samples([replace(shown[0], encoded_depths=None)], LENS)

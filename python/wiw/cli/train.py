@@ -234,8 +234,8 @@ def _train_diffuser(
             f"--demonstrations: diffuser needs views of {Sensors.size} x {Sensors.size} pixels, got demonstrations of "
             f"{collection.config.get('size')}; collect with --size {Sensors.size}"
         )
-    lens = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
-    samples = training.extract_samples(_show_bar(collection, "reading", len(collection)), lens)
+    camera = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
+    samples = training.extract_samples(_show_bar(collection, "reading", len(collection)), camera)
     card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)

@@ -53,8 +53,8 @@ class Detector(ABC):
         """Find the named objects in each image: boxes within the image, highest score first.
 
         Args:
-            images: perspective views. An object across the seam of a panorama is found in two halves; use views
-            instead. names: the objects to find, e.g. ["chair", "coffee table"]; an empty list finds nothing.
+            images: perspective views; an object across the seam of a panorama would be found in two halves.
+            names: the objects to find, e.g. ["chair", "coffee table"]; an empty list finds nothing.
             ids: the simulator's instance ids of the images, for detectors that need them; others never see them.
 
         Raises:

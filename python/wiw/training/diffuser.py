@@ -36,7 +36,7 @@ SUBTASK_LENGTHS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "inse
 class Samples:
     """N training samples: what was seen, and the path that the expert took next."""
 
-    sight: WorkspaceView
+    view: WorkspaceView
     """The views of N frames."""
     pose: NDArray[np.float64]
     """float64 [N, 7]: the gripper's pose."""
@@ -75,24 +75,24 @@ class Recipe:
             raise ArgumentError(f"Recipe: epochs, batch, levels, width and layers must be positive, got {self}")
 
 
-def extract_samples(demonstrations: Iterable[Demonstration], lens: PinholeCamera) -> Samples:
+def extract_samples(demonstrations: Iterable[Demonstration], camera: PinholeCamera) -> Samples:
     """Return a training sample for each subtask of the demonstrations, as a camera sees its beginning.
 
     Raises:
         ArgumentError: there are none, or some are of an unknown task or without depth.
     """
-    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, lens)]
+    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, camera)]
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
-    sights, poses, paths = zip(*found, strict=True)
-    sight = WorkspaceView(
-        *(np.stack([getattr(each, name) for each in sights]) for name in ("image", "height", "places"))
+    views, poses, paths = zip(*found, strict=True)
+    view = WorkspaceView(
+        *(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places"))
     )
-    return Samples(sight, np.stack(poses), np.stack(paths))
+    return Samples(view, np.stack(poses), np.stack(paths))
 
 
 def _split_into_subtasks(
-    demonstration: Demonstration, lens: PinholeCamera
+    demonstration: Demonstration, camera: PinholeCamera
 ) -> Iterator[tuple[WorkspaceView, NDArray[np.float64], NDArray[np.float64]]]:
     """Yield the view at the beginning of each subtask, the gripper's pose there, and the poses that it goes to.
 
@@ -112,7 +112,7 @@ def _split_into_subtasks(
             up = max(pose[2] for pose in poses)
             poses.append(np.concatenate([poses[-1][:2], [up], poses[-1][3:]]))
         path = np.stack(poses + [poses[-1]] * (longest - len(poses)))
-        yield lens.sight(*_decode_frame(demonstration, frame)), demonstration.poses[frame], path
+        yield camera.view_workspace(*_decode_frame(demonstration, frame)), demonstration.poses[frame], path
 
 
 def _decode_frame(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -125,7 +125,7 @@ def _decode_frame(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.
 
 
 def train(
-    moments: Samples,
+    samples: Samples,
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
     on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
@@ -134,14 +134,14 @@ def train(
     """Train a network; return it with the recipe that reproduces it without a time limit.
 
     Args:
-        moments: to learn from.
+        samples: to learn from.
         recipe: how to train; see `Recipe`.
         minutes: if given, reduces the number of epochs so that training takes about this long.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         checkpoint: where the state of training is saved, and from where it resumes.
     """
-    steps_per_epoch = max(1, len(moments) // recipe.batch)
-    begin = partial(_Trainer, moments, recipe)
+    steps_per_epoch = max(1, len(samples) // recipe.batch)
+    begin = partial(_Trainer, samples, recipe)
     trainer, recipe = run_training(
         begin, recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.03), on_step, checkpoint
     )
@@ -153,10 +153,10 @@ class _Trainer(ResumableTrainer):
 
     stateful_parts = ("network", "average", "optimiser")
 
-    def __init__(self, moments: Samples, recipe: Recipe) -> None:
+    def __init__(self, samples: Samples, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xD1F1]) % 2**63)
-        self.samples, self.recipe = moments, recipe
-        shape = Shape(recipe.width, layers=recipe.layers, poses=moments.path.shape[1])
+        self.samples, self.recipe = samples, recipe
+        shape = Shape(recipe.width, layers=recipe.layers, poses=samples.path.shape[1])
         self.network = Network(shape)
         self.average = deepcopy(self.network)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
@@ -221,23 +221,23 @@ class Batch:
     """[B, L, 10]."""
 
 
-def sample_batch(moments: Samples, count: int, tilt: float, rng: np.random.Generator) -> Batch:
+def sample_batch(samples: Samples, count: int, tilt: float, rng: np.random.Generator) -> Batch:
     """Sample random rows, and augment them: rotated about the middle of the workspace by up to `tilt` radians, with
     other brightness and tint.
     """
-    chosen = rng.integers(0, len(moments), count)
+    chosen = rng.integers(0, len(samples), count)
     light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    images = (moments.sight.image[chosen] * light.astype(np.float32)).clip(0, 255).astype(np.uint8)
+    images = (samples.view.image[chosen] * light.astype(np.float32)).clip(0, 255).astype(np.uint8)
     angles = rng.uniform(-tilt, tilt, count)
     turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
-    places = np.einsum("bij,bhwj->bhwi", turns, moments.sight.places[chosen] - MIDDLE) + MIDDLE
-    poses = np.concatenate([moments.pose[chosen, None], moments.path[chosen]], axis=1)
+    places = np.einsum("bij,bhwj->bhwi", turns, samples.view.places[chosen] - MIDDLE) + MIDDLE
+    poses = np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1)
     poses[..., :3] = np.einsum("bij,blj->bli", turns, poses[..., :3] - MIDDLE) + MIDDLE
     poses[..., 5] += angles[:, None]
     vectors = torch.from_numpy(to_vectors(poses))
     return Batch(
         torch.from_numpy(images),
-        torch.from_numpy(moments.sight.height[chosen]),
+        torch.from_numpy(samples.view.height[chosen]),
         torch.from_numpy(places.astype(np.float32)),
         vectors[:, 0],
         vectors[:, 1:],

@@ -86,12 +86,12 @@ class TransformersClient(Client):
         read = int(inputs["input_ids"].shape[1])
         if call.logprobs:
             listed = self._first_tokens(inputs)
-            told = [
+            tokens_listed = [
                 pair
                 for rank, pair in enumerate(listed)
                 if rank < call.logprobs or pair[0].strip(LETTER_CONTEXT) in call.labels
             ]
-            return Completion(listed[0][0], "length", tuple(told), read, 1)
+            return Completion(listed[0][0], "length", tuple(tokens_listed), read, 1)
         if call.schema is not None:
             text = self._generate_object(call)
             return Completion(text, "stop", None, read, self._count_tokens(text))
@@ -171,27 +171,27 @@ class TransformersClient(Client):
         ways = [self._prepare_inputs(messages, before + option) for option in options]
         tokens = [way["input_ids"][0].tolist() for way in ways]
         begin = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, zip(*tokens, strict=False)))
-        chances, told = [], None
+        chances, logprobs = [], None
         for way, own in zip(ways, tokens, strict=True):
             goes_on = sum(each[: begin + 1] == own[: begin + 1] for each in tokens) > 1  # as another does
-            if told is None or goes_on:
+            if logprobs is None or goes_on:
                 with torch.inference_mode():
-                    told = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
-            chances.append(_compute_logprob(told if goes_on else told[:1], own, tokens, begin))
+                    logprobs = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
+            chances.append(_compute_logprob(logprobs if goes_on else logprobs[:1], own, tokens, begin))
         return torch.tensor(chances)
 
 
-def _compute_logprob(told: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:
+def _compute_logprob(logprobs: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:
     """Return the log-probability of one of several texts, token by token, among the texts that share its beginning.
 
     Args:
-        told: log-probabilities [len(own) - begin + 1, V] of the tokens after the first `begin`.
+        logprobs: log-probabilities [len(own) - begin + 1, V] of the tokens after the first `begin`.
         own: the text's tokens.
         tokens: the tokens of all texts.
         begin: number of first tokens that all texts share.
     """
     chance = 0.0
-    for place, following in enumerate(told, start=begin):
+    for place, following in enumerate(logprobs, start=begin):
         alike = [each for each in tokens if each[:place] == own[:place]]
         ways = following[sorted({each[place] for each in alike if len(each) > place})].logsumexp(0)
         if place == len(own):

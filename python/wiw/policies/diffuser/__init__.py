@@ -91,13 +91,13 @@ class Diffuser(Policy):
         from wiw.policies.diffuser.diffusion import sample_ddim
 
         observation, pose, network = situation.observation, situation.observation.pose, self._network
-        sight = PinholeCamera.from_camera(CAMERAS["front"], observation.depth.shape).sight(
+        view = PinholeCamera.from_camera(CAMERAS["front"], observation.depth.shape).view_workspace(
             observation.front, observation.depth
         )
         drawn = [torch.randn(network.shape.poses, 9, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
         with single_thread(), torch.inference_mode():
-            seen = sight.image, sight.height, sight.places, to_vectors(pose)
-            image, height, places, now = (torch.from_numpy(each)[None] for each in seen)
+            inputs = view.image, view.height, view.places, to_vectors(pose)
+            image, height, places, now = (torch.from_numpy(each)[None] for each in inputs)
             scene = network.encode_scene(image, height, places, now)
             noise = torch.stack(drawn)[None]
             clean, open_ = sample_ddim(lambda noised, level: network.denoise(scene, noised, level), noise, self.steps)

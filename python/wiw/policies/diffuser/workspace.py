@@ -76,7 +76,7 @@ class PinholeCamera:
         intrinsics[:2, 2] -= columns.start, rows.start
         return PinholeCamera(intrinsics, self.T_world_camera)
 
-    def sight(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> WorkspaceView:
+    def view_workspace(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> WorkspaceView:
         """Return the workspace's part of an image [H, W, 3] with planar depth [H, W] in metres.
 
         Raises:
