@@ -80,7 +80,7 @@ def test_points_are_where_the_renderer_has_them() -> None:
     picture = bench.render_view("front", (480, 480), ("depth", "instance"))
     points = LENS.unproject(picture["depth"])
     for name in ("green", "blue"):
-        ids = [number for number, other in enumerate(bench.names, 1) if other == name]
+        ids = [number for number, other in enumerate(bench.instance_names, 1) if other == name]
         found = points[np.isin(picture["instance"], ids)]
         assert len(found) > 100
         np.testing.assert_allclose(
@@ -315,7 +315,7 @@ def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: S
     assert len(two) == 2
     np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
     np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
-    lit = two.view.image[1].astype(int) - two.sight.image[0]
+    lit = two.view.image[1].astype(int) - two.view.image[0]
     assert np.abs(lit).max() > 60
     with pytest.raises(ArgumentError, match="--depth"):
         extract_samples([replace(shown[0], encoded_depths=None)], LENS)
@@ -364,10 +364,10 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_pa
 class _Bytes:
     """What can be kept of a lesson: some numbers."""
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {"values": torch.arange(500.0)}
 
-    def restore(self, state: Any) -> None:
+    def load_state_dict(self, state: Any) -> None:
         pass
 
 

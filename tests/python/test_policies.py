@@ -158,9 +158,9 @@ def test_the_map_knows_walls_free_space_and_the_frontier() -> None:
     assert 0.5 < runs[1] < 1.0
     np.testing.assert_allclose(ends[0], [2.5, 0])
     distance = exploration.distance_to_target(4.0, 0.1)
-    ahead = exploration.at(distance, np.array([[0.0, 0.0], [2.0, 0.0]]))
+    ahead = exploration.sample_grid(distance, np.array([[0.0, 0.0], [2.0, 0.0]]))
     assert ahead[0] > ahead[1] + 1.5  # the open end of the corridor
-    assert exploration.at(distance, np.array([[0.0, 1.5]]))[0] == FAR_DISTANCE
+    assert exploration.sample_grid(distance, np.array([[0.0, 1.5]]))[0] == FAR_DISTANCE
 
 
 def test_the_target_is_the_frontier_that_looks_like_the_goal() -> None:
@@ -173,7 +173,7 @@ def test_the_target_is_the_frontier_that_looks_like_the_goal() -> None:
         exploration = ExplorationMap()
         exploration.update(depth, np.zeros(3), likeness)
         distance = exploration.distance_to_target(4.0, 0.1)
-        there, away = exploration.at(distance, np.array([[nearer, 0.0], [-nearer, 0.0]]))
+        there, away = exploration.sample_grid(distance, np.array([[nearer, 0.0], [-nearer, 0.0]]))
         assert there < away
 
 

@@ -52,7 +52,7 @@ def plays() -> Plays:
 
 def test_a_play_is_a_function_of_its_number(plays: Plays) -> None:
     again = record_plays(0, 2, 1)
-    for name in FILE_FIELDS:
+    for name in ("views", "bare", "arm", "poses"):
         np.testing.assert_array_equal(getattr(again, name)[0], getattr(plays, name)[2])
     assert plays.views.shape == (4, POSES + 1, *np.zeros((160, 160))[WINDOW].shape, 3) == plays.bare.shape
     assert plays.arm.dtype == np.bool_ and 0.01 < plays.arm.mean() < 0.3
@@ -206,10 +206,10 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
 
 
 class _Nothing:
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {}
 
-    def restore(self, state: Any) -> None:
+    def load_state_dict(self, state: Any) -> None:
         pass
 
 

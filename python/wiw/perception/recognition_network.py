@@ -81,11 +81,6 @@ class Network(nn.Module):
         return self.fuse(*self.encode_glimpses(pictures, scalars), owners, sets)
 
 
-def count_parameters(network: Network) -> int:
-    """Return the number of learned parameters."""
-    return sum(value.numel() for value in network.parameters())
-
-
 def select_float_state(network: Network) -> dict[str, Any]:
     """Return the floating-point state to save; counters of training are left out."""
     return {name: value for name, value in network.state_dict().items() if value.is_floating_point()}

@@ -85,9 +85,7 @@ def extract_samples(demonstrations: Iterable[Demonstration], camera: PinholeCame
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
     views, poses, paths = zip(*found, strict=True)
-    view = WorkspaceView(
-        *(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places"))
-    )
+    view = WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
     return Samples(view, np.stack(poses), np.stack(paths))
 
 
