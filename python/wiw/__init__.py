@@ -58,19 +58,19 @@ _HOME = {
     "Policy": "wiw.policies.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
-    "attribute": "wiw.evaluation.attribute",
-    "check_model": "wiw.evaluation.model_check",
+    "attribute": "wiw.studies.attribute",
+    "check_model": "wiw.studies.model_check",
     "collect": "wiw.training.collect",
-    "compare": "wiw.evaluation.compare",
-    "evaluate": "wiw.evaluation.evaluate",
-    "load_run": "wiw.evaluation.runlog",
+    "compare": "wiw.studies.compare",
+    "evaluate": "wiw.studies.evaluate",
+    "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
     "make_vec": "wiw.registry",
     "policy": "wiw.registry",
-    "power": "wiw.evaluation.power",
-    "scale": "wiw.evaluation.scale",
+    "power": "wiw.analysis.power",
+    "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
-    "verify": "wiw.evaluation.verify",
+    "verify": "wiw.runs.verify",
     "world_model": "wiw.registry",
 }
 """Where a public name lives; the others in `__all__` are modules."""
@@ -104,18 +104,18 @@ if TYPE_CHECKING:
         scenes,
         types,
     )
-    from wiw.evaluation.attribute import attribute
-    from wiw.evaluation.compare import compare
-    from wiw.evaluation.evaluate import evaluate
-    from wiw.evaluation.model_check import check_model
-    from wiw.evaluation.power import power
-    from wiw.evaluation.runlog import load_run
-    from wiw.evaluation.scale import scale
-    from wiw.evaluation.verify import verify
+    from wiw.analysis.power import power
     from wiw.loop.agent import Agent
     from wiw.metrics.headlines import Headline
     from wiw.policies.base import Policy
     from wiw.registry import make, make_vec, policy, world_model
+    from wiw.runs.verify import verify
+    from wiw.studies.attribute import attribute
+    from wiw.studies.compare import compare
+    from wiw.studies.evaluate import evaluate
+    from wiw.studies.model_check import check_model
+    from wiw.studies.run_log import load_run
+    from wiw.studies.scale import scale
     from wiw.training.collect import collect
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts

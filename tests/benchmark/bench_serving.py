@@ -23,7 +23,7 @@ import numpy as np
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.types import Proposal
 
 HERE = Path(__file__)

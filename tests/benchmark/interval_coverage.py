@@ -10,9 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from wiw.evaluation.intervals import clustered_bootstrap, t_of_sums, wilson
-from wiw.evaluation.simulate import draw, total
-from wiw.evaluation.utility import ratio
+from wiw.analysis.intervals import clustered_bootstrap, t_of_sums, wilson
+from wiw.analysis.simulate import draw, total
+from wiw.analysis.utility import ratio
 
 SCENES = (5, 10, 30, 87)
 PER_SCENE = 5

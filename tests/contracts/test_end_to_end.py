@@ -183,7 +183,7 @@ def front_rays(size: tuple[int, int]) -> Any:
 
 
 class Compass(wiw.WorldModel):
-    """Remembers what it is handed; in all its frames colours tell where the camera looks."""
+    """Remembers what it is handed; in the frames that it imagines colours tell where the camera looks."""
 
     accepts = wiw.accepts("trajectory")
 
@@ -199,7 +199,9 @@ class Compass(wiw.WorldModel):
         self.handed += zip(controls, observations.image, depth, labels, strict=True)
         size = self.accepts.size
         picture = colours(front_rays(size) if self.accepts.view == "perspective" else panorama.directions(size))
-        return np.broadcast_to(picture, (len(controls), len(controls[0].actions) + 1, *picture.shape))
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, axis=1)
+        frames[:, 1:] = picture
+        return frames
 
 
 KINDS = [

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 import wiw
+from wiw.analysis.summary import headlines, shown_headlines, summarise
 from wiw.cli import main
 from wiw.errors import ContractError
-from wiw.evaluation.recipes import AgentRecipe
-from wiw.evaluation.summary import headlines, shown_headlines, summarise
 from wiw.registry import METRICS
+from wiw.runs.recipes import AgentRecipe
 
 STRANGER = """
 import wiw

@@ -52,9 +52,9 @@ def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, **_):
     """Begins a run or goes on with it; names each episode in `reported` once the store has said that it is kept."""
     from fakes import LineAgent, LineTask
 
-    from wiw.evaluation.evaluate import run_arms
-    from wiw.evaluation.rows import OutcomeRow
-    from wiw.evaluation.store import RunStore
+    from wiw.runs.rows import OutcomeRow
+    from wiw.runs.store import RunStore
+    from wiw.studies.evaluate import run_arms
 
     if reported is not None:
         log, write = os.open(reported, os.O_WRONLY | os.O_CREAT | os.O_APPEND), RunStore.write
@@ -70,13 +70,13 @@ def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, **_):
 
 
 def report(out, target, **_):
-    from wiw.evaluation.runlog import load_run
+    from wiw.studies.run_log import load_run
 
     load_run(out).report(target)
 
 
 def export(out, target, kind, **_):
-    from wiw.evaluation.runlog import load_run
+    from wiw.studies.run_log import load_run
 
     log = load_run(out)
     if kind == "view":
@@ -109,12 +109,6 @@ def serve():
     for extra in ("pyarrow.parquet", "rerun"):
         with contextlib.suppress(ModuleNotFoundError):
             importlib.import_module(extra)
-
-    import wiw.evaluation.evaluate
-    import wiw.evaluation.export
-    import wiw.evaluation.report.page
-    import wiw.evaluation.view
-    import wiw.loop.scheduler  # noqa: F401
 
     print("ready", flush=True)
     for line in sys.stdin:

@@ -22,9 +22,9 @@ from wiw.datasets import ar
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError, ContractError
-from wiw.evaluation.report.story import Attempt
-from wiw.evaluation.rows import decode_jpeg
 from wiw.loop.scheduler import run_episodes
+from wiw.report.story import Attempt
+from wiw.runs.rows import decode_jpeg
 from wiw.tasks.ar import AR
 from wiw.types import Answer, Observation
 

@@ -48,6 +48,18 @@ def test_alone_is_what_a_scene_of_that_instance_alone_shows(two_rooms: str) -> N
     np.testing.assert_allclose(before.sum(axis=1), 4 * np.pi)
 
 
+def test_measuring_visibility_leaves_pictures_as_they_were() -> None:
+    place = world("apartments:val/0", "cpu")
+    points = place.ground.put_down(place.navmesh.sample(25, 5)).astype(float)
+    poses = np.stack([visibility.camera_pose(points[k], np.pi / 8 * k) for k in (6, 18)])
+    before = place.renderer.perspective(poses, (480, 480), 90.0)
+    for instance in range(1, len(place.scene.instances) + 1):
+        visibility.visible_share(place, points[0], instance)
+    after = place.renderer.perspective(poses, (480, 480), 90.0)
+    for output, pixels in before.items():
+        np.testing.assert_array_equal(after[output], pixels, output)
+
+
 def test_a_share_is_none_behind_a_wall_and_all_in_plain_sight(two_rooms: str) -> None:
     place = world(two_rooms, "cpu")
     table = next(int(thing["id"]) for thing in place.scene.instances if thing["name"] == "table")

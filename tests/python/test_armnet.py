@@ -26,8 +26,8 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import save as packed  # noqa: E402
 
-from wiw.world_models.armnet import BUILT_IN, SIZE, ArmNet  # noqa: E402
 from wiw.world_models.armnet.body import plate, sights  # noqa: E402
+from wiw.world_models.armnet.model import BUILT_IN, SIZE, ArmNet  # noqa: E402
 from wiw.world_models.armnet.motion import motion  # noqa: E402
 from wiw.world_models.armnet.network import (  # noqa: E402
     FRONT,
@@ -35,9 +35,9 @@ from wiw.world_models.armnet.network import (  # noqa: E402
     Arm,
     Mixture,
     Network,
-    carried,
-    cleared,
-    composed,
+    carry_canvas,
+    clear_arm,
+    compose_view,
     in_sight,
     shade,
     sources,
@@ -128,7 +128,7 @@ def test_without_things_that_move_the_next_view_is_known(table: Workbench) -> No
     after = bench.render_view("front", FRONT)["color"]
     bare = image(plate(FRONT).color)
     old, new = (arm_of(sight) for sight in sights(np.stack([here, PLAN[0]]), FRONT))
-    canvas = cleared(image(before), old, in_sight(image(before), old), bare, bare)
+    canvas = clear_arm(image(before), old, in_sight(image(before), old), bare, bare)
     still = torch.where(new.mask > 0.5, new.color, canvas * shade(new.color, bare, new.mask))
     gap = (still - image(after)).abs().amax(1)
     copied = (image(before) - image(after)).abs().amax(1)
@@ -141,7 +141,7 @@ def test_the_canvas_is_the_table_without_the_arm(table: Workbench) -> None:
     seen, clear = (image(bench.render_view("front", FRONT, arm=arm)["color"]) for arm in (True, False))
     *_, sight = sights(np.stack([PLAN[0]]), FRONT)
     bare = image(plate(FRONT).color)
-    canvas = cleared(seen, arm_of(sight), in_sight(seen, arm_of(sight)), bare, bare)
+    canvas = clear_arm(seen, arm_of(sight), in_sight(seen, arm_of(sight)), bare, bare)
     assert (canvas - clear).abs().mean() < 0.15 * (seen - clear).abs().mean()
 
 
@@ -154,16 +154,16 @@ def test_what_is_carried_goes_along_and_grows_as_it_comes_near() -> None:
     canvas = torch.zeros(1, 1, 64, 120)
     x, y = way.before[0, :2].round().int().tolist()
     canvas[..., y - 3 : y + 3, x - 3 : x + 3] = 1
-    moved = carried(canvas, way)[0, 0]
+    moved = carry_canvas(canvas, way)[0, 0]
     rows, columns = torch.nonzero(moved > 0.5).float().mean(0) + 0.5
     assert abs(columns - way.after[0, 0]) < 1 and abs(rows - way.after[0, 1]) < 1
     assert moved.sum() > 1.1 * canvas.sum()
     still = motion(there, there)
-    torch.testing.assert_close(carried(canvas, still), canvas, atol=1e-4, rtol=0)
+    torch.testing.assert_close(carry_canvas(canvas, still), canvas, atol=1e-4, rtol=0)
     large = torch.nn.functional.interpolate(canvas, scale_factor=3)
-    small = torch.nn.functional.avg_pool2d(carried(large, way, scale=3.0), 3)
+    small = torch.nn.functional.avg_pool2d(carry_canvas(large, way, scale=3.0), 3)
     torch.testing.assert_close(small[0, 0], moved, atol=0.35, rtol=0)
-    aside = carried(canvas, still, torch.full((1, 2, 64, 120), 2.0))
+    aside = carry_canvas(canvas, still, torch.full((1, 2, 64, 120), 2.0))
     torch.testing.assert_close(aside[..., :-2, :-2], canvas[..., 2:, 2:], atol=1e-4, rtol=0)
 
 
@@ -177,9 +177,9 @@ def test_each_part_of_a_mixture_is_what_it_says(part: int) -> None:
     shares[:, part] = 1
     way = motion(PLAN[:1], PLAN[1:2])
     mixture = Mixture(shares, paint, torch.zeros(1, 2, 64, 120))
-    made = composed(shares, sources(mixture, canvas, arm, way, bare))
+    made = compose_view(shares, sources(mixture, canvas, arm, way, bare))
     dark = shade(color, bare, arm.mask)
-    expected = [canvas * dark, carried(canvas, way) * dark, color, paint][part].clamp(0, 1)
+    expected = [canvas * dark, carry_canvas(canvas, way) * dark, color, paint][part].clamp(0, 1)
     torch.testing.assert_close(made, expected)
 
 
@@ -273,7 +273,7 @@ def test_without_torch_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch
 
 
 def test_torch_is_not_loaded_before_it_is_needed() -> None:
-    code = "import sys, wiw.world_models.armnet; assert 'torch' not in sys.modules"
+    code = "import sys, wiw.world_models.armnet.model; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -291,7 +291,7 @@ def test_the_weights_that_come_with_it_know_what_is_carried() -> None:
     truth = bench.render_fronts_after(plan, SIZE)[-1]
     bare = image(plate(SIZE).color)
     first, *_, last = (arm_of(sight) for sight in sights(ids, SIZE))
-    canvas = cleared(image(seen), first, in_sight(image(seen), first), bare, bare)
+    canvas = clear_arm(image(seen), first, in_sight(image(seen), first), bare, bare)
     still = torch.where(last.mask > 0.5, last.color, canvas * shade(last.color, bare, last.mask))
     changed = (still - image(truth)).abs().amax(1) > 0.06
     wrong, alone = ((view - image(truth)).abs().mean(1)[changed].mean() for view in (image(made), still))

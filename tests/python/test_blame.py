@@ -15,12 +15,12 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
+from wiw.analysis.blame import SWAPS, VERDICTS, EpisodeBlame
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.evaluation.blame import SWAPS, VERDICTS, EpisodeBlame
-from wiw.evaluation.evaluate import evaluate, resume_run, run_arms
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.evaluation.store import RunStore, store_path
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.store import RunStore, store_path
+from wiw.studies.evaluate import evaluate, resume_run, run_arms
 
 PARTS = Path(__file__).with_name("blame_parts.py")
 EPISODES = 2

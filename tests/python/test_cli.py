@@ -13,7 +13,7 @@ from wiw.cli import main
 from wiw.cli.doctor import examine
 from wiw.cli.options import parsed
 from wiw.errors import ArgumentError
-from wiw.evaluation.runlog import load_run
+from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
 
 FAKES = Path(__file__).with_name("fakes.py")
@@ -345,3 +345,53 @@ def test_each_task_names_the_policy_that_runs_it():
     assert {default_policy(name) for name in named} <= set(POLICIES.names())
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
+
+
+LEAVING = """
+import sys
+import threading
+
+import wiw
+
+
+class Quits(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", size=(48, 96))
+
+    def rollout(self, observations, controls, seeds):
+        sys.exit(0)
+
+
+class Unmade(Quits):
+    def __init__(self):
+        sys.exit(0)
+
+
+class Endless(Quits):
+    def __init__(self):
+        threading.Event().wait()
+"""
+
+
+def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, capsys, monkeypatch):
+    monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
+    file = tmp_path / "leaving.py"
+    file.write_text(LEAVING)
+    command = ["run", "imagenav", "--scenes", two_rooms, "--preset", str(short), "--episodes", "1"]
+
+    def ends(model, *more):
+        out = tmp_path / model
+        code = main([*command, "--world-model", f"{file}:{model}", "--out", str(out), "--no-report", *more])
+        return code, capsys.readouterr().err
+
+    code, said = ends("Quits")
+    assert code == 1 and "1 episode failed for infrastructure" in said and "SystemExit(0)" in said
+    code, said = ends("Unmade")
+    assert code == 2 and "cannot be made: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
+    code, said = ends("Endless", "--deadline", "0.2")
+    assert code == 2 and "did not return within 0.2 s" in said and "Traceback" not in said
+    for model, kind in (("Quits", "raised"), ("Unmade", "raised"), ("Endless", "deadline")):
+        assert main(["check-model", f"{file}:{model}", "--scenes", two_rooms, "--deadline", "5"]) == 1
+        assert kind in capsys.readouterr().out
+    file.write_text("import sys\nsys.exit(0)\n")
+    code, said = ends("Quits", "--seed", "1")
+    assert code == 2 and "cannot be loaded: SystemExit: 0 (leaving.py, line 2)" in said

@@ -10,18 +10,19 @@ import numpy as np
 import pytest
 
 import wiw
+from wiw.analysis.costs import Costs
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
-from wiw.evaluation.costs import Costs
-from wiw.evaluation.evaluate import run_arms
-from wiw.evaluation.store import RunStore
 from wiw.loop.attempts import TRIES
+from wiw.runs.store import RunStore
+from wiw.studies.evaluate import run_arms
 
 
 class Counted(wiw.WorldModel):
     """Repeats the observation; fails once; counts what reaches it over all instances."""
 
     accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective", best_batch=3)
+    version = "1"
     calls: ClassVar[int] = 0
     rows: ClassVar[int] = 0
 

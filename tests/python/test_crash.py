@@ -17,9 +17,9 @@ import pytest
 from crash_victims import EPISODES, Victims, evaluate
 
 from wiw.errors import FileError, StoreError
-from wiw.evaluation.runlog import load_run
-from wiw.evaluation.store import RunStore, store_path
 from wiw.files import whole_file, whole_folder
+from wiw.runs.store import RunStore, store_path
+from wiw.studies.run_log import load_run
 
 KILLS_OF_RUNS, KILLS_OF_EXPORTS = 140, 60
 HERE = Path(__file__).parent

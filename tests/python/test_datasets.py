@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from wiw.datasets import episodes as files
 from wiw.datasets.habitat import heading_of, yaw_of
 from wiw.errors import FileError
-from wiw.evaluation.evaluate import evaluate, resume_run
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.studies.evaluate import evaluate, resume_run
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode
 

@@ -13,7 +13,7 @@ from fakes import LineAgent, LineTask
 
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError
-from wiw.evaluation.evaluate import run_arms
+from wiw.studies.evaluate import run_arms
 
 EVIL = 'a,"b"\n/../c'
 TABLES = ("arms", "episodes", "outcomes", "decisions", "candidates")

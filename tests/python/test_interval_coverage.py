@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from wiw.evaluation.intervals import clustered_bootstrap, clustered_t, t_of_sums, wilson
-from wiw.evaluation.simulate import draw, total
+from wiw.analysis.intervals import clustered_bootstrap, clustered_t, t_of_sums, wilson
+from wiw.analysis.simulate import draw, total
 
 RUNS, PER_SCENE = 5000, 5
 NOISE = 0.9

@@ -13,11 +13,11 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.evaluation.rows import decision_row
 from wiw.loop.agent import Query
 from wiw.loop.attempts import TRIES
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
+from wiw.runs.rows import decision_row
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Answer, DecisionRecord, Goal, Key, Observation, Proposal, Truth
 
@@ -52,9 +52,10 @@ class Stamp(wiw.WorldModel):
 
     def rollout(self, observations, controls, seeds):
         frames = np.zeros((len(controls), len(controls[0].actions) + 1, 576, 1024, 3), np.uint8)
+        frames[:, 0] = observations.image
         for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
             for k in range(len(control.actions)):
-                frames[row, k + 1] = 1 + int(seed) % 200 if k == control.length - 1 else 0
+                frames[row, k + 1] = 2 + int(seed) % 200 if k == control.length - 1 else 0
         return frames
 
 
@@ -398,3 +399,46 @@ def test_a_model_may_not_answer_in_the_memory_of_an_earlier_answer(task: ImageNa
 
     with pytest.raises(ContractError, match="return a new array from every call"):
         run(task, wiw.Agent(Greedy(), Reusing()), count=1)
+
+
+class Remembering(Greedy):
+    """Remembers every moment that it has observed."""
+
+    def __init__(self) -> None:
+        self.begun: list[int] = []
+        self.lengths: dict[tuple[int, int], int] = {}
+
+    def begin(self, goal, key):
+        self.begun.append(key.episode)
+        return []
+
+    def observe(self, situations):
+        for situation in situations:
+            situation.memory.append(situation.observation)
+            self.lengths[situation.key.episode, situation.key.decision] = len(situation.memory)
+
+    def score(self, situations, proposals, rollouts):
+        assert all(len(situation.memory) == situation.key.decision + 1 for situation in situations)
+        return super().score(situations, proposals, rollouts)
+
+
+def test_memory_holds_every_moment_from_the_first_on(task: ImageNav) -> None:
+    policy = Remembering()
+    recorder = run(task, wiw.Agent(policy, "copy", candidates=2), count=2)
+    assert sorted(policy.begun) == [0, 1]
+    assert len(recorder.decisions) > 4
+    assert policy.lengths == {key: key[1] + 1 for key in recorder.decisions}
+
+
+def test_a_first_decision_carries_out_before_the_second(task: ImageNav) -> None:
+    env, seen = task.environment(), []
+
+    class Watching(Greedy):
+        def observe(self, situations):
+            seen.extend(situation.executed for situation in situations)
+
+    agent = wiw.Agent(Watching(), candidates=1, horizon=2, execute=2)
+    env.begin(task.episode(0))
+    for index in range(3):
+        env.run(agent.decide(env.observation, env.goal, Key(0, 0, index)).actions)
+    assert seen == [(), (FORWARD, FORWARD), (FORWARD,) * 4]

@@ -14,11 +14,11 @@ from pressing_policy import Pressing
 
 import wiw
 from wiw.cli import main
-from wiw.evaluation.evaluate import evaluate, resume_run
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.evaluation.runlog import load_run
-from wiw.evaluation.store import RunStore
 from wiw.render import resolve_backend
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.store import RunStore
+from wiw.studies.evaluate import evaluate, resume_run
+from wiw.studies.run_log import load_run
 from wiw.tabletop.base import make_action
 from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Proposal

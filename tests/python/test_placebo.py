@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
-from wiw.evaluation.verify import verify
 from wiw.loop.agent import Query
 from wiw.loop.imagine import model_spec
 from wiw.loop.placebo import shuffled
+from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
+from wiw.runs.verify import verify
 from wiw.types import Key, Proposal
 
 SPEC = model_spec(wiw.accepts(control="trajectory"))

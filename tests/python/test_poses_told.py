@@ -22,12 +22,12 @@ from test_export import contents_of
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.evaluation.evaluate import evaluate
-from wiw.evaluation.films import film, keep_films
-from wiw.evaluation.report.page import render
-from wiw.evaluation.report.stage import SIDE, Stage, signs, stage_of
-from wiw.evaluation.rows import decode_jpeg, kept_frames
-from wiw.evaluation.view import write_view
+from wiw.report.page import render
+from wiw.report.site import write_view
+from wiw.report.stage import SIDE, Stage, signs, stage_of
+from wiw.runs.films import film, keep_films
+from wiw.runs.rows import decode_jpeg, kept_frames
+from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import Manipulation
 

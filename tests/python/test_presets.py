@@ -11,8 +11,8 @@ import pytest
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.evaluation.evaluate import evaluate, resume_run
-from wiw.evaluation.recipes import AgentRecipe
+from wiw.runs.recipes import AgentRecipe
+from wiw.studies.evaluate import evaluate, resume_run
 from wiw.tasks import presets
 from wiw.tasks.imagenav import ImageNav
 

@@ -14,10 +14,10 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError, FileError
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
-from wiw.tabletop.robot import load_panda, load_robot
+from wiw.runs.recipes import AgentRecipe
 from wiw.tabletop.tasks import TABLETOP_TASKS
+from wiw.tabletop.robot import load_panda, load_robot
 from wiw.tabletop.workbench import TABLE, Thing, Workbench
 from wiw.tasks.manipulation import Manipulation
 

@@ -11,8 +11,8 @@ import pytest
 import wiw
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.loop.agent import Query, consults
+from wiw.runs.recipes import AgentRecipe
 from wiw.types import Goal, Key, Observation, Proposal
 
 

@@ -11,9 +11,9 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.evaluation.evaluate import evaluate
 from wiw.policies.base import Situation
 from wiw.policies.scripted import Scripted
+from wiw.studies.evaluate import evaluate
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tasks.manipulation import Manipulation
 from wiw.types import Goal, Key, Proposal, Rollout

@@ -15,7 +15,6 @@ from wiw import panorama
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.cli import main
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.loop.agent import Query
 from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
@@ -23,6 +22,7 @@ from wiw.loop.imagine import imagine
 from wiw.loop.labels import labelled, semantics_source
 from wiw.perception.semantics import CATEGORIES, OTHER_CATEGORY, Semantics
 from wiw.policies.base import FrameSpec
+from wiw.runs.recipes import AgentRecipe
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Conditioning, Key, Proposal
 
@@ -35,6 +35,7 @@ class Reader(wiw.WorldModel):
     """Paints what it is told that things are."""
 
     accepts = wiw.accepts("trajectory", needs=("semantic",), cacheable=True)
+    version = "1"
     seen = []
 
     def rollout(self, observations, controls, seeds):
@@ -178,7 +179,7 @@ def test_a_run_keeps_its_source_and_can_be_resumed_and_verified(
     begin = ["run", "imagenav", "--scenes", two_rooms, "--world-model", reader, "--episodes", "2", "--live", "2"]
     begin += ["--task-option", "decisions=2", "--cache", str(tmp_path / "kept")]
     assert main([*begin, *arms, "--semantics", "simulator", "--out", out, "--no-report"]) == 0
-    log = wiw.evaluation.runlog.RunLog(wiw.evaluation.store.RunStore.read(Path(out)))
+    log = wiw.studies.run_log.RunLog(wiw.runs.store.RunStore.read(Path(out)))
     assert [arm["agent"]["semantics"] for arm in log.store.config["arms"]] == ["simulator"] * max(1, 3 * bool(arms))
     assert all(episode["status"] == "done" for episode in log.episodes)
     assert any(decision["calls"]["rows"] for decision in log.decisions)

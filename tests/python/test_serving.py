@@ -38,8 +38,9 @@ from wiw.types import Conditioning, Control
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
-from wiw.world_models.remote import Remote, link
+from wiw.world_models.remote import link
 from wiw.world_models.remote.limits import check_row
+from wiw.world_models.remote.model import Remote
 
 SIZE = (8, 16)
 
@@ -181,7 +182,7 @@ def test_rows_of_different_lengths_never_share_a_batch():
 
 
 def test_a_whole_run_is_the_same_as_at_home(two_rooms, tmp_path):
-    from wiw.evaluation.store import RunStore
+    from wiw.runs.store import RunStore
     from wiw.tasks.imagenav import ImageNav
 
     def facts(model, name):

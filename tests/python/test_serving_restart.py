@@ -18,8 +18,8 @@ import pytest
 
 import wiw
 from wiw.cli import main
-from wiw.evaluation.recipes import AgentRecipe
-from wiw.evaluation.store import RunStore
+from wiw.runs.recipes import AgentRecipe
+from wiw.runs.store import RunStore
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Conditioning, Control
 

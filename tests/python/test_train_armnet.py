@@ -34,7 +34,7 @@ from wiw.training.plays import (  # noqa: E402
     read_demonstration_plays,
     record_plays,
 )
-from wiw.world_models.armnet import ArmNet  # noqa: E402
+from wiw.world_models.armnet.model import ArmNet  # noqa: E402
 from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
 from wiw.world_models.armnet.weights import load  # noqa: E402
 

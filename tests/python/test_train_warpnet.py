@@ -16,7 +16,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.training.walks import WalkRules, Walks, find_straight_paths, merge_walks, record_walks  # noqa: E402
 from wiw.training.warpnet import Recipe, evaluate, sample_pairs, train  # noqa: E402
-from wiw.world_models.warpnet import WarpNet  # noqa: E402
+from wiw.world_models.warpnet.model import WarpNet  # noqa: E402
 from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")

@@ -11,9 +11,9 @@ from fakes import LineAgent, LineTask
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
-from wiw.evaluation.evaluate import evaluate, run_arms
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.evaluation.store import store_path
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.store import store_path
+from wiw.studies.evaluate import evaluate, run_arms
 
 TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"
 

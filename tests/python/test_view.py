@@ -16,11 +16,10 @@ from PIL import Image
 
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.evaluation.evaluate import run_arms
-from wiw.evaluation.rows import decode_jpeg, encode_jpeg
-from wiw.evaluation.store import store_path
-from wiw.evaluation.view import write_view
-from wiw.evaluation.view.site import Beside
+from wiw.report.site import Beside, write_view
+from wiw.runs.rows import decode_jpeg, encode_jpeg
+from wiw.runs.store import store_path
+from wiw.studies.evaluate import run_arms
 from wiw.types import Episode
 
 EVIL = """<img src=x onerror="document.title='owned'">'"/../&"""

@@ -4,9 +4,9 @@ import pytest
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.evaluation.scene_map import HFOV_DEG, draw, look_down, to_pixels
 from wiw.nav import NavMesh
 from wiw.render import Renderer
+from wiw.runs.scene_map import HFOV_DEG, draw, look_down, to_pixels
 from wiw.scenes import load
 from wiw.types import ArmObservation, Decision, Goal, Key, Observation, Proposal, Rollout
 

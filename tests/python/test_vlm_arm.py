@@ -17,14 +17,14 @@ pytest.importorskip("json_repair")
 
 import wiw
 from wiw.errors import ArgumentError, PromptError
-from wiw.evaluation.evaluate import evaluate
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.policies.vlm import VLM
 from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
 from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
+from wiw.runs.recipes import AgentRecipe
 from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
+from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Goal, Key, Proposal

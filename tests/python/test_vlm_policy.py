@@ -19,13 +19,13 @@ import wiw
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
-from wiw.evaluation.evaluate import evaluate
-from wiw.evaluation.recipes import AgentRecipe
 from wiw.loop.agent import Query
 from wiw.policies.vlm import VLM, presets, prompt_images
 from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
+from wiw.runs.recipes import AgentRecipe
 from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
+from wiw.studies.evaluate import evaluate
 from wiw.types import Rollout
 from wiw.vlm.base import Call
 from wiw.vlm.mock import MockClient

@@ -13,10 +13,10 @@ import pytest
 from wiw import scenes
 from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import FileError, StoreError
-from wiw.evaluation.evaluate import evaluate, resume_run
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.evaluation.store import store_path
 from wiw.nav import NavMesh, NavMeshSettings
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.store import store_path
+from wiw.studies.evaluate import evaluate, resume_run
 
 
 @pytest.fixture

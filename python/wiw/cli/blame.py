@@ -47,7 +47,7 @@ def blame(
         workers: Processes; as many as the run was begun with if not given. Results do not depend on it.
         retry_failed: Whether to run episodes again whose infrastructure failed under a swap.
     """
-    from wiw.evaluation.attribute import attribute
+    from wiw.studies.attribute import attribute
 
     arms = None if arm is None else [name.strip() for name in arm.split(",") if name.strip()]
     found = stoppable(lambda: attribute(run, arms, episodes, workers, retry_failed=retry_failed), run, "blame")

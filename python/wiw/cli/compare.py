@@ -29,8 +29,8 @@ def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -
         arm: Of both runs, or of the first; all that both have if not given.
         other: Of the second run, if it has another name there.
     """
-    from wiw.evaluation.compare import compare as compare_runs
-    from wiw.evaluation.tables import print_summary
+    from wiw.report.tables import print_summary
+    from wiw.studies.compare import compare as compare_runs
 
     print_summary(compare_runs(first, second, arm, other))
     return 0

@@ -81,8 +81,8 @@ def _run(part: Part, folder: Path) -> int:
     """One part, with its table and report; its exit code."""
     from wiw.cli.run import finish
     from wiw.cli.stop import stoppable
-    from wiw.evaluation.evaluate import evaluate
-    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe
+    from wiw.studies.evaluate import evaluate
 
     arms = _arms(part.arms)
     print(f"\n{part.about}, {len(arms)} world models.\n")

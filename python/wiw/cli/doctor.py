@@ -70,7 +70,7 @@ def _software() -> Iterator[Finding]:
 
 def _processor() -> Iterator[Finding]:
     from wiw._core import core
-    from wiw.evaluation.platform import processor_name
+    from wiw.runs.platform import processor_name
 
     cores, threads = len(os.sched_getaffinity(0)), core.num_threads()
     yield Finding("processor", f"{processor_name()}, {cores} cores")

@@ -32,7 +32,7 @@ def export(
         parquet: New folder for Parquet files; needs pyarrow.
         rerun: Recording for `rerun FILE.rrd`, with the pictures that the run kept; needs rerun-sdk.
     """
-    from wiw.evaluation.runlog import load_run
+    from wiw.studies.run_log import load_run
 
     for path in load_run(run).export(csv, parquet, rerun):
         print(path)

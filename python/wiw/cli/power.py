@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
-    from wiw.evaluation.power import Power
+    from wiw.analysis.power import Power
 
 Number = Annotated[float, arg(metavar="X")]
 Count = Annotated[int, arg(metavar="N")]
@@ -54,7 +54,7 @@ def power(
         chance: Of showing the difference if there is one.
         arms: Compared with the same base, whose p values Holm adjusts.
     """
-    from wiw.evaluation.power import power as plan
+    from wiw.analysis.power import power as plan
 
     def planned(points: float | None, scenes: int | None = None) -> Power:
         return plan(

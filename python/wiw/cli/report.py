@@ -26,8 +26,8 @@ def report(
         run: The run's folder.
         out: Where to write; report.html in the run's folder if not given.
     """
-    from wiw.evaluation.costs import print_costs
-    from wiw.evaluation.runlog import load_run
+    from wiw.analysis.costs import print_costs
+    from wiw.studies.run_log import load_run
 
     log = load_run(run)
     log.summary()

@@ -112,7 +112,7 @@ def run(
         deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
-            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
+            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
         fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
         lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where
@@ -126,8 +126,8 @@ def run(
         prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
     """
-    from wiw.evaluation.evaluate import evaluate
-    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.studies.evaluate import evaluate
 
     flags = {
         "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
@@ -175,7 +175,7 @@ def resume(
         retry_failed: Whether to run episodes again whose infrastructure failed.
         report: Whether to write report.html at the end.
     """
-    from wiw.evaluation.evaluate import resume_run
+    from wiw.studies.evaluate import resume_run
 
     return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
 
@@ -213,7 +213,7 @@ def vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:
-    from wiw.evaluation.recipes import absolute
+    from wiw.runs.recipes import absolute
 
     if arms is None:
         return None

@@ -81,7 +81,7 @@ def scale(
         live: Episodes kept live at a time in a process, so that model calls are batched.
         deadline: Most seconds for a call of the world model, 300 if not given.
         cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
-            folder for every model; or off.
+            folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder.
         vlm: For policy vlm, as in `wiw run`.
         vlm_model: Likewise.
@@ -89,8 +89,8 @@ def scale(
         semantics_option: An option of --semantics; may be given again.
     """
     from wiw.cli.run import stoppable, vlm_options
-    from wiw.evaluation.recipes import AgentRecipe, TaskRecipe, absolute
-    from wiw.evaluation.scale import scale as run_scale
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
+    from wiw.studies.scale import scale as run_scale
 
     policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)

@@ -68,7 +68,7 @@ def _guard(watch: int, done: threading.Event) -> None:
 
 def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:
     """Does the work on a run; when it is stopped, says which command goes on with it."""
-    from wiw.evaluation.store import store_path
+    from wiw.runs.store import store_path
 
     try:
         return work()

@@ -197,7 +197,7 @@ def _train_warpnet(
     from wiw.training import warpnet as training
     from wiw.training.gather import gather_walks
     from wiw.training.walks import WalkRules
-    from wiw.world_models.warpnet import WarpNet
+    from wiw.world_models.warpnet.model import WarpNet
     from wiw.world_models.warpnet.weights import load, save
 
     rules, recipe = WalkRules(**rule_options), training.Recipe(seed=data.seed, **recipe_options)

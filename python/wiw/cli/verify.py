@@ -28,7 +28,7 @@ def verify(
         episodes: How many, drawn at random; all if the run has fewer.
         seed: Of that draw.
     """
-    from wiw.evaluation.verify import verify as check
+    from wiw.runs.verify import verify as check
 
     found = check(run, episodes, seed)
     print(found)

@@ -28,8 +28,8 @@ def view(
         run: The run's folder.
         out: Folder to write, new or with an older view; `view` in the run's folder if not given.
     """
-    from wiw.evaluation.runlog import load_run
-    from wiw.evaluation.view import write_view
+    from wiw.report.site import write_view
+    from wiw.studies.run_log import load_run
 
     log = load_run(run)
     site = write_view(log, out or log.path / "view")

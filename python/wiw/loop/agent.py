@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.loop.attempts import DEADLINE, Attempts
+from wiw.loop.attempts import DEADLINE, Attempts, make_model
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.contract import (
@@ -35,7 +35,7 @@ from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
 from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
-from wiw.registry import POLICIES, WORLD_MODELS
+from wiw.registry import POLICIES
 from wiw.types import ArmObservation, Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout, Space
 from wiw.world_models.base import WorldModel
 
@@ -99,9 +99,10 @@ class Agent:
             extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
             Without a model nothing is imagined, and there is one level.
         width: plans of an episode that are kept and extended; None means `candidates`.
-        deadline: seconds that a call of the world model may take before it counts as failed (`wiw.loop.attempts`).
+        deadline: seconds that a call of the world model, or its constructor, may take before it counts as failed
+            (`wiw.loop.attempts`).
         cache: "auto" keeps the rollouts of models that declare themselves `cacheable` in `~/.cache/wiw/rollouts`, a
-            folder keeps those of any model there, "off" keeps none (`wiw.loop.rollout_cache`).
+            folder keeps those of any model with a `version` there, "off" keeps none (`wiw.loop.rollout_cache`).
         cache_gb: most gigabytes of that folder; what was not used for longest goes first.
         pool: plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ
             in `candidates` alone are nested; None proposes as many as are kept.
@@ -118,6 +119,7 @@ class Agent:
             both; None means the task's own, else the policy's.
 
     Raises:
+        ConstructionError: the constructor of a model or policy raised; a model's did not return by the deadline.
         WeightsError: those of LPIPS are not there.
         ArgumentError: a number out of range; a policy that makes plans of another kind; a model that would not be given
             what it needs; with depth > 1, a model that shows no panorama or a policy that needs depth, which no
@@ -154,7 +156,8 @@ class Agent:
         """The numbers that were not left to the task."""
         self._given_space = space
         self.policy: Policy = _of_space(POLICIES.make(policy), space)
-        self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model).for_space(self.policy.space)
+        made = None if model is None else make_model(model, deadline)
+        self.model: WorldModel | None = None if made is None else made.for_space(self.policy.space)
         self._given_revision = revision
         self.revision: Policy = self._reviser(revision)
         if self.revision.space != self.policy.space:
@@ -416,15 +419,16 @@ class Agent:
         """Each episode as its proposer and as its reviser know it; the same object where one policy is both."""
         proposing, revising = [], []
         for query in queries:
-            life = self._life(query)
+            life = self._begin_or_continue(query)
             imagines = self._ask is not None and consults(query.key, self.imagine_fraction)
             known = query.observation, query.goal, query.key
             proposing.append(Situation(*known, life.proposer, tuple(life.executed), imagines))
             revising.append(Situation(*known, life.reviser, tuple(life.executed), imagines))
         return proposing, revising
 
-    def _life(self, query: Query) -> _Life:
-        name = (query.key.seed, query.key.episode)
+    def _begin_or_continue(self, query: Query) -> _Life:
+        """What is kept of an episode: once a decision, for its first begins anew."""
+        name = query.key.seed, query.key.episode
         if query.key.decision == 0 or name not in self._lives:
             check_answerer(self.revision, query.goal)
             memory = self.policy.begin(query.goal, query.key)
@@ -446,7 +450,7 @@ class Agent:
             actions = future.proposals[chosen].actions
         actions = checked_plan(self.revision, actions, self.horizon * self.depth)
         execute = self._segment(len(actions))
-        self._life(query).executed += actions[:execute].tolist()
+        self._lives[query.key.seed, query.key.episode].executed += actions[:execute].tolist()
         exchanges = tuple(each for policy in self._policies for each in policy.exchanges(query.key))
         return Decision(
             actions=actions,

@@ -24,6 +24,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
+from wiw.runs.sources import source_digests
 from wiw.serving.known import Known
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
@@ -344,12 +345,16 @@ async def _send(client: ServerConnection, message: bytes) -> None:
 
 
 def _welcome(model: WorldModel, in_flight: int) -> Welcome:
-    try:
-        fingerprint, unknown = model.fingerprint(), ""
-    except ArgumentError as error:
-        fingerprint, unknown = "", str(error)
-    described = json.dumps(model.describe(), default=str)
+    fingerprint = model.fingerprint()
+    unknown = "" if fingerprint else f"{type(model).__name__} declares no version"
+    described = json.dumps({**model.describe(), **_sources(model, fingerprint)}, default=str)
     return Welcome(declaration(model.accepts), described, fingerprint, unknown, in_flight)
+
+
+def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
+    """Return what tells versions of a model apart that declares none: digests of its source files, by name."""
+    digests = {} if fingerprint else source_digests(model)
+    return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
 
 
 def _is_loopback(host: str) -> bool:

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 from wiw.physics import Articulation, read_surface
 from wiw.tabletop.shapes import Mesh, build_mesh, merge_meshes, paint_mesh
 
+LinkMeshes = tuple[tuple[int, Mesh], ...]
+"""(link, mesh in the link's frame) of every visible link."""
+
 
 @cache
-def build_link_meshes(robot: Articulation) -> tuple[tuple[int, Mesh], ...]:
+def build_link_meshes(robot: Articulation) -> LinkMeshes:
     """Return (link, mesh in the link's frame) for every visible link; primitives get rounded edges.
 
     Raises:

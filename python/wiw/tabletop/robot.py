@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from os import PathLike
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Gripper, InverseKinematics, World, panda
-from wiw.tabletop.link_meshes import build_link_meshes
-from wiw.tabletop.shapes import Mesh
+from wiw.tabletop.description import read_description
+from wiw.tabletop.link_meshes import LinkMeshes, build_link_meshes
 
 TOOL_WORDS = ("tcp", "grasptarget", "grasp_target", "tool", "tip", "ee")
 """Words in the name of the link between the finger tips, the most specific first."""
@@ -41,11 +42,13 @@ class Robot:
     finger_joints: tuple[str, str]
     identity: dict[str, Any] = field(default_factory=dict)
     """JSON-able: equal for equal robots."""
+    file_meshes: LinkMeshes | None = field(default=None, compare=False, repr=False)
+    """Link meshes of a robot whose files were read in a separate process."""
 
     @cached_property
-    def link_meshes(self) -> tuple[tuple[int, Mesh], ...]:
+    def link_meshes(self) -> LinkMeshes:
         """(link, mesh in the link's frame) of every visible link."""
-        return build_link_meshes(self.description)
+        return build_link_meshes(self.description) if self.file_meshes is None else self.file_meshes
 
     @cached_property
     def tool_index(self) -> int:
@@ -103,24 +106,43 @@ def load_robot(file: str | PathLike[str], tcp: str = "") -> Robot:
             expected and what was found.
     """
     path = Path(file).expanduser().absolute()
-    description = Articulation(path)
-    digest = hashlib.sha256(path.read_bytes())
-    for mesh in description.meshes:
-        digest.update(Path(mesh).read_bytes() if Path(mesh).is_file() else b"")
-    key = path, digest.hexdigest()[:16], tcp
-    if key not in _CACHE:
-        identity = {"name": path.name, "digest": key[1], **({"tcp": tcp} if tcp else {})}
-        robot = _build_robot(description, tcp, identity)
-        _ = robot.link_meshes, robot.ready_joints  # what cannot be drawn or used is told here
-        _CACHE[key] = robot
-    return _CACHE[key]
+    cached = _CACHE.get((path, tcp))
+    if cached is not None and cached.digest == _compute_digest(path, cached.meshes):
+        return cached.robot
+    description = read_description(path)
+    meshes = tuple(map(Path, description.articulation.meshes))
+    digest = _compute_digest(path, meshes)
+    identity = {"name": path.name, "digest": digest, **({"tcp": tcp} if tcp else {})}
+    robot = _build_robot(description.articulation, tcp, identity, description.link_meshes)
+    _ = robot.ready_joints  # an arm that does not come there is refused here
+    _CACHE[path, tcp] = _CachedRobot(digest, meshes, robot)
+    return robot
 
 
-_CACHE: dict[tuple[Path, str, str], Robot] = {}
-"""Loaded robots by file, digest of it and its meshes, and tool link."""
+@dataclass(frozen=True)
+class _CachedRobot:
+    """A robot, and the files it was read from."""
+
+    digest: str
+    meshes: tuple[Path, ...]
+    robot: Robot
 
 
-def _build_robot(description: Articulation, tcp: str, identity: dict[str, Any]) -> Robot:
+_CACHE: dict[tuple[Path, str], _CachedRobot] = {}
+"""Loaded robots by file and tool link."""
+
+
+def _compute_digest(path: Path, meshes: Sequence[Path]) -> str:
+    """Return the digest of a description and its meshes."""
+    state = hashlib.sha256(path.read_bytes() if path.is_file() else b"")
+    for mesh in meshes:
+        state.update(mesh.read_bytes() if mesh.is_file() else b"")
+    return state.hexdigest()[:16]
+
+
+def _build_robot(
+    description: Articulation, tcp: str, identity: dict[str, Any], link_meshes: LinkMeshes | None = None
+) -> Robot:
     left, right = _find_finger_joints(description)
     hand = left["parent"]
     robot = Robot(
@@ -130,6 +152,7 @@ def _build_robot(description: Articulation, tcp: str, identity: dict[str, Any]) 
         (left["child"], right["child"]),
         (left["name"], right["name"]),
         identity,
+        looks,
     )
     _check_frame(robot)
     return robot

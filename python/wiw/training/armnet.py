@@ -26,9 +26,9 @@ from wiw.world_models.armnet.network import (
     Arm,
     Motion,
     Network,
-    cleared,
-    composed,
-    imagined_in_sight,
+    clear_arm,
+    compose_view,
+    find_visible_arm,
     in_sight,
     sources,
     still,
@@ -203,13 +203,13 @@ def predict_free_running(network: Network, sequences: Sequences, bfloat16: bool 
     for k, motion in enumerate(sequences.motions):
         before, arm = sequences.arms[k : k + 2]
         step = _predict_step(network, canvas, before.mask, arm, motion, sequences.views[k + 1], bfloat16)
-        canvas = cleared(step.prediction.detach(), arm, imagined_in_sight(step.shares.detach(), arm), plate, canvas)
+        canvas = clear_arm(step.prediction.detach(), arm, find_visible_arm(step.shares.detach(), arm), plate, canvas)
         yield step
 
 
 def clear_canvas(seen: Tensor, arm: Arm, before: Tensor) -> Tensor:
     """Return the canvas after a true view."""
-    return cleared(seen, arm, in_sight(seen, arm), load_bare_table(), before)
+    return clear_arm(seen, arm, in_sight(seen, arm), load_bare_table(), before)
 
 
 def predict_teacher_forced(network: Network, sequences: Sequences, bfloat16: bool = False) -> Iterator[StepPrediction]:
@@ -234,7 +234,7 @@ def _predict_step(
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         mixture = network(canvas, arm, before, motion, plate)
     parts = sources(mixture, canvas, arm, motion, plate)
-    return StepPrediction(composed(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
+    return StepPrediction(compose_view(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
 
 
 def _compute_loss(step: StepPrediction, recipe: Recipe) -> Tensor:

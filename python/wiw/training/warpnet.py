@@ -19,7 +19,7 @@ from wiw.errors import ArgumentError
 from wiw.reproject import pose, warp
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 from wiw.training.walks import Walks, find_straight_paths
-from wiw.world_models.warpnet import WarpNet, to_network
+from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
 
 STRIDE = 0.2
@@ -219,7 +219,7 @@ def _evaluate_scene(model: WarpNet, name: str, seed: int, paths: int) -> list[di
         for steps, target in zip(EVALUATED_STEPS, color[1:], strict=True):
             shown = {
                 "copy": color[0],
-                "warpnet": model.moved(color[0], steps * STRIDE, 0.0),
+                "warpnet": model.imagine_move(color[0], steps * STRIDE, 0.0),
                 "warp": warp(color[:1], depth, pose(forward=steps * STRIDE)[None, None])[0, 0],
             }
             for made, image in shown.items():

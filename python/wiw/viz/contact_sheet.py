@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from wiw.evaluation.scene_map import draw
+from wiw.runs.scene_map import draw
 
 HEIGHT, GAP, CAPTION = 288, 12, 26
 """Pixels: of a picture, between pictures, above a row."""

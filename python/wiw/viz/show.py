@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.evaluation.report.cuts import BAND, FRONT, part
-from wiw.evaluation.report.plans import glyphs
-from wiw.evaluation.report.stage import signs
-from wiw.evaluation.rows import kept_frames
+from wiw.report.cuts import BAND, FRONT, part
+from wiw.report.plans import glyphs
+from wiw.report.stage import signs
+from wiw.runs.rows import kept_frames
 from wiw.tabletop.workbench import SHUT
 from wiw.types import ArmObservation, Decision, Observation, Rollout
 

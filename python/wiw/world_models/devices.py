@@ -12,6 +12,6 @@ __all__ = ["device", "memory_guard", "require"]
 
 
 def require(requirements: Requirements) -> None:
-    """Raises DependencyError where a package is missing."""
+    """Raise DependencyError where a package is missing."""
     if missing := requirements.missing():
         raise DependencyError(f"{', '.join(missing)} not installed; pip install 'wiw[{requirements.extra}]'")

@@ -8,6 +8,8 @@ namespace wiw::cpu {
 
 namespace {
 
+constexpr unsigned kVisible = 0xFFFFFFFF;  // to every ray
+
 /// Embree's kernels must match ours in width: a packet wider than its native one is traced ray by ray.
 std::string device_options(Isa isa) {
   std::string options = "threads=" + std::to_string(ThreadPool::shared().size());
@@ -35,6 +37,7 @@ EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa is
   }
   for (const Part& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
   in_moved_.assign(shading.parts().size(), false);
+  away_.assign(shading.parts().size(), false);
   fixed_ = rtcNewScene(device_);
   moved_ = rtcNewScene(device_);
   rtcSetSceneFlags(moved_, RTC_SCENE_FLAG_DYNAMIC);
@@ -106,21 +109,41 @@ void EmbreeScene::pierce(const RTCFilterFunctionNArguments* arguments) {
 void EmbreeScene::move(std::span<const Placed> parts) {
   bool any_new = false;
   for (const Placed& part : parts) {
-    if (!in_moved_[part.number]) adopt(part.number), any_new = true;
+    if (!in_moved_[part.number] && !is_home(part)) adopt(part.number), any_new = true;
   }
   // Trees are built from the parts as the scene has them and fitted to every later pose, which is much faster than
   // building and leaves pictures a function of the poses alone.
   if (any_new) rtcCommitScene(moved_);
+  bool any_placed = false;
   for (const Placed& part : parts) {
+    if (!in_moved_[part.number]) continue;
     RTCGeometry geometry = rtcGetGeometry(moved_, static_cast<unsigned>(part.number));
     write_vertices(geometry, part.number, *part.T_world_instance);
     rtcUpdateGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0);
+    show(part.number, is_home(part));
     rtcCommitGeometry(geometry);
+    any_placed = true;
   }
-  if (parts.empty()) return;
+  if (!any_placed) return;
   rtcCommitScene(moved_);
-  any_moved_ = true;
   check("moving instances");
+}
+
+bool EmbreeScene::is_home(const Placed& part) const {
+  return part.T_world_instance->matrix() ==
+         scene_.instances[shading_.parts()[part.number].instance].T_world_instance.matrix();
+}
+
+/// A part that is back where the scene has it is drawn from the fixed scene again: the two trees break ties between
+/// surfaces at equal distance differently, and a picture must depend on the poses alone.
+void EmbreeScene::show(std::size_t number, bool from_fixed) {
+  const auto id = static_cast<unsigned>(number);
+  // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
+  rtcSetGeometryMask(rtcGetGeometry(fixed_, id), from_fixed ? kVisible : 0);
+  rtcSetGeometryMask(rtcGetGeometry(moved_, id), from_fixed ? 0 : kVisible);
+  if (away_[number] != from_fixed) return;
+  away_[number] = !from_fixed;
+  away_count_ += from_fixed ? -1 : 1;
 }
 
 void EmbreeScene::adopt(std::size_t number) {
@@ -130,8 +153,6 @@ void EmbreeScene::adopt(std::size_t number) {
   rtcCommitGeometry(geometry);
   rtcAttachGeometryByID(moved_, geometry, id);
   rtcReleaseGeometry(geometry);
-  // Traversal reads a geometry's mask at every hit, so masking needs no rebuild of the fixed scene.
-  rtcSetGeometryMask(rtcGetGeometry(fixed_, id), 0);
   in_moved_[number] = true;
 }
 

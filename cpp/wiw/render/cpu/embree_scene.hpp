@@ -14,8 +14,8 @@
 namespace wiw::cpu {
 
 /// The parts' triangles in two Embree scenes: one built once from everything, and a small dynamic one with the parts
-/// that have been moved. A moved part is masked out of the first, so that one is never rebuilt. Geometry ids are part
-/// numbers in both.
+/// that have been moved. Each part is masked out of one of them: out of the first while it is away from where the scene
+/// has it, so that one is never rebuilt. Geometry ids are part numbers in both.
 class EmbreeScene {
  public:
   EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa isa);
@@ -30,8 +30,8 @@ class EmbreeScene {
   void move(std::span<const Placed> parts);
 
   [[nodiscard]] RTCScene fixed() const { return fixed_; }
-  /// Null while nothing has moved.
-  [[nodiscard]] RTCScene moved() const { return any_moved_ ? moved_ : nullptr; }
+  /// Null while every part is where the scene has it.
+  [[nodiscard]] RTCScene moved() const { return away_count_ > 0 ? moved_ : nullptr; }
   [[nodiscard]] std::string version() const;
 
  private:
@@ -42,6 +42,8 @@ class EmbreeScene {
   static void pierce(const RTCFilterFunctionNArguments* arguments);
 
   void adopt(std::size_t part);
+  void show(std::size_t part, bool from_fixed);
+  [[nodiscard]] bool is_home(const Placed& part) const;
   RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
   void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
   void check(const char* what) const;
@@ -53,7 +55,8 @@ class EmbreeScene {
   RTCScene fixed_ = nullptr;
   RTCScene moved_ = nullptr;
   std::vector<bool> in_moved_;  // by part
-  bool any_moved_ = false;
+  std::vector<bool> away_;      // by part
+  int away_count_ = 0;
 };
 
 }  // namespace wiw::cpu

@@ -39,7 +39,7 @@ def _bare() -> Workbench:
 
 @cache
 def plate(size: tuple[int, int]) -> Sight:
-    """The bare table without an arm, as seen in front."""
+    """Return the front view of the bare table without an arm."""
     seen = _bare().render_view("front", size, arm=False)
     seen["color"].setflags(write=False)
     return Sight(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
@@ -52,7 +52,7 @@ def _depth(size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def sights(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[Sight]:
-    """The arm after it has gone to each of the poses [N, 7], one after another, from where it waits."""
+    """Yield the arm after it has gone to each of the poses [N, 7] in turn, from where it waits."""
     bench = _bare().fork()
     for pose in poses:
         bench.move_to(np.clip(pose, *_RANGE))

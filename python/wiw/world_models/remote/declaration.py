@@ -15,7 +15,7 @@ from wiw.world_models.base import Accepts, accepts
 
 
 def declaration(declared: Accepts) -> str:
-    """JSON of what a model accepts."""
+    """Return JSON of what a model accepts."""
     values = {field.name: getattr(declared, field.name) for field in fields(declared)}
     if declared.vocabulary is not None:
         values["vocabulary"] = [[int(name), np.asarray(own).tolist()] for name, own in declared.vocabulary.items()]
@@ -24,11 +24,11 @@ def declaration(declared: Accepts) -> str:
     return json.dumps(values)
 
 
-def declared(text: str) -> Accepts:
-    """What a model accepts, from such JSON.
+def parse_declaration(text: str) -> Accepts:
+    """Return what a model accepts, from such JSON.
 
     Raises:
-        RemoteError: it is none.
+        RemoteError: it cannot be read.
     """
     try:
         values: dict[str, Any] = json.loads(text)

@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many episodes a run needs, or what it can show, before it is run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from wiw.analysis.intervals import t_of_sums
+from wiw.analysis.simulate import draw, total
+from wiw.errors import ArgumentError
+
+BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
+"""Near what 210 test episodes of Image-Goal Navigation in 42 apartments gave (`docs/results.md`): 18 % succeed without
+a world model; the oracle wins 76 more and loses 4; paired differences correlate within apartments by -0.06 to 0.06."""
+MOST_SCENES = 100_000
+LEAST = 0.1
+"""Points; differences are sought in such steps."""
+_DRAWS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Power:
+    """What `wiw.power` returns; shows itself as a sentence or two."""
+
+    difference: float
+    """Points of success rate between two arms that the run shows."""
+    base: float
+    """Success rate of the arm compared with, percent."""
+    losses: float
+    """Percent of episodes that only the arm compared with succeeds in."""
+    correlation: float
+    """Of the differences of two episodes of a scene."""
+    per_scene: int
+    arms: int
+    wanted: float
+    """Chance of showing the difference that was asked for."""
+    scenes: int
+    """Needed."""
+    by_interval: float
+    """Chance, in simulated runs, that the 95 % interval of the difference excludes 0 on its side."""
+    by_test: float
+    """The same for the exact McNemar test."""
+
+    @property
+    def episodes(self) -> int:
+        """Needed, of each arm."""
+        return self.scenes * self.per_scene
+
+    @property
+    def wins(self) -> float:
+        """Percent of episodes that only the better arm succeeds in."""
+        return self.losses + abs(self.difference)
+
+    def __str__(self) -> str:
+        among = f", as one of {self.arms} arms," if self.arms > 1 else ""
+        return (
+            f"{self.episodes} episodes in {self.scenes} scenes ({self.per_scene} each) show a difference of "
+            f"{self.difference:+g} points to {self.base:g} %{among} with a chance of {100 * self.by_interval:.0f} % by "
+            f"its interval and {100 * self.by_test:.0f} % by McNemar's test, if {self.wins:g} % of episodes are won, "
+            f"{self.losses:g} % are lost, and episodes of a scene correlate by {self.correlation:g}."
+        )
+
+    def _repr_pretty_(self, printer: Any, cycle: bool) -> None:
+        printer.text(str(self))
+
+
+def power(
+    difference: float | None = None,
+    *,
+    scenes: int | None = None,
+    base: float = BASE,
+    losses: float = LOSSES,
+    correlation: float = CORRELATION,
+    per_scene: int = PER_SCENE,
+    chance: float = 0.8,
+    arms: int = 1,
+    seed: int = 0,
+) -> Power:
+    """Scenes that a run needs to show a paired difference of success rates, or the least that a run can show.
+
+        wiw.power(10)              # +10 points to 20 %, in apartments
+        wiw.power(10, arms=4)      # the same as one of four arms, whose p values Holm adjusts
+        wiw.power(scenes=40)       # what 200 episodes in 40 scenes can show
+
+    The fewest scenes for which the t interval of the difference excludes 0 often enough are found by its noncentral t
+    distribution, and the chance is then measured in simulated runs; scenes are added until it is what was asked for.
+    The least difference is sought in simulated runs, to a tenth of a point.
+
+    Args:
+        difference: in points; positive if the arm under test is better. None: the least that `scenes` can show.
+        scenes: of the run; None: as many as `difference` needs.
+        base: success rate of the arm it is compared with, percent.
+        losses: percent of episodes in which the worse arm succeeds and the better one does not. Fewer: arms are more
+            alike, so that less is left to chance.
+        correlation: between the differences of two episodes of one scene, in [0, 1).
+        per_scene: episodes in each scene.
+        chance: of showing the difference, if there is one.
+        arms: compared with the same base; the strictest step of Holm's adjustment is reckoned with.
+        seed: of the simulation.
+
+    Raises:
+        ArgumentError: numbers that no run could have; both a difference and scenes, or neither.
+    """
+    if (difference is None) == (scenes is None):
+        raise ArgumentError(
+            "power: expected either a difference, for the scenes it needs, or scenes, for what they show"
+        )
+    plan = _Plan(losses, correlation, per_scene, chance, 1 - 0.05 / arms if arms > 0 else 0.0, seed)
+    if difference is not None:
+        _check(difference, base, losses, correlation, per_scene, chance, arms)
+        needed, shares = plan.scenes_for(abs(difference))
+    else:
+        assert scenes is not None
+        _check(LEAST, base, losses, correlation, per_scene, chance, arms)
+        if scenes < 2:
+            raise ArgumentError(f"power: expected at least 2 scenes, got {scenes}")
+        difference, shares = plan.difference_for(scenes, 100 - base - losses)
+        needed = scenes
+    return Power(difference, base, losses, correlation, per_scene, arms, chance, needed, *shares)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What does not change while scenes, or the difference, are sought."""
+
+    losses: float
+    correlation: float
+    per_scene: int
+    chance: float
+    confidence: float
+    seed: int
+
+    def scenes_for(self, difference: float) -> tuple[int, tuple[float, float]]:
+        """Fewest scenes, and what they give by interval and by test."""
+        rng = self._rng()
+        scenes = self._fewest(difference)
+        while (shares := self._simulated(difference, scenes, rng))[0] < self.chance:
+            scenes += max(1, scenes // 25)
+        return scenes, shares
+
+    def difference_for(self, scenes: int, most: float) -> tuple[float, tuple[float, float]]:
+        """Least difference up to `most`, to a tenth of a point, and what the scenes give for it."""
+
+        def shown(tenths: int) -> tuple[float, float]:
+            return self._simulated(tenths / 10, scenes, self._rng())
+
+        least, end = 1, int(10 * most + 1e-9)
+        if end < least or shown(end)[0] < self.chance:
+            raise ArgumentError(
+                f"power: {scenes * self.per_scene} episodes in {scenes} scenes show no difference up to {most:g} "
+                f"points with a chance of {100 * self.chance:g} %; take more scenes"
+            )
+        while least < end:
+            middle = (least + end) // 2
+            least, end = (least, middle) if shown(middle)[0] >= self.chance else (middle + 1, end)
+        return end / 10, shown(end)
+
+    def _rng(self) -> np.random.Generator:
+        return np.random.Generator(np.random.Philox(key=self.seed))
+
+    def _simulated(self, difference: float, scenes: int, rng: np.random.Generator) -> tuple[float, float]:
+        lost, won = self.losses / 100, (self.losses + difference) / 100
+        return simulated_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
+
+    def _fewest(self, difference: float) -> int:
+        """Fewest scenes by the formula."""
+        least, most = 2, 2
+        while not self._enough(difference, most):
+            if most > MOST_SCENES:
+                raise ArgumentError(
+                    f"power: a difference of {difference:g} points needs more than {MOST_SCENES} scenes"
+                )
+            least, most = most, 2 * most
+        while least < most:
+            middle = (least + most) // 2
+            least, most = (least, middle) if self._enough(difference, middle) else (middle + 1, most)
+        return most
+
+    def _enough(self, difference: float, scenes: int) -> bool:
+        """Whether scenes show a difference often enough, by the noncentral t distribution of the mean over scenes."""
+        gain, discordant = difference / 100, (2 * self.losses + difference) / 100
+        spread = (discordant - gain**2) * (1 + (self.per_scene - 1) * self.correlation) / self.per_scene
+        limit = stats.t.ppf(0.5 + self.confidence / 2, scenes - 1)
+        shift = gain * math.sqrt(scenes / max(spread, 1e-12))
+        return bool(stats.nct.sf(limit, scenes - 1, shift) >= self.chance)
+
+
+def simulated_power(
+    won: float,
+    lost: float,
+    scenes: int,
+    per_scene: int,
+    correlation: float,
+    confidence: float,
+    rng: np.random.Generator,
+) -> tuple[float, float]:
+    """Shares of simulated runs in which the interval, and McNemar's test, show that the better arm is better."""
+    runs = max(400, min(8000, _DRAWS // scenes))
+    counts = draw([won, lost, 1 - won - lost], scenes, per_scene, correlation, runs, rng)
+    sums, squares = total(counts, [1, -1, 0])
+    low, _ = t_of_sums(sums, squares, np.full(scenes, float(per_scene)), "difference", confidence)
+    wins, losses, _ = counts.sum(1).T
+    p_values = np.minimum(1.0, 2 * stats.binom.cdf(np.minimum(wins, losses), wins + losses, 0.5))
+    return float(np.mean(low > 0)), float(np.mean((p_values <= 1 - confidence) & (wins > losses)))
+
+
+def _check(
+    difference: float, base: float, losses: float, correlation: float, per_scene: int, chance: float, arms: int
+) -> None:
+    wins = losses + abs(difference)
+    only_base, only_arm = (losses, wins) if difference > 0 else (wins, losses)
+    expectations = (
+        (difference != 0, f"a difference other than 0, got {difference:g}"),
+        (0 <= base <= 100, f"base from 0 to 100 %, got {base:g}"),
+        (losses >= 0, f"losses of at least 0 %, got {losses:g}"),
+        (only_base <= base, f"no more than the base's {base:g} % of episodes lost, got {only_base:g} %"),
+        (only_arm <= 100 - base, f"no more than the {100 - base:g} % that the base fails in won, got {only_arm:g} %"),
+        (0 <= correlation < 1, f"correlation in [0, 1), got {correlation:g}"),
+        (per_scene >= 1, f"per_scene of at least 1, got {per_scene}"),
+        (0 < chance < 1, f"chance between 0 and 1, got {chance:g}"),
+        (arms >= 1, f"arms of at least 1, got {arms}"),
+    )
+    for holds, expected in expectations:
+        if not holds:
+            raise ArgumentError(f"power: expected {expected}")

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where an arm stands between the floor and the ceiling of its run: U = (SR - floor) / (ceiling - floor)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+from wiw.analysis.intervals import Interval, left_out_covariance, made_up, per_cluster, steadied
+
+FLOOR, CEILING = "copy", "oracle"
+UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
+
+
+@dataclass(frozen=True)
+class Utility:
+    """The share of what a perfect world model would bring over a motionless one that an arm brings."""
+
+    arm: str
+    value: float
+    """0: as the floor; 1: as the ceiling; nan where the run cannot tell floor and ceiling apart."""
+    low: float
+    high: float
+    n: int
+    """Episodes that arm, floor and ceiling have all finished."""
+    scenes: int
+    reference: bool
+    """Whether the arm stands beside the world models for comparison, rather than being one under test."""
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether ceiling - floor is surely not 0 on these episodes: its paired 95 % interval lies above."""
+        return not math.isnan(self.value)
+
+
+def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], reference: bool = False) -> Utility | None:
+    """An arm's utility, on the episodes that it, the floor and the ceiling have finished; None if there are none.
+
+    Args:
+        arm: its name.
+        done: by arm, finished episodes by index with "scene" and "metrics".
+        reference: see `Utility`.
+    """
+    names = (arm, FLOOR, CEILING)
+    common = sorted(set.intersection(*(set(done[name]) for name in names)))
+    if not common or any("success" not in done[name][i]["metrics"] for name in names for i in common):
+        return None
+    scored, floor, ceiling = (
+        np.array([done[name][i]["metrics"]["success"] for i in common], np.float64) for name in names
+    )
+    scenes = [done[arm][i]["scene"] for i in common]
+    clusters: Sequence[Any] = scenes if len(set(scenes)) > 1 else common  # one scene: over its episodes
+    value, (low, high) = ratio(scored - floor, ceiling - floor, clusters)
+    return Utility(arm, value, low, high, len(common), len(set(scenes)), reference)
+
+
+def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: float = 0.95) -> tuple[float, Interval]:
+    """mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is not identifiable.
+
+    It holds every u for which the mean of gains - u spans is within t standard errors of 0, so it is as good as the t
+    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is identifiable where
+    that interval of mean(spans) lies above 0.
+
+    Args:
+        gains: float [n] in [-1, 1], arm - floor in each episode.
+        spans: float [n] in [-1, 1], ceiling - floor.
+        clusters: [n] labels.
+        confidence: e.g. 0.95.
+    """
+    labels = np.asarray(clusters)
+    both = [np.asarray(values, np.float64) for values in (gains, spans)]
+    (over, counts), (under, _) = (per_cluster(values, labels) for values in both)
+    if len(counts) < 2:
+        return UNKNOWN
+    squares = [float(np.square(values).sum()) for values in both]
+    a, var_a = map(float, steadied(over, squares[0], counts, "difference"))
+    b, var_b = map(float, steadied(under, squares[1], counts, "difference"))
+    apart = [
+        all_squares - float(sums.sum() ** 2 / counts.sum())
+        for all_squares, sums in zip(squares, (over, under), strict=True)
+    ]
+    covariance = _correlation(over, under, counts, apart) * math.sqrt(var_a * var_b)
+    t_square = float(stats.t.ppf(0.5 + confidence / 2, len(counts) - 1)) ** 2
+    square, half_linear, constant = b * b - t_square * var_b, a * b - t_square * covariance, a * a - t_square * var_a
+    if b <= 0 or square <= 0:
+        return UNKNOWN
+    root = math.sqrt(max(0.0, half_linear**2 - square * constant))
+    return float(a / b), (float((half_linear - root) / square), float((half_linear + root) / square))
+
+
+def _correlation(
+    over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64], apart: list[float]
+) -> float:
+    """Of the two means over clusters; `apart` are sums of squared distances from the mean, over episodes.
+
+    The made-up episodes count too: three fair coins, floor, arm and ceiling, give either difference a variance of 1/2
+    and both a covariance of 1/4. So an arm that did as the ceiling in every episode is not certain to be its equal.
+    """
+    shared, *own = (float(left_out_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
+    scale, weight = math.sqrt(own[0] * own[1]), made_up(len(counts))
+    seen = min(1.0, max(-1.0, shared / scale)) if scale > 1e-12 else 0.0
+    more = [one + weight / 2 for one in apart]
+    return (seen * math.sqrt(max(0.0, apart[0] * apart[1])) + weight / 4) / math.sqrt(more[0] * more[1])

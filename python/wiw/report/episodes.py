@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the page shows of the episodes that keep pictures."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+from PIL import Image
+
+from wiw.analysis.blame import blame
+from wiw.report.maps import (
+    MapFrame,
+    Trail,
+    all_points,
+    frame_of_picture,
+    frame_of_points,
+    start_and_goal,
+    trail,
+)
+from wiw.report.plans import of_poses, ways_of_telling
+from wiw.report.stage import Stage, stage_of
+from wiw.report.steps import step
+from wiw.report.story import Album, Attempt, Step, Story
+from wiw.runs.store import RunStore
+from wiw.types import Episode, Wording
+
+
+def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
+    """The episodes that keep pictures and have ended, and the scene maps by id as data URIs."""
+    outcomes = outcomes_by_episode(store, arms)
+    episodes, pictures = store.episodes(), dict[str, str]()
+    kept = [index for index in store.info["pictures"] if outcomes.get(index)]
+    return [tell(store, index, episodes[index], outcomes[index], pictures, Album()) for index in kept], pictures
+
+
+def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
+    """How each episode ended, by arm in the order of `arms`; episodes that no arm has ended are left out."""
+    blamed = blame(store)
+    verdicts = blamed.verdicts() if blamed is not None else {}
+    by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    by_arm |= {key: {**by_arm[key], "blame": verdict} for key, verdict in verdicts.items()}
+    found: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for index in sorted({episode for _, episode in by_arm}):
+        found[index] = {arm: by_arm[arm, index] for arm in arms if (arm, index) in by_arm}
+    return found
+
+
+def tell(
+    store: RunStore,
+    index: int,
+    episode: Episode,
+    outcomes: Mapping[str, Mapping[str, Any]],
+    pictures: dict[str, str],
+    album: Album,
+) -> Story:
+    """One episode; its scene's map joins `pictures`."""
+    decisions = {arm: store.decisions(arm, index) for arm in outcomes}
+    rows = [row for own in decisions.values() for row in own]
+    poses = any(of_poses(row) for row in rows)
+    frame, picture = (None, None) if poses else _map(store, episode, rows, pictures, album)
+    shots = dict[str, str]()
+    attempts = tuple(
+        _attempt(store, frame, outcome, decisions[arm], shots, album, f"{index}-{number}")
+        for number, (arm, outcome) in enumerate(outcomes.items())
+    )
+    goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
+    ends = start_and_goal(frame, episode) if frame is not None else None
+    shown = album.put(f"{index}-goal", "jpeg", goal) if goal else None
+    return Story(index, episode, shown, picture, frame, ends, attempts, wording(store), poses, shots)
+
+
+def _map(
+    store: RunStore, episode: Episode, rows: Sequence[Mapping[str, Any]], pictures: dict[str, str], album: Album
+) -> tuple[MapFrame, str | None]:
+    """Where an episode is drawn, and the id of what is below."""
+    kept = store.scene_map(episode.scene)
+    if kept is None:
+        return frame_of_points(all_points(episode, rows)), None
+    webp, matrix = kept
+    picture = f"scene-{hashlib.sha256(episode.scene.encode()).hexdigest()[:12]}"
+    pictures[picture] = album.put(picture, "webp", webp)
+    return frame_of_picture(Image.open(io.BytesIO(webp)).size, matrix), picture
+
+
+def wording(store: RunStore) -> Wording:
+    """How the run's task speaks of its episodes."""
+    return Wording(**store.info.get("wording", {}))
+
+
+def _attempt(
+    store: RunStore,
+    frame: MapFrame | None,
+    outcome: Mapping[str, Any],
+    decisions: list[dict[str, Any]],
+    shots: dict[str, str],
+    album: Album,
+    name: str,
+) -> Attempt:
+    """One arm's run of an episode; what a gripper's camera saw joins `shots`."""
+    arm, index = outcome["arm"], outcome["episode"]
+    stage, steps, end = stage_of(store.info), list[Step](), ""
+    for row, way in zip(decisions, ways_of_telling(decisions, stage), strict=True):
+        number, images = row["decision"], store.images(arm, index, row["decision"])
+        made = step(row, images, way, album, f"{name}-{number}")
+        if made.shot and made.seen:
+            shots[made.shot] = made.seen
+        if "end" in images:
+            end = f"shot-{name}-end"
+            shots[end] = album.draw(end, partial(way.seen, images["end"], album))
+        steps.append(made)
+    film = store.film(arm, index)
+    return Attempt(
+        arm,
+        outcome,
+        tuple(steps),
+        _trail(frame, stage, arm, decisions),
+        wording(store),
+        store.config.get("task", {}).get("categories", ()),
+        album.put(f"{name}-film", "webp", film) if film else None,
+        end,
+    )
+
+
+def _trail(
+    frame: MapFrame | None, stage: Stage | None, arm: str, decisions: Sequence[Mapping[str, Any]]
+) -> Trail | None:
+    if not decisions:
+        return None
+    if frame is not None:
+        return trail(frame, arm, decisions)
+    return None if stage is None else stage.trail(arm, decisions)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How plans and what came of them are told: of primitives, seen all around, or of poses, seen by a fixed camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.report import cuts
+from wiw.report.stage import Drawing, Stage, signs
+from wiw.report.story import Album
+from wiw.tabletop.workbench import SHUT
+
+GLYPHS = {int(FORWARD): "↑", int(TURN_LEFT): "↖", int(TURN_RIGHT): "↗", int(STOP): "■"}
+
+
+class Primitives:
+    """Plans of primitives."""
+
+    view = "panorama"
+    """Name of the picture of what the agent saw."""
+
+    def text(self, plan: Sequence[int]) -> str:
+        """A plan in a few signs."""
+        return glyphs(plan)
+
+    def drawing(self, plan: Sequence[int]) -> Drawing | None:
+        """A plan on what the agent saw; none of primitives."""
+        return None
+
+    def seen(self, jpeg: bytes, album: Album) -> bytes:
+        """What the agent saw, as a JPEG for the album."""
+        return cuts.panorama(jpeg, album.panorama_width, album.quality)
+
+    def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
+        """What was imagined, or would have been seen, likewise."""
+        return cuts.strip(jpeg, frames, album.frame_height, album.quality)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Plans of poses of a gripper."""
+
+    stage: Stage | None
+    """Nothing is drawn without one."""
+    start: Sequence[float]
+    """Where the gripper was, [3]."""
+    shut: bool
+    """Whether it was closed."""
+    view = "front"
+
+    def text(self, plan: Sequence[Sequence[float]]) -> str:
+        """A plan in a few signs."""
+        return signs(plan, self.start, self.shut)
+
+    def drawing(self, plan: Sequence[Sequence[float]]) -> Drawing | None:
+        """A plan on what the camera saw."""
+        return None if self.stage is None else self.stage.draw(self.start, plan)
+
+    def seen(self, jpeg: bytes, album: Album) -> bytes:
+        """What the camera saw, as a JPEG for the album."""
+        return cuts.front(jpeg, album.front_side, album.quality)
+
+    def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
+        """What was imagined, or would have been seen, likewise: every frame without a gap, or the last one."""
+        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole)
+
+
+def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
+    """For each decision of an episode how it is told."""
+    found: list[Primitives | Poses] = []
+    shut = False
+    for row in decisions:
+        if not of_poses(row):
+            found.append(Primitives())
+            continue
+        found.append(Poses(stage, (row["before_x"], row["before_y"], row["before_z"]), shut))
+        shut = row["executed"][-1][6] < SHUT if row["executed"] else shut
+    return found
+
+
+def of_poses(row: Mapping[str, Any]) -> bool:
+    """Whether a decision plans poses of a gripper."""
+    return isinstance(row["actions"][0], list)
+
+
+def glyphs(actions: Sequence[int]) -> str:
+    """Primitives as arrows; ids without one as numbers."""
+    return "".join(GLYPHS.get(action, f"({action})") for action in actions)

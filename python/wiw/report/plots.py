@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plots as inline SVG that takes its text colour from the page, so that it reads on light and dark alike."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from wiw.analysis.blame import Blame
+from wiw.analysis.fidelity import ArmFidelity
+from wiw.analysis.intervals import wilson
+from wiw.analysis.summary import Summary
+from wiw.types import Wording
+
+INK = "#010203"
+"""Stands for the page's text colour."""
+PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
+ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b"}
+BLAME_COLORS = {
+    "imagination": "#4c78a8",
+    "scoring": "#d1495b",
+    "proposals": "#b5651d",
+    "joint": "#8e6bbf",
+    "beyond": "#8b9099",
+}
+FEW = 24
+"""Below this many episodes single outcomes are shown instead of binned rates."""
+
+Outcomes = Mapping[str, Sequence[Mapping[str, Any]]]
+
+
+def arm_colors(arms: Sequence[str]) -> dict[str, str]:
+    """One colour an arm; the references always have the same."""
+    others = [arm for arm in arms if arm not in ROLE_COLORS]
+    return {**ROLE_COLORS, **{arm: PALETTE[i % len(PALETTE)] for i, arm in enumerate(others)}}
+
+
+def success_by_arm(summary: Summary) -> Markup:
+    """Success rates with their intervals; floor and ceiling as lines through the others."""
+    lines = [line for line in summary.arms if "success" in line.estimates]
+    colors = arm_colors([line.name for line in summary.arms])
+    figure, axes = _figure()
+    for y, line in enumerate(reversed(lines)):
+        found = line.estimates["success"]
+        if line.name in ("copy", "oracle"):
+            axes.axvline(found.value, color=colors[line.name], lw=1, ls=(0, (4, 3)), alpha=0.7, zorder=0)
+        axes.plot([found.low, found.high], [y, y], color=colors[line.name], lw=5, alpha=0.35, solid_capstyle="round")
+        axes.plot(found.value, y, "o", color=colors[line.name], ms=9)
+    axes.set_yticks(range(len(lines)), [line.name for line in reversed(lines)])
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    axes.set_xlim(-2, 102)
+    axes.set_xlabel("success rate, %")
+    axes.grid(axis="x", color=INK, alpha=0.08)
+    return _svg(figure, "success-by-arm")
+
+
+def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) -> Markup:
+    """Success rates with their intervals against imagined futures; for each series (rollouts, estimate, label)."""
+    colors = arm_colors(list(series))
+    figure, axes = _figure()
+    for name, points in series.items():
+        axes.plot(
+            [x for x, _, _ in points], [found.value for _, found, _ in points], "-o", color=colors[name], label=name
+        )
+        for x, found, label in points:
+            axes.plot([x, x], [found.low, found.high], color=colors[name], lw=4, alpha=0.3, solid_capstyle="round")
+            axes.annotate(label, (x, found.value), textcoords="offset points", xytext=(6, 6), fontsize=8, color=INK)
+    axes.set_ylim(-2, 102)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("imagined futures an episode")
+    axes.set_ylabel("success rate, %")
+    axes.grid(axis="y", color=INK, alpha=0.08)
+    _legend(axes)
+    return _svg(figure, "success-by-rollouts")
+
+
+def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
+    """Success rate with its interval against how rightly imagined futures order the plans, a point an arm."""
+    colors = arm_colors([line.name for line in summary.arms])
+    figure, axes = _figure()
+    for line in truths:
+        estimate = summary[line.arm].estimates["success"]
+        axes.plot([line.rank] * 2, [estimate.low, estimate.high], color=colors[line.arm], lw=4, alpha=0.35)
+        axes.plot(line.rank, estimate.value, "o", color=colors[line.arm], ms=9, label=line.arm)
+    axes.set_xlim(-1.05, 1.05)
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel("rank agreement, Kendall's tau")
+    axes.set_ylabel("success rate, %")
+    _legend(axes)
+    return _svg(figure, "success-by-rank")
+
+
+def blame_by_arm(found: Blame) -> Markup:
+    """Failures of each arm by what they are due to, as stacked bars."""
+    lines = list(reversed(found.arms))
+    figure, axes = _figure()
+    left = np.zeros(len(lines))
+    for verdict, color in BLAME_COLORS.items():
+        counts = np.array([line.verdicts[verdict] for line in lines], np.float64)
+        axes.barh(range(len(lines)), counts, left=left, height=0.55, color=color, label=verdict)
+        for y, (start, count) in enumerate(zip(left, counts, strict=True)):
+            if count:
+                axes.text(start + count / 2, y, f"{count:.0f}", ha="center", va="center", color="white", fontsize=9)
+        left += counts
+    axes.set_yticks(range(len(lines)), [line.arm for line in lines])
+    axes.set_ylim(-0.6, len(lines) - 0.4)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("failed episodes")
+    axes.grid(visible=False, axis="y")
+    _legend(axes)
+    return _svg(figure, "blame-by-arm")
+
+
+def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
+    """How success depends on the way to go: single episodes where there are few, else rates in bins of equal counts."""
+    colors = arm_colors(list(outcomes))
+    figure, axes = _figure()
+    if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
+        _outcome_dots(axes, outcomes, colors, words)
+    else:
+        _binned_rates(axes, outcomes, colors)
+    axes.set_xlabel(f"shortest way {words.way}, m")
+    return _svg(figure, "success-by-distance")
+
+
+def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str], words: Wording) -> None:
+    for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
+        for row in rows:
+            filled = colors[arm] if row["metrics"].get("success") else "none"
+            axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9)
+    axes.set_yticks(range(len(outcomes)), list(reversed(list(outcomes))))
+    axes.set_ylim(-0.6, len(outcomes) - 0.4)
+    axes.set_title(f"filled: {words.won}, hollow: {words.lost}", loc="right", fontsize=9, color=INK)
+
+
+def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+    lengths = np.array([row["geodesic"] for rows in outcomes.values() for row in rows])
+    edges = np.unique(np.quantile(lengths, np.linspace(0, 1, 5)))
+    for shift, (arm, rows) in enumerate(outcomes.items()):
+        ways = np.array([row["geodesic"] for row in rows])
+        reached = np.array([row["metrics"].get("success", 0.0) for row in rows])
+        which = np.clip(np.searchsorted(edges, ways, side="right") - 1, 0, len(edges) - 2)
+        points = [(i, reached[which == i]) for i in range(len(edges) - 1) if (which == i).any()]
+        offset = 0.03 * (edges[-1] - edges[0]) * (shift - (len(outcomes) - 1) / 2)
+        x = [(edges[i] + edges[i + 1]) / 2 + offset for i, _ in points]
+        y = [100 * values.mean() for _, values in points]
+        spans = [wilson(float(values.mean()), len(values)) for _, values in points]
+        bars = [
+            [value - 100 * low for value, (low, _) in zip(y, spans, strict=True)],
+            [100 * high - value for value, (_, high) in zip(y, spans, strict=True)],
+        ]
+        axes.errorbar(
+            x, y, yerr=np.clip(bars, 0, None), color=colors[arm], marker="o", ms=6, lw=1.6, elinewidth=1, label=arm
+        )
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel("success rate, %")
+    _legend(axes)
+
+
+def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Markup:
+    """Share of episodes that have succeeded after so many decisions."""
+    colors = arm_colors(list(outcomes))
+    figure, axes = _figure()
+    for arm, rows in outcomes.items():
+        taken = np.sort([row["metrics"]["decisions"] for row in rows if row["metrics"].get("success")])
+        share = 100 * np.arange(1, len(taken) + 1) / max(1, len(rows))
+        x, y = np.concatenate([[0], taken, [budget]]), np.concatenate([[0], share, [share[-1] if len(share) else 0]])
+        axes.step(x, y, where="post", color=colors[arm], lw=2.2, label=arm)
+    axes.set_xlim(0, budget + 0.3)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(-3, 103)
+    axes.set_xlabel("decisions")
+    axes.set_ylabel(f"{words.succeeded}, %")
+    _legend(axes)
+    return _svg(figure, "decisions-to-success")
+
+
+def _figure() -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(4.7, 3.1), layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    axes.spines["bottom"].set_color(INK)
+    axes.spines["bottom"].set_alpha(0.3)
+    axes.tick_params(colors=INK, length=0, labelsize=10)
+    axes.xaxis.label.set_color(INK)
+    axes.yaxis.label.set_color(INK)
+    axes.grid(axis="y", color=INK, alpha=0.08)
+    axes.set_axisbelow(True)
+    return figure, axes
+
+
+def _legend(axes: Axes) -> None:
+    longest = max((len(text) for text in axes.get_legend_handles_labels()[1]), default=0)
+    columns = 4 if longest < 11 else 2  # as many as fit the drawing's width
+    axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
+
+
+def _svg(figure: Figure, name: str) -> Markup:
+    buffer = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}):
+        figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    drawing = buffer.getvalue().replace(INK, "currentColor")
+    return Markup(drawing[drawing.index("<svg") :])  # matplotlib escapes the text it draws

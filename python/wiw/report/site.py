@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writes the list and the episodes' pages; pictures lie beside them, so that a page opens at once in a run of any size.
+
+The report is one file about the results, with a few episodes for example; this is for finding and opening any decision.
+Both draw an episode from the same values and template parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wiw._core import core
+from wiw.files import whole_folder
+from wiw.report.episodes import outcomes_by_episode, tell, wording
+from wiw.report.plots import arm_colors
+from wiw.report.story import Album, Story, place, taken_for, where
+from wiw.report.templating import environment
+from wiw.runs.run import Run
+from wiw.types import Episode, Wording
+
+
+class Beside(Album):
+    """Pictures as files of a folder, each written once; those that are to be made are made by a pool's threads."""
+
+    panorama_width, frame_height, quality = 1024, 132, 76
+    front_side, end_side, whole = 480, 160, True
+
+    def __init__(self, folder: Path, pool: Executor) -> None:
+        self._folder, self._pool = folder, pool
+        self._folder.mkdir()
+        self._sizes: dict[str, int] = {}
+        self._making: list[Future[str]] = []
+
+    @property
+    def count(self) -> int:
+        """Pictures that were written."""
+        return len(self._sizes)
+
+    @property
+    def size(self) -> int:
+        """Their bytes."""
+        return sum(self._sizes.values())
+
+    def put(self, name: str, kind: str, data: bytes) -> str:
+        """The picture's address, seen from an episode's page. Names are numbers and our own words, never the run's."""
+        file = self._folder / _file(name, kind)
+        if file.name not in self._sizes:
+            file.write_bytes(data)
+            self._sizes[file.name] = len(data)
+        return f"../{self._folder.name}/{file.name}"
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> str:
+        """The address of a picture that will be there after `finish`."""
+        self._making.append(self._pool.submit(lambda: self.put(name, "jpeg", make())))
+        return f"../{self._folder.name}/{_file(name, 'jpeg')}"
+
+    def finish(self) -> None:
+        """Waits for the pictures that are being made; raises what making one has raised."""
+        making, self._making = self._making, []
+        for picture in making:
+            picture.result()
+
+
+def _file(name: str, kind: str) -> str:
+    return f"{name}.{'jpg' if kind == 'jpeg' else kind}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How an episode ended in one arm, for the list."""
+
+    arm: str
+    state: str
+    """"reached" (a success), "missed", "failed" (infrastructure) or "open" (not run yet)."""
+    text: str
+    about: str
+    """What the text says."""
+    short: bool = False
+    """Whether it says how far from the goal the episode ended."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One episode in the list."""
+
+    index: int
+    episode: Episode
+    place: str
+    cells: tuple[Cell, ...]
+    pictures: bool
+
+    @property
+    def group(self) -> str:
+        """What the list can be narrowed to: its kind where its task has several, else its scene."""
+        return self.episode.kind or self.episode.scene
+
+    @property
+    def told_to(self) -> str:
+        """What was asked for in words, where the task does so."""
+        return str(self.episode.info.get("instruction", ""))
+
+    @property
+    def file(self) -> str:
+        """Its page's name."""
+        return f"{self.index:04d}.html"
+
+    @property
+    def told(self) -> bool:
+        """Whether there is a page: an arm has ended it."""
+        return any(cell.state != "open" for cell in self.cells)
+
+
+@dataclass(frozen=True)
+class Site:
+    """What was written."""
+
+    index: Path
+    """The page to open."""
+    episodes: int
+    pictures: int
+    size: int
+    """Bytes of pictures."""
+
+
+def write_view(run: Run, folder: Path) -> Site:
+    """Writes `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
+
+    Raises:
+        FileError: the folder holds something that is no view, or cannot be written.
+    """
+    with whole_folder(folder, replace=is_view) as draft, ThreadPoolExecutor(core.num_threads()) as pool:
+        album = Beside(draft / "images", pool)
+        pages = draft / "episodes"
+        pages.mkdir()
+        outcomes = outcomes_by_episode(run.store, run.arms)
+        lines = _lines(run, outcomes)
+        common = _common(run)
+        (draft / "index.html").write_text(_index(run, lines, common), encoding="utf-8")
+        told = [line for line in lines if line.told]
+        for number, line in enumerate(told):
+            scenes: dict[str, str] = {}
+            story = tell(run.store, line.index, line.episode, outcomes[line.index], scenes, album)
+            common |= {"before": told[number - 1] if number else None}
+            common |= {"after": told[number + 1] if number + 1 < len(told) else None}
+            (pages / line.file).write_text(_episode(story, scenes, common), encoding="utf-8")
+            album.finish()
+    return Site(folder / "index.html", len(told), album.count, album.size)
+
+
+def is_view(folder: Path) -> bool:
+    """Whether a folder holds a view and nothing else, so that a new one may take its place."""
+    return (folder / "index.html").is_file() and {path.name for path in folder.iterdir()} <= {
+        "index.html",
+        "episodes",
+        "images",
+    }
+
+
+def _index(run: Run, lines: list[Line], common: Mapping[str, Any]) -> str:
+    template = environment().get_template("index.html.j2")
+    return template.render(**common, lines=lines, groups=list(dict.fromkeys(line.group for line in lines)))
+
+
+def _episode(story: Story, scenes: Mapping[str, str], values: Mapping[str, Any]) -> str:
+    template = environment().get_template("episode_page.html.j2")
+    return template.render(**values, story=story, pictures=scenes)
+
+
+def _common(run: Run) -> dict[str, Any]:
+    task = run.store.config["task"]
+    return {
+        "title": f"{task.get('task', 'run')} · {run.path.name}",
+        "arms": run.arms,
+        "colors": arm_colors(run.arms),
+        "radius": task.get("radius"),
+        "place": place,
+        "whole": Beside.whole,
+        "words": wording(run.store),
+        "choices": task.get("categories", ()),
+    }
+
+
+def _lines(run: Run, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
+    pictures = set(run.store.info["pictures"])
+    words, choices = wording(run.store), run.store.config["task"].get("categories", ())
+    return [
+        Line(
+            index,
+            episode,
+            where(episode),
+            tuple(_cell(arm, outcomes.get(index, {}).get(arm), words, choices) for arm in run.arms),
+            index in pictures,
+        )
+        for index, episode in enumerate(run.store.episodes())
+    ]
+
+
+def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: Sequence[str]) -> Cell:
+    if outcome is None:
+        return Cell(arm, "open", "to run", "not run yet")
+    if outcome["status"] == "failed":
+        return Cell(arm, "failed", "failed", "failed for infrastructure")
+    metrics = outcome["metrics"]
+    count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
+    if metrics.get("success"):
+        return Cell(arm, "reached", count, f"{words.won}; decisions taken")
+    if choices:
+        return Cell(arm, "missed", taken_for(metrics, choices) or "no answer", f"{words.lost}; what it was taken for")
+    if "distance_to_goal" in metrics:
+        return Cell(arm, "missed", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; metres short", True)
+    return Cell(arm, "missed", count, f"{words.lost}; decisions taken")

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What pages tell of episodes, as values that templates fill in."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wiw.report.maps import MapFrame, Mark, Trail
+from wiw.report.stage import Drawing
+from wiw.types import Episode, Wording
+
+
+class Album:
+    """Where the pictures of a page go: into the page itself, as data URIs."""
+
+    panorama_width, frame_height, quality = 760, 104, 68
+    front_side, end_side = 300, 150
+    """Pixels of the front views of a gripper: of real ones, and of imagined ones."""
+    whole = False
+    """Whether imagined ways of a gripper are shown frame by frame, or their ends alone."""
+
+    def put(self, name: str, kind: str, data: bytes) -> str:
+        """What an `src` attribute says of a picture; `name` tells it from the others of the run."""
+        return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> str:
+        """The same for a JPEG that is still to be made."""
+        return self.put(name, "jpeg", make())
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One plan and what was imagined of it."""
+
+    actions: str
+    score: float | None
+    share: float
+    """0 (worst of the decision) to 1 (best), for a bar."""
+    chosen: bool
+    note: str
+    strip: str | None
+    """What was imagined; as `Album.put` says."""
+    true: str | None
+    """What would really have been seen."""
+    truth: str
+    """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
+    truly_best: bool
+    real_frames: int
+    """How many leading frames are the real view turned."""
+    frames: int
+    """Of the strips."""
+    drawing: Drawing | None = None
+    """The plan on what the camera sees, where it is one of poses."""
+    text: str = ""
+    """The plan in the policy's words."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One decision."""
+
+    number: int
+    executed: str
+    seen: str | None
+    """What the agent saw; as `Album.put` says."""
+    candidates: tuple[Candidate, ...]
+    rewritten: str
+    """The plan, where it is none of the candidates."""
+    before: float | None
+    after: float | None
+    """Metres of shortest way to the goal or target; straight-line where there is no way; None where the task has none.
+    """
+    note: str
+    fidelity: str
+    """How well imagination ranked the plans; empty where not measured."""
+    seconds: Mapping[str, float]
+    calls: Mapping[str, float]
+    answer: str = ""
+    """What the agent believed and how surely, where the task asks."""
+    refused: str = ""
+    """Why ways of a gripper ended early."""
+    shot: str = ""
+    """Id of what a gripper's camera saw among the story's shots; empty where plans are not of poses."""
+
+    @property
+    def gain(self) -> float:
+        """Metres that the decision brought the agent nearer."""
+        return 0.0 if self.before is None or self.after is None else self.before - self.after
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One arm's run of an episode."""
+
+    arm: str
+    outcome: Mapping[str, Any]
+    steps: tuple[Step, ...]
+    trail: Trail | None
+    words: Wording
+    choices: Sequence[str] = ()
+    """What answers are chosen from, where the task asks for any."""
+    film: str | None = None
+    """The episode in motion; as `Album.put` says."""
+    end: str = ""
+    """Id of what was seen at the end among the story's shots; empty where it was not kept."""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the episode was a success."""
+        return bool(self.outcome["metrics"].get("success"))
+
+    @property
+    def text(self) -> str:
+        """How it ended, in words."""
+        if self.outcome["status"] == "failed":
+            return "failed for infrastructure"
+        metrics = self.outcome["metrics"]
+        count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
+        if self.reached:
+            return f"{self.words.won} in {count}"
+        due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
+        if self.choices:
+            label = taken_for(metrics, self.choices)
+            return (f"taken for {label} in {count}" if label else f"not answered in {count}") + due
+        left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
+        return f"{self.words.lost} in {count}{left}{due}"
+
+
+@dataclass(frozen=True)
+class Story:
+    """One episode with all its arms."""
+
+    index: int
+    episode: Episode
+    goal: str | None
+    picture: str | None
+    """Id of the scene's map among the page's shared pictures."""
+    frame: MapFrame | None
+    """None where plans are of poses: the way is drawn on what the camera sees."""
+    ends: tuple[Mark, Mark] | None
+    """Start and goal on the map."""
+    attempts: tuple[Attempt, ...]
+    words: Wording
+    poses: bool = False
+    """Whether plans are of poses of a gripper."""
+    shots: Mapping[str, str] = field(default_factory=dict)
+    """What a gripper's camera saw, by id; as `Album.put` says."""
+
+    @property
+    def place(self) -> str:
+        """The scene's name without its folders, or the kind of task."""
+        return where(self.episode)
+
+    @property
+    def told(self) -> str:
+        """What was asked for in words, where the task does so."""
+        return str(self.episode.info.get("instruction", ""))
+
+    @property
+    def way(self) -> str:
+        """E.g. " · 4.2 m to the goal"; nothing where no arm could measure it."""
+        length = self.episode.geodesic
+        return f" · {length:.1f} m {self.words.way}" if np.isfinite(length) else ""
+
+    @property
+    def target(self) -> str:
+        """What is to be recognised, where the task is that."""
+        return str(self.episode.info.get("category", ""))
+
+
+def taken_for(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
+    """The final answer, where the task asks for any; empty where none was given."""
+    predicted = int(metrics.get("predicted", -1))
+    return choices[predicted] if 0 <= predicted < len(choices) else ""
+
+
+def place(scene: str) -> str:
+    """A scene's name without its folders."""
+    return scene if scene.startswith("apartments:") else Path(scene).name
+
+
+def where(episode: Episode) -> str:
+    """The kind of an episode where its task has several, else its scene's name without its folders."""
+    return episode.kind.replace("_", " ") or place(episode.scene)

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How templates of pages are filled: everything is escaped, and a name that is missing is an error."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from importlib.resources import files
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from wiw.analysis.statistics import Estimate
+from wiw.analysis.summary import column_title, show_p
+
+PACKAGE = "wiw.report"
+
+
+@cache
+def environment() -> Environment:
+    """Return the templates of all pages."""
+    made = Environment(
+        loader=PackageLoader(PACKAGE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how, "number": _number}
+    made.filters["asset"] = _read_asset
+    made.tests |= {"binding": _binding, "known": _known}
+    return made
+
+
+def signed(value: float) -> str:
+    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
+    return f"{value:+.1f}".replace("-", "\u2212")
+
+
+def _number(value: float) -> str:
+    """Two digits, with a true minus sign."""
+    return f"{value:.2f}".replace("-", "\u2212")
+
+
+def _how(estimate: Estimate) -> str:
+    """How an interval was made, and the second opinion on it."""
+    if estimate.bootstrap is None:
+        return estimate.method
+    low, high = estimate.bootstrap
+    return f"{estimate.method}; bootstrap over scenes: {low:.1f} to {high:.1f}"
+
+
+def _binding(estimate: Estimate) -> bool:
+    return estimate.excludes_zero
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _read_asset(name: str) -> Markup:
+    """Return a style sheet or script of the templates, as it is."""
+    return Markup((files(PACKAGE) / "templates" / name).read_text(encoding="utf-8"))

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs the episodes of a run store that have not ended, in this process or in workers, and records them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from wiw.errors import Error, InfrastructureError, StoreError
+from wiw.runs.films import keep_films
+from wiw.runs.progress import Tracker, make_board
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
+from wiw.runs.scene_map import keep_scene_maps
+from wiw.runs.sources import require_sources
+from wiw.runs.store import RunStore
+from wiw.runs.workers import Job, Plan, Row, run_here, run_in_workers
+from wiw.types import Episode, EpisodeResult
+
+
+def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
+    """How a run's task and agents are made again.
+
+    Raises:
+        StoreError: the run was begun with objects that existed only in memory.
+    """
+    info = store.info
+    if info["task"] is None or None in info["agents"].values():
+        raise StoreError(
+            f"{store.path} was begun with objects in memory, which cannot be made again from here; "
+            "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
+            "wiw.runs.recipes.AgentRecipe, or `wiw run`"
+        )
+    return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+
+
+def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:
+    """Return digests, by path, of the user's own source files that a run of these recipes depends on."""
+    found = dict(task.sources())
+    for recipe in agents.values():
+        found |= recipe.sources()
+    return found
+
+
+def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
+    """Hold a run to the user's own source files that it was begun with; closes the store where they have changed.
+
+    Raises:
+        StoreError: a file has changed since.
+    """
+    try:
+        require_sources(store.path.parent, store.info.get("sources"), sources_of(task, agents))
+    except StoreError:
+        store.close()
+        raise
+
+
+def require_of(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
+    """Asks a task that can tell whether all that its episodes need is there, before anything is run, and what it is."""
+    return dict(task.require(episodes)) if hasattr(task, "require") else {}
+
+
+def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
+    """The same for the episodes that a run has left."""
+    episodes = store.episodes()
+    try:
+        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_failed)])
+    except Error:
+        store.close()
+        raise
+
+
+def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> None:
+    """Sees that episodes of a run are run with what the others were run with.
+
+    Raises:
+        FileError: a scene is not there.
+        StoreError: what belongs to a scene has come or gone.
+    """
+    kept = store.info.get("scenes", {})
+    used = require_of(task, episodes)
+    store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
+
+
+def with_pictures(episodes: Sequence[Episode], count: int) -> list[int]:
+    """`count` indices spread evenly over the episodes, and the first of each kind of task that has none among them."""
+    count, last = min(count, len(episodes)), len(episodes) - 1
+    kept = {round(i * last / max(1, count - 1)) for i in range(count)}
+    for index, episode in enumerate(episodes):
+        if count and episode.kind not in {episodes[other].kind for other in kept}:
+            kept.add(index)
+    return sorted(kept)
+
+
+def run_pending(
+    store: RunStore,
+    task: Any,
+    agents: Mapping[str, Any],
+    pending: Mapping[str, list[int]],
+    workers: int,
+    progress: bool,
+) -> None:
+    """Run these episodes of each arm and close the store."""
+    info = store.info
+    episodes = store.episodes()
+    pictures = frozenset(info["pictures"])
+    plan = Plan(
+        task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes, info.get("sources", {})
+    )
+    board = make_board(progress and any(pending.values()))
+    try:
+        for arm, indices in pending.items():
+            store.discard(arm, indices)
+        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
+        _run_jobs(plan, episodes, pending, desk, workers)
+        keep_scene_maps(store, task)
+        keep_films(store, task)
+    finally:
+        board.close()
+        store.close()
+
+
+def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[int]], desk: _Desk, workers: int) -> None:
+    sizes = {
+        arm: len(left) if workers == 1 else max(plan.live, math.ceil(len(left) / (3 * workers)))
+        for arm, left in pending.items()
+    }
+    jobs = [
+        Job(arm, tuple((index, episodes[index]) for index in left[first : first + sizes[arm]]))
+        for arm, left in pending.items()
+        for first in range(0, len(left), max(1, sizes[arm]))
+    ]
+    if workers == 1 or len(jobs) == 0:
+        run_here(plan, jobs, desk)
+    else:
+        run_in_workers(plan, jobs, desk, workers)
+
+
+def _budget(store: RunStore) -> int:
+    """Most decisions of an episode, as far as the task tells."""
+    return int(store.config["task"].get("decisions", 20))
+
+
+SAME_ERRORS = 5
+"""Failures by the same exception at the beginning of an arm that stop a run."""
+
+
+class _Desk:
+    """Writes rows to the store and tells the bars."""
+
+    def __init__(self, store: RunStore, tracker: Tracker) -> None:
+        self._store, self._tracker = store, tracker
+        self._known: set[str] = set()
+        self._first_errors: dict[str, list[str] | None] = {}
+        """By arm: last lines of its failures; None once an episode has gone through."""
+
+    def write(self, row: Row) -> None:
+        if isinstance(row, AgentRow):
+            if row.arm not in self._known:  # every worker builds its own
+                self._store.write_agent(row)
+            self._known.add(row.arm)
+            return
+        if isinstance(row, AgainRow):
+            self.discard(row.arm, row.episodes)
+            return
+        if isinstance(row, LostRow):
+            self._store.write_lost(row)
+            return
+        self._store.write(row)
+        if isinstance(row, DecisionRow):
+            self._tracker.decision(row.arm, row.episode)
+        else:
+            self._tracker.episode(row.arm, row.result)
+            self._watch(row.arm, row.result)
+
+    def discard(self, arm: str, episodes: Iterable[int]) -> None:
+        episodes = list(episodes)
+        self._store.discard(arm, episodes)
+        for episode in episodes:
+            self._tracker.forget(arm, episode)
+
+    def _watch(self, arm: str, result: EpisodeResult) -> None:
+        """Stops a run whose arm begins with nothing but the same failure: a mistake in the set-up, not bad luck."""
+        if result.status == "done":
+            self._first_errors[arm] = None
+        errors = self._first_errors.setdefault(arm, [])
+        if errors is None:
+            return
+        errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
+        if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
+            raise InfrastructureError(
+                f"the first {SAME_ERRORS} episodes of arm '{arm}' all failed alike, so the run was stopped: "
+                f"{errors[0]}. Mend the cause, then `wiw resume --retry-failed`; the tracebacks are in the run store"
+            )

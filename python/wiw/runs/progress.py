@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bar for each arm: in a terminal by rich, in a notebook by the browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from wiw.types import EpisodeResult
+
+
+@dataclass
+class ArmProgress:
+    """How far an arm is, and how well it does so far."""
+
+    total: int
+    """Episodes to run."""
+    decisions_each: int
+    """Most decisions an episode may take; ends early where the goal is reached."""
+    ended: int = 0
+    failed: int = 0
+    successes: float = 0.0
+    decisions: int = 0
+
+    @property
+    def share(self) -> float:
+        """0 to 1; decisions of running episodes count in part, so that the bar moves from the start."""
+        running = self.decisions / max(1, self.decisions_each)
+        return min(1.0, (self.ended + min(running, 0.95 * (self.total - self.ended))) / max(1, self.total))
+
+    @property
+    def text(self) -> str:
+        """E.g. "7/20 episodes, SR 43 %"."""
+        judged = self.ended - self.failed
+        rate = f", SR {100 * self.successes / judged:.0f} %" if judged else ""
+        failed = f", {self.failed} failed" if self.failed else ""
+        return f"{self.ended}/{self.total} episodes{rate}{failed}"
+
+
+class Board(Protocol):
+    """Where progress is shown."""
+
+    def show(self, arm: str, progress: ArmProgress) -> None:
+        """An arm has moved on."""
+
+    def close(self) -> None:
+        """The run has ended or was stopped."""
+
+
+class Tracker:
+    """Counts what happens in a run and tells the board."""
+
+    def __init__(self, totals: Mapping[str, int], decisions_each: int, board: Board) -> None:
+        self._arms = {arm: ArmProgress(total, decisions_each) for arm, total in totals.items()}
+        self._running: dict[tuple[str, int], int] = {}
+        self._board = board
+        for arm, progress in self._arms.items():
+            board.show(arm, progress)
+
+    def decision(self, arm: str, episode: int) -> None:
+        """A decision was taken."""
+        self._running[arm, episode] = self._running.get((arm, episode), 0) + 1
+        self._arms[arm].decisions += 1
+        self._board.show(arm, self._arms[arm])
+
+    def forget(self, arm: str, episode: int) -> None:
+        """An episode's decisions count no more: it has ended, or begins again."""
+        self._arms[arm].decisions -= self._running.pop((arm, episode), 0)
+
+    def episode(self, arm: str, result: EpisodeResult) -> None:
+        """An episode has ended."""
+        self.forget(arm, result.episode)
+        progress = self._arms[arm]
+        progress.ended += 1
+        progress.failed += result.status == "failed"
+        progress.successes += result.metrics.get("success", 0.0)
+        self._board.show(arm, progress)
+
+
+class SilentBoard:
+    """Shows nothing."""
+
+    def show(self, arm: str, progress: ArmProgress) -> None:
+        """Nothing."""
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+class TerminalBoard:
+    """Rich bars; plain lines at quarter marks where the output is no terminal."""
+
+    def __init__(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self._console = Console(stderr=True)
+        self._bars = Progress(
+            TextColumn("[bold]{task.description:<12}"),
+            BarColumn(bar_width=32),
+            TextColumn("{task.fields[text]}"),
+            TimeElapsedColumn(),
+            TextColumn("<"),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+        self._tasks: dict[str, Any] = {}
+        self._quarters: dict[str, int] = {}
+        self._bars.start()
+
+    def show(self, arm: str, progress: ArmProgress) -> None:
+        """Moves the arm's bar."""
+        if not self._console.is_terminal:
+            self._line(arm, progress)
+            return
+        if arm not in self._tasks:
+            self._tasks[arm] = self._bars.add_task(arm, total=1.0, text="waiting", start=False)
+        if progress.share > 0 and not self._bars.tasks[self._tasks[arm]].started:
+            self._bars.start_task(self._tasks[arm])
+        self._bars.update(self._tasks[arm], completed=progress.share, text=progress.text)
+
+    def _line(self, arm: str, progress: ArmProgress) -> None:
+        quarter = 4 * progress.ended // max(1, progress.total)
+        if quarter > self._quarters.get(arm, 0):
+            self._quarters[arm] = quarter
+            self._console.print(f"{arm}: {progress.text}", highlight=False)
+
+    def close(self) -> None:
+        """Leaves the bars as they stand."""
+        self._bars.stop()
+
+
+class NotebookBoard:
+    """HTML bars in a cell's output; needs no widgets."""
+
+    def __init__(self) -> None:
+        from IPython.display import HTML, display
+
+        self._html = HTML
+        self._arms: dict[str, ArmProgress] = {}
+        self._shown = 0.0
+        self._handle = display(HTML(""), display_id=True)
+
+    def show(self, arm: str, progress: ArmProgress) -> None:
+        """Redraws, at most five times a second."""
+        self._arms[arm] = progress
+        if time.monotonic() - self._shown > 0.2:
+            self._draw()
+
+    def _draw(self) -> None:
+        from html import escape
+
+        self._shown = time.monotonic()
+        rows = "".join(
+            f"<tr><td><b>{escape(arm)}</b></td><td><progress value='{p.share:.3f}' max='1'></progress></td>"
+            f"<td>{p.text}</td></tr>"
+            for arm, p in self._arms.items()
+        )
+        self._handle.update(self._html(f"<table>{rows}</table>"))
+
+    def close(self) -> None:
+        """Draws the last state."""
+        self._draw()
+
+
+def make_board(wanted: bool) -> Board:
+    """The board that fits where the program runs."""
+    if not wanted:
+        return SilentBoard()
+    return NotebookBoard() if in_notebook() else TerminalBoard()
+
+
+def in_notebook() -> bool:
+    """Return whether the value of a cell is shown by itself, so that printing it would show it twice."""
+    try:
+        from IPython import get_ipython
+    except ModuleNotFoundError:
+        return False
+    return type(get_ipython()).__name__ == "ZMQInteractiveShell"

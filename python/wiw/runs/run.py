@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on disk as its readers see it: arms, episodes and decisions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError
+from wiw.runs.store import RunStore
+
+
+class Records(list[dict[str, Any]]):
+    """A list of plain dicts that turns into a pandas DataFrame on request."""
+
+    def to_pandas(self) -> Any:
+        """The records as a DataFrame, nested metrics as columns.
+
+        Raises:
+            ArgumentError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError:
+            raise ArgumentError("to_pandas needs pandas, which is not installed: pip install pandas") from None
+        return pandas.DataFrame([_flat(record) for record in self])
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    metrics = record.get("metrics", {})
+    return {**{name: value for name, value in record.items() if name != "metrics"}, **metrics}
+
+
+class Run:
+    """A run on disk, finished or not."""
+
+    def __init__(self, store: RunStore) -> None:
+        self.store = store
+
+    @property
+    def path(self) -> Path:
+        """The run's folder."""
+        return self.store.path.parent
+
+    @property
+    def arms(self) -> list[str]:
+        """Names of the arms, in the order of the table."""
+        return [arm["name"] for arm in self.store.config["arms"]]
+
+    @property
+    def episodes(self) -> Records:
+        """Ended episodes of all arms: arm, episode, scene, status, metrics, seconds, error."""
+        return Records(self.store.outcomes())
+
+    @property
+    def decisions(self) -> Records:
+        """Decisions of all ended episodes: proposals, scores, choice, what was executed, truth before and after."""
+        return Records(self.store.decisions())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every arm has ended every episode."""
+        return not any(self.store.pending(arm) for arm in self.arms)
+
+    def close(self) -> None:
+        """Close the run's file."""
+        self.store.close()
+
+    def __repr__(self) -> str:
+        ended = {arm: sum(record["arm"] == arm for record in self.episodes) for arm in self.arms}
+        return f"{type(self).__name__}({str(self.path)!r}, ended: {ended} of {len(self.store.episodes())})"

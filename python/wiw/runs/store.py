@@ -1,0 +1,537 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The run store: one SQLite file that survives being killed at any moment, written by one process.
+
+Every decision and every episode's end is a transaction of its own in WAL mode: a killed run loses at most what it was
+about to write. Episodes without an outcome are partial; resuming discards and redoes them.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import sqlite3
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import wiw
+from wiw.errors import ArgumentError, StoreError
+from wiw.runs.faults import explained, remedy
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.types import Episode
+
+SCHEMA_VERSION = 7
+DECISION_JSON = (
+    "actions",
+    "executed",
+    "scores",
+    "answer",
+    "fidelity",
+    "exchanges",
+    "proposals",
+    "real_frames",
+    "path",
+    "refused",
+    "seconds",
+    "calls",
+    "spent",
+)
+"""Columns of table `decision` that hold JSON."""
+APPLICATION_ID = 0x77697721
+"""Marks the file as a run store (SQLite's application_id)."""
+FILE_NAME = "run.sqlite"
+_SCHEMA = Path(__file__).with_name("schema.sql")
+
+
+def store_path(run: str | Path) -> Path:
+    """The store's file, from a run's folder or the file itself."""
+    path = Path(run).expanduser()
+    return path if path.suffix == ".sqlite" else path / FILE_NAME
+
+
+class RunStore:
+    """An open run store. Use `create`, `resume` or `read`; works as a context manager."""
+
+    def __init__(self, path: Path, connection: sqlite3.Connection, lock: Any = None) -> None:
+        self.path = path
+        self._connection = connection
+        self._lock = lock
+
+    @classmethod
+    def create(
+        cls, run: str | Path, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
+    ) -> RunStore:
+        """A new store for writing.
+
+        Raises:
+            StoreError: a run is already there, or the folder cannot be written.
+        """
+        path = store_path(run)
+        if cls.begun(run):
+            raise StoreError(
+                f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
+                "(or evaluate(..., resume=True)), or give another output folder"
+            )
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(
+                f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
+            ) from error
+        lock = _lock(path)
+        store = cls(path, _connect(path, lock), lock)
+        with store._closed_on_error(), store._writing() as connection:
+            for statement in _SCHEMA.read_text().split(";\n"):
+                connection.execute(statement)
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            created = datetime.now(timezone.utc).isoformat(timespec="seconds")
+            connection.execute(
+                "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(info))
+            )
+            connection.executemany(
+                "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [_episode_values(index, episode) for index, episode in enumerate(episodes)],
+            )
+        return store
+
+    @staticmethod
+    def begun(run: str | Path) -> bool:
+        """Whether a run is there, rather than nothing or a creation that was cut off."""
+        path = store_path(run)
+        return path.exists() and not _blank(path)
+
+    @classmethod
+    def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:
+        """An existing store for writing; partial episodes are discarded.
+
+        Raises:
+            StoreError: missing, damaged, of another version, of another configuration than `config`, or in use.
+        """
+        path = store_path(run)
+        lock = _lock(path) if path.exists() else None
+        store = cls._open(path, lock)
+        with store._closed_on_error():
+            store.require_version()
+            if config is not None:
+                _require_same(path, store.config, json.loads(to_json(config)))
+            store._discard_partial()
+        return store
+
+    def require_version(self) -> None:
+        """Holds the run to the version of wiw that began it.
+
+        Raises:
+            StoreError: this is another.
+        """
+        if self.wiw_version != wiw.__version__:
+            raise StoreError(
+                f"{self.path} was begun by wiw {self.wiw_version}, this is {wiw.__version__}: results of two versions "
+                "must not be mixed; install that version or start a new run"
+            )
+
+    def require_task(self, task: dict[str, Any]) -> None:
+        """Holds the run to the task it was begun with, whose preset may be a file that has changed since.
+
+        Raises:
+            StoreError: the task differs; says in what.
+        """
+        _require_same(self.path, self.config["task"], json.loads(to_json(task)))
+
+    def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
+        """Holds the run to something else it was begun with.
+
+        Raises:
+            StoreError: it differs; says in what.
+        """
+        _require_same(self.path, begun_with, now)
+
+    @classmethod
+    def read(cls, run: str | Path) -> RunStore:
+        """An existing store for reading, also while it is being written.
+
+        Raises:
+            StoreError: missing, damaged or of another version.
+        """
+        return cls._open(store_path(run), None)
+
+    @classmethod
+    def _open(cls, path: Path, lock: Any) -> RunStore:
+        if not path.is_file():
+            raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
+        store = cls(path, _connect(path, lock), lock)
+        with store._closed_on_error():
+            store._require_whole()
+            store._require_readable()
+        return store
+
+    def _require_whole(self) -> None:
+        """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
+        pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
+        if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
+            raise StoreError(f"{self.path}: the file is cut short; {remedy(self.path, 'malformed')}")
+
+    def _require_readable(self) -> None:
+        application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
+        if application != APPLICATION_ID:
+            raise StoreError(
+                f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
+                f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
+            )
+        if version != SCHEMA_VERSION:
+            raise StoreError(
+                f"{self.path} was written by wiw {self.wiw_version} with schema version {version}; this is wiw "
+                f"{wiw.__version__}, which reads version {SCHEMA_VERSION}: use the one that wrote it, or run anew"
+            )
+
+    # -- what the run is -------------------------------------------------------------------------------------------
+
+    @property
+    def wiw_version(self) -> str:
+        """Version of wiw that began the run."""
+        return str(self._value("wiw_version"))
+
+    @property
+    def created(self) -> str:
+        """When the run began, ISO 8601 in UTC."""
+        return str(self._value("created"))
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Task, arms and seed."""
+        return dict(json.loads(self._value("config")))
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """Platform, how to rebuild task and agents, which episodes keep pictures."""
+        return dict(json.loads(self._value("info")))
+
+    def episodes(self) -> list[Episode]:
+        """The episodes that every arm runs; their place in the list is their index."""
+        return [_episode(row) for row in self._rows("SELECT * FROM episode ORDER BY episode")]
+
+    def outcomes(self) -> list[dict[str, Any]]:
+        """Ended episodes of all arms; those of a task with several kinds say of which ("task")."""
+        rows = self._rows(
+            "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
+            "FROM outcome o JOIN episode e USING (episode) "
+            "ORDER BY arm, episode"
+        )
+        named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
+        return [{**row, "metrics": json.loads(row["metrics"])} for row in named]
+
+    def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
+        """Decisions of ended episodes, of one arm or episode if named, in order."""
+        rows = self._rows(
+            "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (?1 IS NULL OR arm = ?1) "
+            "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
+            (arm, episode),
+        )
+        for row in rows:
+            for column in DECISION_JSON:
+                row[column] = None if row[column] is None else json.loads(row[column])
+        return rows
+
+    def totals(self, column: str) -> dict[str, dict[str, float]]:
+        """Sums over the decisions of ended episodes of a column of named numbers ("seconds", "calls", "spent"), by arm,
+        with their number as "decisions".
+        """
+        if column not in ("seconds", "calls", "spent"):
+            raise ArgumentError(f"totals: expected seconds, calls or spent, got '{column}'")
+        found: dict[str, dict[str, float]] = {}
+        ended = "decision d JOIN outcome USING (arm, episode)"
+        for row in self._rows(f"SELECT arm, count(*) AS n FROM {ended} GROUP BY arm"):
+            found[row["arm"]] = {"decisions": float(row["n"])}
+        sums = f"SELECT arm, key, sum(value) AS total FROM {ended}, json_each(d.{column}) GROUP BY arm, key"
+        for row in self._rows(sums):
+            found[row["arm"]][row["key"]] = float(row["total"] or 0)
+        return found
+
+    def lost(self) -> dict[str, dict[str, float]]:
+        """By arm and name, what was spent on decisions that failed or were begun again."""
+        found: dict[str, dict[str, float]] = {}
+        for row in self._rows("SELECT arm, name, value FROM lost"):
+            found.setdefault(row["arm"], {})[row["name"]] = row["value"]
+        return found
+
+    def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
+        """JPEG by name, empty where no pictures were kept."""
+        rows = self._rows(
+            "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
+            (arm, episode, decision),
+        )
+        return {row["name"]: row["jpeg"] for row in rows}
+
+    def film(self, arm: str, episode: int) -> bytes | None:
+        """Animated WebP of an episode, if one was kept."""
+        found = self._rows("SELECT webp FROM film WHERE arm = ? AND episode = ?", (arm, episode))
+        return found[0]["webp"] if found else None
+
+    def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
+        """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
+        for row in self._rows("SELECT * FROM scene_map WHERE scene = ?", (scene,)):
+            return row["webp"], json.loads(row["world_to_pixel"])
+        return None
+
+    def pending(self, arm: str, retry_failed: bool = False) -> list[int]:
+        """Indices of the episodes still to be run in an arm."""
+        status = "AND status = 'done'" if retry_failed else ""
+        rows = self._rows(
+            f"SELECT episode FROM episode WHERE episode NOT IN "
+            f"(SELECT episode FROM outcome WHERE arm = ? {status}) ORDER BY episode",
+            (arm,),
+        )
+        return [row["episode"] for row in rows]
+
+    # -- writing ---------------------------------------------------------------------------------------------------
+
+    def write(self, row: DecisionRow | OutcomeRow) -> None:
+        """Writes one decision with its pictures, or one episode's end, as one transaction.
+
+        An episode whose file gave no length takes it from the first arm that has measured it ("shortest").
+        """
+        with self._writing() as connection:
+            if isinstance(row, DecisionRow):
+                key = {"arm": row.arm, "episode": row.episode, "decision": row.decision}
+                _insert(connection, "decision", {**key, **row.values})
+                for name, jpeg in row.images.items():
+                    _insert(connection, "image", {**key, "name": name, "jpeg": jpeg})
+            else:
+                result = row.result
+                _insert(
+                    connection,
+                    "outcome",
+                    {
+                        "arm": row.arm,
+                        "episode": result.episode,
+                        "status": result.status,
+                        "metrics": to_json(dict(result.metrics)),
+                        "seconds": result.seconds,
+                        "error": result.error,
+                        "kind": result.kind,
+                    },
+                )
+                shortest = result.metrics.get("shortest", math.nan)
+                if math.isfinite(shortest):
+                    connection.execute(
+                        "UPDATE episode SET geodesic = ? WHERE episode = ? AND geodesic IS NULL",
+                        (shortest, result.episode),
+                    )
+
+    def write_agent(self, row: AgentRow) -> None:
+        """Keeps what an arm's agent says of itself, as `info["built"][arm]`.
+
+        Raises:
+            StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
+        """
+        info = self.info
+        agent = json.loads(to_json(row.agent))
+        built = info.setdefault("built", {})
+        if row.arm in built:
+            _require_same(self.path, built[row.arm], agent)
+            return
+        built[row.arm] = agent
+        with self._writing() as connection:
+            connection.execute("UPDATE run SET info = ?", (to_json(info),))
+
+    def write_lost(self, row: LostRow) -> None:
+        """Books what a failed decision had spent."""
+        with self._writing() as connection:
+            connection.executemany(
+                f"INSERT INTO lost VALUES (?, ?, ?) {_ADD}", [(row.arm, *item) for item in row.spent.items()]
+            )
+
+    def discard(self, arm: str, episodes: Iterable[int]) -> None:
+        """Forgets what was written of episodes that are to be run again, but for what it cost."""
+        with self._writing() as connection:
+            for episode in episodes:
+                _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
+                connection.execute("DELETE FROM outcome WHERE arm = ? AND episode = ?", (arm, episode))
+
+    def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
+        """Keeps how a scene looks from above."""
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT OR REPLACE INTO scene_map VALUES (?, ?, ?)", (scene, webp, to_json(world_to_pixel))
+            )
+
+    def write_film(self, arm: str, episode: int, webp: bytes) -> None:
+        """Keeps how an episode went."""
+        with self._writing() as connection:
+            _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
+
+    def close(self) -> None:
+        """Closes the file and lets others write."""
+        self._connection.close()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
+
+    def __enter__(self) -> RunStore:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _discard_partial(self) -> None:
+        with self._writing() as connection:
+            _forget(
+                connection, "NOT EXISTS (SELECT 1 FROM outcome o WHERE o.arm = d.arm AND o.episode = d.episode)", ()
+            )
+
+    @contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+    @contextmanager
+    def _writing(self) -> Iterator[sqlite3.Connection]:
+        with explained(self.path), self._connection as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            yield connection
+
+    def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[dict[str, Any]]:
+        with explained(self.path):
+            return [dict(row) for row in self._connection.execute(query, values)]
+
+    def _value(self, column: str) -> Any:
+        rows = self._rows("SELECT * FROM run")
+        if not rows:
+            raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
+        return rows[0][column]
+
+
+def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
+    """A connection; one that may write is for whoever holds the lock, which is given up if there can be none."""
+    try:
+        with explained(path):
+            return _opened(path, writing=lock is not None)
+    except StoreError:
+        if lock is not None:
+            lock.close()
+        raise
+
+
+def _opened(path: Path, writing: bool) -> sqlite3.Connection:
+    uri = f"{path.absolute().as_uri()}?mode={'rwc' if writing else 'ro'}"
+    connection = _plain(uri)
+    if writing:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA foreign_keys = ON")
+        return connection
+    try:
+        connection.execute("SELECT 1 FROM sqlite_master")
+    except sqlite3.OperationalError:
+        connection.close()
+        if _has_log(path):
+            raise
+        return _plain(uri + "&immutable=1")  # a reader makes a small file too, for which a full disk has no room
+    return connection
+
+
+def _plain(uri: str) -> sqlite3.Connection:
+    connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=30)
+    connection.row_factory = sqlite3.Row
+    return connection
+
+
+def _has_log(path: Path) -> bool:
+    """Whether transactions lie in the log beside the file."""
+    log = path.with_name(path.name + "-wal")
+    return log.exists() and log.stat().st_size > 0
+
+
+def _blank(path: Path) -> bool:
+    """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
+    with explained(path):
+        connection = _opened(path, writing=True)  # also where it was cut off with a log that only a writer takes in
+        (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        connection.close()
+    return bool(tables == 0)
+
+
+def _lock(path: Path) -> Any:
+    """An advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
+    try:
+        handle = path.with_suffix(".lock").open("w")
+    except OSError as error:
+        raise StoreError(
+            f"cannot write in the run's folder {path.parent} ({error.strerror}); expected free space and the right to "
+            "write there: make room, or choose another with out= or --out"
+        ) from error
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        handle.close()
+        raise StoreError(f"{path} is being written by another process; wait for it to end or stop it") from None
+    return handle
+
+
+def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
+    marks = ", ".join("?" for _ in values)
+    connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values()))
+
+
+_ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
+
+
+def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
+    """Deletes decisions, pictures and films `d` that meet a condition; what they cost is booked as lost."""
+    for column, name in (("spent", "key"), ("seconds", "'seconds'")):
+        connection.execute(
+            f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "
+            f"WHERE ({condition}) AND key != 'replay' GROUP BY arm, {name} {_ADD}",
+            values,
+        )
+    for table in ("decision", "image", "film"):
+        connection.execute(f"DELETE FROM {table} AS d WHERE {condition}", values)
+
+
+def _require_same(path: Path, stored: dict[str, Any], wanted: dict[str, Any]) -> None:
+    if stored == wanted:
+        return
+    differing = sorted(name for name in stored.keys() | wanted.keys() if stored.get(name) != wanted.get(name))
+    detail = "; ".join(
+        f"{name}: the run has {to_json(stored.get(name))}, now {to_json(wanted.get(name))}" for name in differing
+    )
+    raise StoreError(
+        f"{path} is a run of another configuration ({detail}); resume it as it was begun or give another folder"
+    )
+
+
+def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
+    values = asdict(episode)
+    return (
+        index,
+        values["episode_id"],
+        values["scene"],
+        *map(float, values["start_position"]),
+        float(values["start_yaw"]),
+        *map(float, values["goal_position"]),
+        float(values["goal_yaw"]),
+        float(values["geodesic"]) if math.isfinite(values["geodesic"]) else None,
+        to_json(values["info"]),
+    )
+
+
+def _episode(row: dict[str, Any]) -> Episode:
+    return Episode(
+        row["episode_id"],
+        row["scene"],
+        (row["start_x"], row["start_y"], row["start_z"]),
+        row["start_yaw"],
+        (row["goal_x"], row["goal_y"], row["goal_z"]),
+        row["goal_yaw"],
+        math.nan if row["geodesic"] is None else row["geodesic"],
+        json.loads(row["info"]),
+    )

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs some episodes of a run again and compares everything that was decided and measured with what the run recorded.
+
+What a language model said then, it is taken to say again. Timings are left out, and so is a rollout cache, which would
+answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import random
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import ArgumentError, StoreError
+from wiw.runs.execute import recipes_of, require_own_sources, require_scenes
+from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.store import DECISION_JSON, RunStore
+from wiw.runs.workers import Job, Plan, Runner
+
+UNLIKE = ("seconds", "calls", "spent", "arm", "episode", "decision")
+"""Columns of a decision that are not compared: timings, what depends on retries and caches, and the row's own name."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One episode of one arm, recorded and run again."""
+
+    arm: str
+    episode: int
+    recorded: str
+    """SHA-256 of everything that was decided and measured, as hexadecimal digits."""
+    again: str
+    difference: str
+    """What differs first, e.g. "decision 3: scores: recorded [0.25,0.5], now [0.25,0.75]"; empty where nothing does."""
+
+    @property
+    def same(self) -> bool:
+        """Whether both are equal."""
+        return self.recorded == self.again
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What `wiw.verify` returns; prints as one line an episode."""
+
+    run: Path
+    checks: tuple[Check, ...]
+
+    @property
+    def same(self) -> bool:
+        """Whether every episode came out as recorded."""
+        return all(check.same for check in self.checks)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{check.arm} episode {check.episode}: "
+            + (f"same, {check.again[:16]}" if check.same else f"DIFFERS at {check.difference}")
+            for check in self.checks
+        ]
+        wrong = sum(not check.same for check in self.checks)
+        verdict = "all as recorded" if not wrong else f"{wrong} of {len(self.checks)} differ from what was recorded"
+        return "\n".join([*lines, f"{self.run}: {verdict}"])
+
+
+Facts = list[tuple[str, dict[str, Any]]]
+"""(place, values) of an episode in order: "agent", "decision 0", ..., "outcome"."""
+
+
+def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
+    """Runs `episodes` random episodes of a run again, in every arm that has ended them, and compares.
+
+    Args:
+        run: the run's folder.
+        episodes: how many; all if the run has fewer.
+        seed: of the choice of episodes.
+
+    Raises:
+        ArgumentError: fewer than one episode.
+        StoreError: no readable run, one that was begun with objects in memory, whose task or source files have changed,
+            or without an ended episode.
+        FileError: a scene is not there.
+    """
+    if episodes < 1:
+        raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")
+    with RunStore.read(run) as store:
+        ended = {(row["arm"], row["episode"]): row for row in store.outcomes() if row["status"] == "done"}
+        if not ended:
+            raise StoreError(f"{store.path} has no ended episode that could be run again; see `wiw resume`")
+        known = sorted({index for _, index in ended})
+        chosen = sorted(random.Random(seed).sample(known, min(episodes, len(known))))
+        again = _run_again(store, {key for key in ended if key[1] in chosen})
+        arms = [arm["name"] for arm in store.config["arms"]]
+        keys = [(arm, index) for index in chosen for arm in arms if (arm, index) in ended]
+        return Verification(
+            store.path.parent, tuple(_check(key, _recorded(store, ended[key]), again[key]) for key in keys)
+        )
+
+
+def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, int], Facts]:
+    task, agents = recipes_of(store)
+    require_own_sources(store, task, agents)
+    built, info, all_episodes = task.build(), store.info, store.episodes()
+    store.require_task(built.describe())
+    require_scenes(built, store, [all_episodes[index] for _, index in keys])
+    limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
+    agents = {arm: recipe.replaying(store.path) for arm, recipe in agents.items()}
+    pictures = frozenset(info["pictures"])
+    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
+    runner, found = Runner(plan), dict[tuple[str, int], Facts]()
+    for arm in agents:
+        indices = sorted(index for name, index in keys if name == arm)
+        if indices:
+            collected = _Collected()
+            runner.run(Job(arm, tuple((index, all_episodes[index]) for index in indices)), collected)
+            found |= {(arm, index): collected.facts(index) for index in indices}
+    return found
+
+
+class _Collected:
+    """Stands where the store is written in a run."""
+
+    def __init__(self) -> None:
+        self._agent: Facts = []
+        self._episodes: dict[int, Facts] = {}
+
+    def __call__(self, row: AgentRow | AgainRow | DecisionRow | LostRow | OutcomeRow) -> None:
+        if isinstance(row, AgentRow):
+            self._agent = [("agent", json.loads(to_json(row.agent)))]
+        elif isinstance(row, AgainRow):
+            for index in row.episodes:
+                self._episodes.pop(index, None)
+        elif isinstance(row, DecisionRow):
+            values = {
+                name: json.loads(value) if name in DECISION_JSON and value is not None else value
+                for name, value in row.values.items()
+            }
+            self._of(row.episode).append(_decision(row.decision, values, row.images))
+        elif isinstance(row, OutcomeRow):
+            self._of(row.result.episode).append(_outcome(row.result.status, row.result.metrics, row.result.error))
+
+    def facts(self, index: int) -> Facts:
+        return [*self._agent, *self._of(index)]
+
+    def _of(self, index: int) -> Facts:
+        return self._episodes.setdefault(index, [])
+
+
+def _recorded(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
+    arm, index = outcome["arm"], outcome["episode"]
+    decisions = [
+        _decision(row["decision"], row, store.images(arm, index, row["decision"]))
+        for row in store.decisions(arm, index)
+    ]
+    agent = [("agent", store.info["built"][arm])] if arm in store.info.get("built", {}) else []
+    return [*agent, *decisions, _outcome(outcome["status"], outcome["metrics"], outcome["error"])]
+
+
+def _decision(number: int, values: Mapping[str, Any], images: Mapping[str, bytes]) -> tuple[str, dict[str, Any]]:
+    facts = {name: value for name, value in values.items() if name not in UNLIKE}
+    if facts["fidelity"] is not None:
+        facts["fidelity"] = {name: value for name, value in facts["fidelity"].items() if name != "lpips"}
+    facts["calls"] = {name: values["calls"].get(name) for name in ("rows", "frames")}
+    seen = {f"picture {name}": _digest(jpeg) for name, jpeg in images.items() if not name.startswith("true/")}
+    return f"decision {number}", json.loads(to_json({**facts, **seen}))
+
+
+def _outcome(status: str, metrics: Mapping[str, float], error: str) -> tuple[str, dict[str, Any]]:
+    last = (error.strip().splitlines() or [""])[-1]
+    return "outcome", json.loads(to_json({"status": status, **metrics, "error": last}))
+
+
+def _check(key: tuple[str, int], recorded: Facts, again: Facts) -> Check:
+    was, now = (_digest(json.dumps(facts, sort_keys=True).encode()) for facts in (recorded, again))
+    return Check(*key, was, now, next(_differences(recorded, again), ""))
+
+
+def _differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[str, Any]]) -> Iterator[str]:
+    for (place, was), (place_now, now) in zip(recorded, again, strict=False):
+        if place != place_now:
+            yield f"{place}: now {place_now}, {now.get('error') or 'another number of decisions'}"
+            return
+        for name in dict.fromkeys([*was, *now]):
+            if was.get(name) != now.get(name):
+                yield f"{place}: {name}: recorded {_short(was.get(name))}, now {_short(now.get(name))}"
+    if len(recorded) != len(again):
+        yield f"the end: recorded {len(recorded)} facts, now {len(again)}"
+
+
+def _short(value: Any, most: int = 200) -> str:
+    if isinstance(value, float) and math.isfinite(value):
+        return repr(value)
+    text = to_json(value)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two runs against each other, episode by episode; runs of unlike episodes are refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from wiw.analysis.statistics import adjusted
+from wiw.analysis.statistics import compare as compare_arms
+from wiw.analysis.summary import ArmSummary, Group, Summary, finished, headlines_of, role_of, summarise
+from wiw.analysis.utility import Utility
+from wiw.errors import ArgumentError, StoreError
+from wiw.report.tables import SummaryTable
+from wiw.runs.rows import to_json
+from wiw.studies.run_log import RunLog, load_run
+from wiw.types import Episode
+
+LENGTH_TOLERANCE = 1e-3
+"""Metres by which two machines may measure the shortest way of an episode differently."""
+
+MOST_NAMED = 5
+"""Of the things in which two agents differ."""
+
+
+@dataclass(frozen=True)
+class Comparison(SummaryTable):
+    """What `wiw.compare` returns: the arms of both runs, and the second run minus the first, arm by arm."""
+
+    runs: tuple[str, str] = ("", "")
+    """What the runs are called in the table."""
+    changed: tuple[str, ...] = ()
+    """What differs between the two agents of a row, a sentence each."""
+
+    def groups(self) -> tuple[Group, ...]:
+        """All differences as one table."""
+        first, second = self.runs
+        rows: dict[str, dict[str, Any]] = {}
+        for one in self.differences:
+            label = _label(one.arm.removesuffix(f" · {second}"), one.base.removesuffix(f" · {first}"))
+            rows.setdefault(label, {})[one.metric] = one
+        title = f"{second} minus {first}, paired by episode"
+        return (Group(title, f"What {second} adds to {first}", f"{second} minus {first}", rows),)
+
+    def remarks(self) -> tuple[str, ...]:
+        """What differs between the agents."""
+        return self.changed
+
+
+def compare(
+    a: str | Path | RunLog, b: str | Path | RunLog, arm: str | None = None, other: str | None = None
+) -> Comparison:
+    """Two runs on the same episodes against each other: run b minus run a, for each arm that both have.
+
+        wiw.compare("runs/old", "runs/new")                      # every arm of both, under its name
+        wiw.compare("runs/a", "runs/b", arm="warp")              # one
+        wiw.compare("runs/a", "runs/b", arm="warp", other="mine")  # b's "mine" minus a's "warp"
+
+    Args:
+        a: folder of a run, wherever it lies, or the run.
+        b: likewise.
+        arm: of run a (and of run b, unless `other` names another); None: all that both have, or the only one of each.
+        other: arm of run b to compare with `arm`.
+
+    Raises:
+        ArgumentError: an arm that is not there, or no arm in common.
+        StoreError: a run cannot be read, or the two differ in task, seed or episodes: the first field that differs.
+    """
+    first, second = (run if isinstance(run, RunLog) else load_run(run) for run in (a, b))
+    require_alike(first, second)
+    pairs = _pairs(first, second, arm, other)
+    names = _names(first, second)
+    sides = [
+        (log, {pair[side]: f"{pair[side]} · {names[side]}" for pair in pairs})
+        for side, log in enumerate((first, second))
+    ]
+    outcomes = [
+        {**row, "arm": labels[row["arm"]]} for log, labels in sides for row in log.episodes if row["arm"] in labels
+    ]
+    labelled = [tuple(labels[arm] for arm, (_, labels) in zip(pair, sides, strict=True)) for pair in pairs]
+    seed = int(first.store.config["seed"])
+    both = summarise([label for pair in labelled for label in pair], outcomes, len(first.store.episodes()), seed)
+    done, _ = finished([line.name for line in both.arms], outcomes)
+    found = [
+        compare_arms(theirs, ours, done, headline, seed) for ours, theirs in labelled for headline in headlines_of(done)
+    ]
+    lines = {line.name: line for log, labels in sides for line in _lines(log, both, labels)}
+    return Comparison(
+        tuple(lines[line.name] for line in both.arms),
+        adjusted([one for one in found if one is not None]),
+        both.same_episodes,
+        tuple(one for log, labels in sides for one in _utilities(log, labels)),
+        both.kinds,
+        names,
+        tuple(line for pair in pairs for line in _changed(first, second, pair)),
+    )
+
+
+def _lines(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
+    """The lines of one run's arms, with the roles that they have there; `labels` by arm."""
+    policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
+    return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
+
+
+def _utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
+    """Where one run's arms stand between its own floor and ceiling."""
+    found = log.numbers().utilities
+    return [replace(one, arm=labels[one.arm]) for one in found if one.arm in labels]
+
+
+def require_alike(a: RunLog, b: RunLog) -> None:
+    """Holds two runs to the same task, seed and episodes, so that their episodes can be paired.
+
+    Raises:
+        StoreError: the first field that differs, with both values and what to do.
+    """
+    ours, theirs = a.store.config, b.store.config
+    for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
+        values = [_value(config["task"].get(name)) for config in (ours, theirs)]
+        if values[0] != values[1]:
+            _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
+    if ours["seed"] != theirs["seed"]:
+        _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"run one of them again with --seed {ours['seed']}")
+    episodes = a.store.episodes(), b.store.episodes()
+    if len(episodes[0]) != len(episodes[1]):
+        counts = [len(one) for one in episodes]
+        _refuse(a, b, "episodes", counts, f"run the shorter one again with --episodes {max(counts)}")
+    for index, pair in enumerate(zip(*episodes, strict=True)):
+        _require_same_episode(a, b, index, pair)
+
+
+def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode, Episode]) -> None:
+    described = [asdict(episode) for episode in pair]
+    lengths = [float(one.pop("geodesic")) for one in described]
+    for name in described[0]:
+        values = [_value(one[name]) for one in described]
+        if values[0] != values[1]:
+            _refuse(a, b, f"episode {index}: {name}", values, "they ran on other episodes; run one of them again")
+    if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
+        advice = "the scene itself has changed (its file, or its navigation mesh); run one of them again"
+        _refuse(a, b, f"episode {index}: shortest way", lengths, advice)
+
+
+def _value(value: Any) -> Any:
+    """As it compares: a path by its last part, for runs of two machines keep their scenes in two places."""
+    if isinstance(value, str) and "/" in value and Path(value).is_absolute():
+        return Path(value).name
+    return value
+
+
+def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str) -> None:
+    raise StoreError(
+        f"cannot compare {a.path} and {b.path}: {field} is {to_json(values[0])} in the first and {to_json(values[1])} "
+        f"in the second; only runs of the same task, seed and episodes can be paired: {advice}"
+    )
+
+
+def _pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tuple[str, str]]:
+    if other is not None and arm is None:
+        raise ArgumentError(f"compare: other='{other}' names an arm of the second run; arm= must name one of the first")
+    if arm is not None:
+        pair = arm, other or arm
+        for log, name in ((a, pair[0]), (b, pair[1])):
+            if name not in log.arms:
+                raise ArgumentError(f"compare: no arm '{name}' in {log.path}; it has {', '.join(log.arms)}")
+        return [pair]
+    common = [name for name in a.arms if name in b.arms]
+    if common:
+        return [(name, name) for name in common]
+    if len(a.arms) == len(b.arms) == 1:
+        return [(a.arms[0], b.arms[0])]
+    raise ArgumentError(
+        f"compare: {a.path} has arms {', '.join(a.arms)}, {b.path} has {', '.join(b.arms)}: none in common; "
+        "name one of each (arm= and other=, or --arm and --other)"
+    )
+
+
+def _names(a: RunLog, b: RunLog) -> tuple[str, str]:
+    """The shortest ends of the two paths that differ."""
+    paths = [log.path.resolve().parts for log in (a, b)]
+    if paths[0] == paths[1]:
+        return "first", "second"
+    for length in range(1, max(map(len, paths)) + 1):
+        ends = ["/".join(parts[-length:]) for parts in paths]
+        if ends[0] != ends[1]:
+            return ends[0], ends[1]
+    return str(a.path), str(b.path)
+
+
+def _label(theirs: str, ours: str) -> str:
+    return theirs if theirs == ours else f"{theirs} - {ours}"
+
+
+def _changed(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
+    """What the two agents say of themselves that is not the same; and the versions of wiw."""
+    said = [_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+    differing = [name for name in dict.fromkeys([*said[0], *said[1]]) if said[0].get(name) != said[1].get(name)]
+    label = _label(pair[1], pair[0])
+    if not differing:
+        return [f"{label}: both runs describe the same agent."]
+    details = [f"{name} {to_json(said[0].get(name))} -> {to_json(said[1].get(name))}" for name in differing]
+    more = f", and {len(details) - MOST_NAMED} more" if len(details) > MOST_NAMED else ""
+    return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
+
+
+def _agent(log: RunLog, arm: str) -> dict[str, Any]:
+    """The agent as it was built, flattened; else as it was asked for."""
+    asked = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
+    return {**_flat(log.store.info.get("built", {}).get(arm, asked)), "wiw": log.store.wiw_version}
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, item in value.items():
+        key = f"{prefix}{name}"
+        found |= _flat(item, f"{key}.") if isinstance(item, dict) else {key: item}
+    return found

@@ -1,0 +1,210 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Questions to a world model as the loop asks them, row by row, to be asked in other company."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw import panorama
+from wiw.loop.agent import Query
+from wiw.loop.attempts import DEADLINE, Attempts
+from wiw.loop.clock import Clock
+from wiw.loop.imagine import seed_of
+from wiw.loop.imagine_poses import IMAGINE
+from wiw.policies.base import FrameSpec
+from wiw.registry import TASKS
+from wiw.types import Conditioning, Control, Key, Proposal, View
+from wiw.world_models.base import WorldModel
+from wiw.world_models.pictures import sample
+
+EPISODES = 2
+REMEMBERED = 4
+"""Answers that are looked at again."""
+SMALL = 96
+"""Columns of true frames."""
+TRUE_PANORAMA = (288, 512)
+PLAN = ("actions", "trajectory", "viewpoints", "ids")
+"""Arrays of a control."""
+Frames = NDArray[np.uint8]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One row of a rollout."""
+
+    image: Frames
+    depth: Any
+    semantic: Any
+    simulator: Any
+    control: Control
+    seed: np.uint64
+    query: Query
+    """The episode that asks."""
+    plan: NDArray[Any]
+    """Its actions, without padding."""
+
+
+class Questions:
+    """What the loop would ask a model in the first moments of some episodes.
+
+    Args:
+        model: who is asked: about primitives in scenes, or, if it takes poses, about poses at a table.
+        scenes: where the episodes with primitives are.
+        deadline: seconds that a call may take.
+
+    Raises:
+        ArgumentError: a deadline that is not above 0.
+    """
+
+    def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
+        self._model, self._attempts = model, Attempts(model, deadline)
+        self._space = model.accepts.space
+        self._queries = _at_tables() if self._space == "pose7" else _in_scenes(scenes)
+        self.row_seconds = 0.0
+        """What a row took in the last call."""
+        self.changed: set[str] = set()
+        """What of its inputs the model has changed."""
+        self.reuses = False
+        """Whether an answer lay in the memory of an earlier one."""
+        self.rewrites = False
+        """Whether an answer has changed after it was given."""
+        self._answers: deque[tuple[Frames, Frames]] = deque(maxlen=REMEMBERED)
+        """The latest answers themselves, and what a sample of their pixels was when they came."""
+
+    def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
+        """The rows of these plans, of primitives or poses, in each episode."""
+        recorder = _Recorder(self._model)
+        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._queries]
+        origins = [range(len(plans)) for _ in proposals]
+        IMAGINE[self._space](recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        asked = {
+            seed_of(query.key, number): (query, np.array(plan))
+            for query in self._queries
+            for number, plan in enumerate(plans)
+        }
+        return [
+            Row(
+                observations.image[place],
+                None if observations.depth is None else observations.depth[place],
+                None if observations.semantic is None else observations.semantic[place],
+                None if observations.simulators is None else observations.simulators[place],
+                replace(control, shared=0),
+                seeds[place],
+                *asked[int(seeds[place])],
+            )
+            for observations, controls, seeds in recorder.asked
+            for place, control in enumerate(controls)
+        ]
+
+    def ask(self, rows: Sequence[Row], shared: int = 0) -> Frames:
+        """The model's answer, in calls of as many rows as it takes best, held to the contract.
+
+        With `shared`, the first frames are not asked for: the same question to the model, but not to a server that
+        remembers its answers.
+
+        Raises:
+            LateError: a call took longer than the deadline.
+            ContractError: an answer breaks the contract; and whatever the model raises.
+        """
+        begin, most = time.perf_counter(), self._model.accepts.best_batch
+        rows = [replace(row, control=replace(row.control, shared=shared)) for row in rows]
+        answers = [self._call(rows[first : first + most]) for first in range(0, len(rows), most)]
+        self.row_seconds = (time.perf_counter() - begin) / len(rows)
+        return np.concatenate(answers)
+
+    def _call(self, rows: Sequence[Row]) -> Frames:
+        observations = Conditioning(
+            np.stack([row.image for row in rows]),
+            depth=None if rows[0].depth is None else np.stack([row.depth for row in rows]),
+            semantic=None if rows[0].semantic is None else np.stack([row.semantic for row in rows]),
+            simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
+        )
+        controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
+        given = [("seeds", seeds)]
+        given += [(f"observations.{name}", getattr(observations, name)) for name in ("image", "depth", "semantic")]
+        given += [(f"control.{name}", getattr(control, name)) for control in controls for name in PLAN]
+        given = [(name, array) for name, array in given if array is not None]
+        kept = [array.copy() for _, array in given]
+        frames = self._attempts.once(observations, controls, seeds)
+        self.changed |= {
+            name for (name, array), before in zip(given, kept, strict=True) if not np.array_equal(array, before)
+        }
+        self.reuses |= any(np.may_share_memory(frames, earlier) for earlier, _ in self._answers)
+        answer = np.array(frames)
+        self.look_back()
+        self._answers.append((frames, sample(answer)))
+        return answer
+
+    def look_back(self) -> None:
+        """See whether one of the latest answers has been written to since; sets `rewrites`."""
+        self.rewrites |= any(not np.array_equal(sample(frames), before) for frames, before in self._answers)
+
+    def true_frames(self, rows: Sequence[Row], plans: Sequence[NDArray[Any]]) -> list[Frames]:
+        """Return what an agent would truly see after each action of a plan, for the place of each row.
+
+        uint8 [K, H, W, 3], in the model's view, of some small size.
+        """
+        accepts = self._model.accepts
+        truth = _true_fronts if self._space == "pose7" else _true_views
+        height, width = accepts.size
+        small = max(1, round(SMALL * height / width)), SMALL
+        return [truth(row.query.simulator, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
+
+
+class _Recorder(Attempts):
+    """Notes what the loop asks of a model, and answers that nothing moves."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(model)
+        self.asked: list[tuple[Conditioning, Sequence[Control], NDArray[np.uint64]]] = []
+
+    def __call__(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        self.asked.append((observations, controls, seeds))
+        return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+
+
+def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """What an agent that walks sees."""
+    poses = simulator.camera_poses_after(plan.astype(np.int8))
+    panoramas = np.empty((len(plan), *TRUE_PANORAMA, 3), np.uint8)
+    simulator.renderer.panorama(poses, TRUE_PANORAMA, panoramas, None, None)
+    if view == "perspective":
+        return np.asarray(panorama.to_perspective(panoramas, 90.0, size))
+    return np.stack([cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in panoramas])
+
+
+def _true_fronts(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """What stands before the camera of a manipulator."""
+    return np.asarray(simulator.fork().render_fronts_after(plan, size))
+
+
+def _in_scenes(scenes: str) -> list[Query]:
+    """The first moments of some episodes of an agent that walks."""
+    task = TASKS.make("imagenav", scenes=scenes)
+    queries = []
+    for index in range(EPISODES):
+        env = task.environment(depth=True)
+        observation = env.begin(task.episode(index))
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork(), semantic=env.semantic()))
+    return queries
+
+
+def _at_tables() -> list[Query]:
+    """The first moments of some episodes of an arm."""
+    task = TASKS.make("manipulation")
+    queries = []
+    for index in range(EPISODES):
+        env = task.environment(depth=True)
+        observation = env.begin(task.episode(index))
+        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
+    return queries

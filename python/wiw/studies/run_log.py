@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run as a researcher reads it: summary, table, costs, fidelity, attribution, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from wiw.analysis.blame import blame
+from wiw.analysis.costs import costs
+from wiw.analysis.fidelity import fidelity
+from wiw.analysis.summary import arm_table, summarise_run
+from wiw.report.export import export
+from wiw.report.page import write_report
+from wiw.report.site import write_view
+from wiw.report.tables import SummaryTable, print_summary
+from wiw.runs.progress import in_notebook
+from wiw.runs.run import Records, Run
+from wiw.runs.store import RunStore
+
+
+class RunLog(Run):
+    """A run on disk, finished or not. Made by `wiw.evaluate` and `wiw.load_run`."""
+
+    @property
+    def valid(self) -> bool:
+        """Whether every arm has ended every episode and at most 1 % of them failed for infrastructure."""
+        return self.complete and not self.numbers().invalid
+
+    def numbers(self) -> SummaryTable:
+        """Return means, intervals and paired differences, without printing."""
+        return SummaryTable.of(summarise_run(self))
+
+    def summary(self) -> SummaryTable:
+        """Print the table of arms and the paired differences, and return them as numbers."""
+        numbers = self.numbers()
+        if not in_notebook():
+            print_summary(numbers)
+        return numbers
+
+    def table(self) -> Records:
+        """Return the table of arms as plain values; see `wiw.analysis.summary.arm_table`."""
+        return arm_table(self)
+
+    def costs(self) -> Records:
+        """Return what each arm cost: one dict per arm, totals and per success; see `wiw.analysis.costs.Costs`."""
+        return Records(line.as_dict() for line in costs(self))
+
+    def fidelity(self) -> Records:
+        """Return how true imagination was in each arm that was run with `fidelity=True`: one dict per arm.
+
+        See `wiw.analysis.fidelity.ArmFidelity`; each decision's own figures are in `decisions`, column "fidelity".
+        """
+        return Records(line.as_dict() for line in fidelity(self))
+
+    def blame(self) -> Records:
+        """Return the stage that each arm's failures are due to, as far as they were attributed: one dict per arm.
+
+        See `wiw.analysis.blame.ArmBlame`.
+        """
+        found = blame(self.store)
+        return Records(line.as_dict() for line in found.arms) if found is not None else Records()
+
+    def report(self, path: str | Path | None = None) -> Path:
+        """Write a self-contained HTML report and return its path; default `report.html` in the run's folder."""
+        return write_report(self, Path(path) if path is not None else self.path / "report.html")
+
+    def view(self, folder: str | Path | None = None) -> Path:
+        """Write pages to walk through all episodes and decisions; return the one to open, `view/index.html`."""
+        return write_view(self, Path(folder) if folder is not None else self.path / "view").index
+
+    def export(
+        self, csv: str | Path | None = None, parquet: str | Path | None = None, rerun: str | Path | None = None
+    ) -> list[Path]:
+        """Write tables into new folders, a recording for the Rerun viewer, or several of these; return the files."""
+        return export(self, *(None if path is None else Path(path) for path in (csv, parquet, rerun)))
+
+    def _repr_html_(self) -> str:
+        return self.numbers()._repr_html_()
+
+
+def load_run(path: str | Path) -> RunLog:
+    """Open a run by its folder, also while it is still running.
+
+    Raises:
+        StoreError: nothing there, damaged, or of another version.
+    """
+    return RunLog(RunStore.read(path))

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inference-time scaling: does more imagination help, and what does it cost? (paper, "Inference-time scaling").
+
+One run with an arm for each amount of imagination, all on the same episodes. The amounts are nested: an agent with
+fewer candidates keeps the first of those that the largest one has, and what a smaller share of decisions consults the
+world model for, a larger one does too. A model behind the rollout cache is asked once for what several arms imagine.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from wiw.analysis.costs import costs
+from wiw.analysis.statistics import Estimate
+from wiw.analysis.summary import show_estimate
+from wiw.errors import ArgumentError
+from wiw.runs.recipes import AgentRecipe, task_recipe
+from wiw.runs.rows import to_json
+from wiw.studies.evaluate import run_arms
+from wiw.studies.run_log import RunLog
+
+CANDIDATES = (1, 2, 4, 8)
+"""Swept where nothing is said."""
+
+
+@dataclass(frozen=True)
+class ScalePoint:
+    """One amount of imagination."""
+
+    arm: str
+    sweep: str
+    """"candidates" or "imagine_fraction"."""
+    value: float
+    success: Estimate
+    rollouts: float
+    """Imagined futures an episode, whether the model or the cache gave them: the paper's world-model inferences."""
+    consultations: float
+    """Decisions an episode for which the model was consulted."""
+    calls: float
+    """Batches an episode that the model was asked for, without what came from the cache."""
+    cached: float
+    """Share of the rollouts that came from the cache."""
+    seconds: float
+    """Wall time an episode, all stages."""
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """What `wiw.scale` found."""
+
+    log: RunLog
+    points: tuple[ScalePoint, ...]
+
+    def to_json(self) -> str:
+        """The points as JSON."""
+        return json.dumps({"points": json.loads(to_json([asdict(point) for point in self.points]))}, indent=2)
+
+    def svg(self) -> str:
+        """Success against imagined futures, with intervals."""
+        from wiw.report.plots import success_by_rollouts
+
+        series: dict[str, list[tuple[float, Estimate, str]]] = {}
+        for point in sorted(self.points, key=lambda point: point.rollouts):
+            series.setdefault(point.sweep, []).append((point.rollouts, point.success, f"{point.value:g}"))
+        return str(success_by_rollouts({name.replace("_", " "): points for name, points in series.items()}))
+
+    def save(self) -> tuple[Path, Path]:
+        """Writes scale.json and scale.svg into the run's folder."""
+        written = self.log.path / "scale.json", self.log.path / "scale.svg"
+        for path, text in zip(written, (self.to_json(), self.svg()), strict=True):
+            path.write_text(text, encoding="utf-8")
+        return written
+
+    def summary(self) -> None:
+        """Prints the table."""
+        from rich import box
+        from rich.console import Console
+        from rich.table import Table
+
+        table = Table(title="More imagination", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
+        for title in ("arm", "SR % ↑", "rollouts", "consulted", "calls", "cached", "s"):
+            table.add_column(title, justify="left" if title == "arm" else "right")
+        for point in self.points:
+            numbers = (f"{value:.1f}" for value in (point.rollouts, point.consultations, point.calls))
+            cached, seconds = f"{100 * point.cached:.0f} %", f"{point.seconds:.2f}"
+            table.add_row(point.arm, show_estimate(point.success), *numbers, cached, seconds)
+        console = Console()
+        Console(width=None if console.is_terminal else max(console.width, 100)).print(table)
+
+
+def scale(
+    env_or_task: Any,
+    agent: Any,
+    candidates: Sequence[int] | None = None,
+    imagine_fraction: Sequence[float] | None = None,
+    episodes: int = 20,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    progress: bool = True,
+    *,
+    live: int = 4,
+    deadline: float | None = None,
+    cache: str | Path | None = None,
+    cache_gb: float | None = None,
+    resume: bool = False,
+    **task_options: Any,
+) -> Scaling:
+    """Runs an agent with different amounts of imagination on the same episodes.
+
+        found = wiw.scale("imagenav", wiw.Agent("matcher", "warp"), candidates=[1, 2, 4, 8], scenes="apartments:val")
+        found.summary()
+
+    Args:
+        env_or_task: an environment, a task, a `TaskRecipe`, or a task's name.
+        agent: a `wiw.Agent` with a world model, or an `AgentRecipe`.
+        candidates: plans imagined at each decision; 1, 2, 4, 8 where this and `imagine_fraction` are None.
+        imagine_fraction: shares of decisions for which the model is consulted, with the agent's own candidates; 0 is
+            the proposer's own preference.
+        episodes: how many.
+        seed: of the run; None means the task's own.
+        out: folder of the run; None means `runs/scale-<time>`.
+        workers: processes.
+        progress: whether to show bars.
+        live: episodes kept live at a time in each process.
+        deadline: see `wiw.evaluate`.
+        cache: see `wiw.evaluate`; a folder spares any model what several amounts imagine.
+        cache_gb: see `wiw.evaluate`.
+        resume: whether to go on with the run in `out` where it was stopped.
+        task_options: options of a task given by name, such as `scenes` and `preset`.
+
+    Raises:
+        ArgumentError: an agent without a world model; no amounts, equal ones or ones out of range.
+    """
+    if agent.model is None:
+        raise ArgumentError("scale: expected an agent with a world model, got one without")
+    amounts = _amounts(candidates, imagine_fraction)
+    agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
+    task = task_recipe(env_or_task, task_options)
+    folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    log = run_arms(
+        task, agents, episodes, seed, folder, workers, progress,
+        live=live, keep_images=0, resume=resume, deadline=deadline, cache=cache, cache_gb=cache_gb,
+    )  # fmt: skip
+    return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
+
+
+def _amounts(
+    candidates: Sequence[int] | None, fractions: Sequence[float] | None
+) -> dict[tuple[str, float], dict[str, Any]]:
+    """What is changed of the agent for each (sweep, value)."""
+    if candidates is None and fractions is None:
+        candidates = CANDIDATES
+    for name, values in (("candidates", candidates), ("imagine_fraction", fractions)):
+        if values is not None and (not values or len(set(values)) < len(values)):
+            raise ArgumentError(f"scale: expected different values of {name}, got {list(values)}")
+    if min(candidates or [1]) < 1 or not all(0 <= share <= 1 for share in fractions or []):
+        raise ArgumentError(
+            f"scale: expected candidates of at least 1 and an imagine_fraction from 0 to 1, got {candidates} and "
+            f"{fractions}"
+        )
+    pool = max(candidates or [1])
+    found: dict[tuple[str, float], dict[str, Any]] = {
+        ("candidates", count): {"candidates": int(count), "pool": int(pool)} for count in candidates or []
+    }
+    return found | {("imagine_fraction", share): {"imagine_fraction": float(share)} for share in fractions or []}
+
+
+def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
+    return replace(agent, **changes) if isinstance(agent, AgentRecipe) else agent.but(**changes)
+
+
+def _points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:
+    """One point for each arm of which an episode was judged."""
+    summary, found = log.numbers(), []
+    for line in costs(log):
+        judged = summary[line.arm].estimates.get("success")
+        if judged is None:
+            continue
+        rows = line.calls.get("rows", 0.0)
+        found.append(
+            ScalePoint(
+                line.arm,
+                *amounts[line.arm],
+                judged,
+                rows / line.episodes,
+                line.calls.get("consultations", 0.0) / line.episodes,
+                line.spent.get("calls", 0.0) / line.episodes,
+                line.spent.get("cached_rows", 0.0) / rows if rows else 0.0,
+                line.all_seconds / line.episodes,
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from scipy import stats
+
+import wiw
+from wiw.analysis.power import simulated_power
+from wiw.analysis.statistics import estimate_difference, holm, mcnemar
+from wiw.cli import main
+from wiw.errors import ArgumentError
+from wiw.metrics.headlines import SUCCESS
+
+
+def test_mcnemars_power_is_the_exact_sum():
+    """Without correlation: over all numbers of wins and losses of 40 pairs."""
+    won, lost, n = 0.3, 0.05, 40
+    exact = 0.0
+    for wins in range(n + 1):
+        for losses in range(min(wins, n - wins + 1)):
+            if stats.binomtest(wins, wins + losses).pvalue <= 0.05:
+                exact += stats.multinomial.pmf([wins, losses, n - wins - losses], n, [won, lost, 1 - won - lost])
+    _, by_test = simulated_power(won, lost, n, 1, 0.0, 0.95, np.random.default_rng(0))
+    assert by_test == pytest.approx(exact, abs=0.02)
+
+
+def test_as_many_episodes_do_show_the_difference():
+    """With the functions that make the tables, on episodes drawn one by one."""
+    plan = wiw.power(20, losses=5, correlation=0.1)
+    assert plan.wins == 25 and plan.episodes == plan.scenes * plan.per_scene
+    rng = np.random.default_rng(3)
+    concentration = 9 * np.array([0.25, 0.05, 0.7])  # correlation 1 / (1 + 9)
+    scenes = list(np.repeat(np.arange(plan.scenes), plan.per_scene))
+    shown = []
+    for _ in range(150):
+        local = rng.dirichlet(concentration, plan.scenes)
+        ways = np.concatenate([rng.choice(3, plan.per_scene, p=shares) for shares in local])
+        arm, base = (ways == 0).astype(float), (ways == 1).astype(float)
+        found = estimate_difference(arm, base, scenes, SUCCESS)
+        shown.append((found.low > 0, mcnemar(arm, base) <= 0.05))
+    by_interval, by_test = np.mean(shown, 0)
+    assert by_interval == pytest.approx(plan.by_interval, abs=0.1) and by_test == pytest.approx(plan.by_test, abs=0.1)
+    assert 0.8 <= plan.by_interval < 0.9
+
+
+def test_what_costs_episodes():
+    plain = wiw.power(15).episodes
+    assert wiw.power(10).episodes > plain
+    assert wiw.power(15, losses=8).episodes > plain
+    assert wiw.power(15, correlation=0.3).episodes > plain
+    assert wiw.power(15, chance=0.95).episodes > plain
+    assert wiw.power(15, arms=5).episodes > plain
+    assert wiw.power(15, per_scene=1).scenes > wiw.power(15).scenes
+    assert wiw.power(-15, base=60).scenes == wiw.power(15, base=60).scenes
+
+
+@pytest.mark.parametrize(
+    "numbers", [{"scenes": 12}, {"scenes": 40, "losses": 6}, {"scenes": 40, "arms": 4, "per_scene": 2}]
+)
+def test_the_least_difference_is_the_one_that_needs_so_many_scenes(numbers):
+    found = wiw.power(**numbers)
+    options = {name: value for name, value in numbers.items() if name != "scenes"}
+    assert found.scenes == numbers["scenes"] and 0.8 <= found.by_interval < 0.85
+    assert (
+        wiw.power(found.difference + 1, **options).scenes
+        <= found.scenes
+        <= wiw.power(found.difference - 1, **options).scenes
+    )
+
+
+def test_what_shows_less():
+    plain = wiw.power(scenes=20).difference
+    assert wiw.power(scenes=40).difference < plain
+    assert wiw.power(scenes=20, losses=8).difference > plain
+    assert wiw.power(scenes=20, correlation=0.3).difference > plain
+    assert wiw.power(scenes=20, arms=5).difference > plain
+    assert wiw.power(scenes=20, chance=0.95).difference > plain
+
+
+def test_several_arms_are_reckoned_with_as_holm_does():
+    assert holm([0.05 / 4, 0.5, 0.6, 0.7])[0] == pytest.approx(0.05)
+    assert "as one of 4 arms" in str(wiw.power(15, arms=4))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"difference": 0}, "a difference other than 0"),
+        ({"difference": 90}, "no more than the 80 % that the base fails in won, got 92 %"),
+        ({"difference": -30}, "no more than the base's 20 % of episodes lost, got 32 %"),
+        ({"difference": 10, "correlation": 1.0}, "correlation in [0, 1)"),
+        ({"difference": 10, "chance": 1.0}, "chance between 0 and 1"),
+        ({"difference": 0.01}, "more than 100000 scenes"),
+        ({}, "either a difference"),
+        ({"difference": 10, "scenes": 20}, "either a difference"),
+        ({"scenes": 1}, "at least 2 scenes"),
+        ({"scenes": 2, "per_scene": 1}, "no difference up to 78 points"),
+        ({"scenes": 20, "arms": 0}, "arms of at least 1"),
+    ],
+)
+def test_numbers_that_no_run_could_have(numbers, message):
+    with pytest.raises(ArgumentError) as error:
+        wiw.power(**numbers)
+    assert message in str(error.value)
+
+
+def test_command_line(capsys):
+    assert main(["power", "15", "--arms", "3"]) == 0
+    assert str(wiw.power(15, arms=3)) == capsys.readouterr().out.strip()
+    assert main(["power", "-15", "--base", "50"]) == 0 and "-15 points" in capsys.readouterr().out
+    assert main(["power", "--scenes", "40"]) == 0
+    assert str(wiw.power(scenes=40)) == capsys.readouterr().out.strip()
+    assert main(["power", "10", "--scenes", "40"]) == 2 and "either a difference" in capsys.readouterr().err
+    assert main(["power"]) == 0 and "12/2" in capsys.readouterr().out
+    assert main(["power", "90"]) == 2 and "80 %" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["power", "--help"])
+    assert "wiw power 10 --arms 4" in capsys.readouterr().out

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from scipy import stats
+
+from wiw.analysis.intervals import agresti_min, clustered_bootstrap, clustered_t, student, wilson
+from wiw.analysis.statistics import compare, estimate_difference, estimate_mean, holm, mcnemar
+from wiw.analysis.summary import headlines, notes, show_estimate, summarise
+from wiw.errors import ArgumentError
+from wiw.report.tables import SummaryTable
+
+SR, SPL, TRAJ = headlines()[:3]
+
+
+@pytest.mark.parametrize(("successes", "n"), [(0, 6), (3, 7), (40, 164), (12, 12)])
+def test_wilson_is_scipys(successes, n):
+    expected = stats.binomtest(successes, n).proportion_ci(method="wilson")
+    assert wilson(successes / n, n) == pytest.approx((expected.low, expected.high), abs=1e-12)
+
+
+def test_student_is_scipys():
+    data = np.random.default_rng(0).normal(40, 9, 23)
+    expected = stats.ttest_1samp(data, 0).confidence_interval()
+    assert student(data) == pytest.approx((expected.low, expected.high))
+    assert all(math.isnan(end) for end in student([3.0]))
+
+
+@pytest.mark.parametrize("method", ["bca", "percentile"])
+def test_bootstrap_is_scipys_where_every_episode_is_its_own_scene(method):
+    data = np.random.default_rng(1).exponential(1.0, 40)
+    expected = stats.bootstrap((data,), np.mean, method=method, n_resamples=40_000, rng=5).confidence_interval
+    assert clustered_bootstrap(data, np.arange(40), method=method, resamples=40_000) == pytest.approx(
+        (expected.low, expected.high), abs=0.03
+    )
+
+
+def test_bootstrap_spread_is_the_clustered_standard_error_of_statsmodels():
+    sm = pytest.importorskip("statsmodels.api")
+    rng = np.random.default_rng(2)
+    scenes = np.repeat(np.arange(60), 4)
+    data = rng.normal(0, 1, 60)[scenes] + rng.normal(0, 0.3, 240)
+    fit = sm.OLS(data, np.ones(240)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
+    low, high = clustered_bootstrap(data, scenes)
+    assert high - low == pytest.approx(2 * 1.96 * fit.bse[0], rel=0.06)
+    independent = clustered_bootstrap(data, np.arange(240))
+    assert high - low > 1.6 * (independent[1] - independent[0])
+
+
+def test_bootstrap_weighs_scenes_by_their_episodes():
+    values, scenes = [1.0] * 30 + [0.0] * 2, ["a"] * 30 + ["b"] * 2
+    low, high = clustered_bootstrap(values, scenes, method="percentile")
+    assert (low, high) == (0.0, 1.0)
+    assert estimate_mean(values, scenes, SR).value == pytest.approx(100 * 30 / 32)
+
+
+def test_bootstrap_is_keyed_by_its_seed_and_refuses_nonsense():
+    data, scenes = np.arange(12.0), np.repeat([0, 1, 2], 4)
+    assert clustered_bootstrap(data, scenes, seed=3) == clustered_bootstrap(data, scenes, seed=3)
+    with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
+        clustered_bootstrap(data, np.zeros(12))
+    with pytest.raises(ArgumentError, match="bca or percentile"):
+        clustered_bootstrap(data, scenes, method="magic")
+
+
+def test_mcnemar_is_statsmodels():
+    tables = pytest.importorskip("statsmodels.stats.contingency_tables")
+    rng = np.random.default_rng(3)
+    arm, base = (rng.random(50) < 0.6).astype(float), (rng.random(50) < 0.3).astype(float)
+    table = [[((arm == a) & (base == b)).sum() for b in (0, 1)] for a in (0, 1)]
+    assert mcnemar(arm, base) == pytest.approx(tables.mcnemar(table, exact=True).pvalue)
+    assert mcnemar([1, 0], [1, 0]) == 1.0
+
+
+def test_agresti_min_formula_by_hand():
+    differences = [1.0] * 5 + [-1.0] * 2 + [0.0] * 13
+    b, c, n = 5.5, 2.5, 22
+    half = 1.959964 * math.sqrt((b + c) - (b - c) ** 2 / n) / n
+    assert agresti_min(differences) == pytest.approx(((b - c) / n - half, (b - c) / n + half), abs=1e-6)
+
+
+def test_agresti_min_covers():
+    """Exact coverage over all outcomes of 20 pairs, with 25 % wins and 10 % losses."""
+    n, win, loss = 20, 0.25, 0.10
+    covered = 0.0
+    for wins in range(n + 1):
+        for losses in range(n + 1 - wins):
+            low, high = agresti_min([1.0] * wins + [-1.0] * losses + [0.0] * (n - wins - losses))
+            if low <= win - loss <= high:
+                covered += stats.multinomial.pmf([wins, losses, n - wins - losses], n, [win, loss, 1 - win - loss])
+    assert 0.94 < covered < 0.985
+
+
+def test_coverage_with_few_scenes():
+    """The wider of the two intervals holds the truth where the bootstrap alone does not: 4 scenes of 5 episodes."""
+    rng = np.random.default_rng(4)
+    scenes = list(np.repeat(["a", "b", "c", "d"], 5))
+    rates = rng.beta(2.27, 3.4, (150, 4))  # mean 0.4, intra-scene correlation 0.15
+    held = [
+        (e.low <= 40 <= e.high)
+        for rate in rates
+        for e in [estimate_mean((rng.random((4, 5)) < rate[:, None]).ravel().astype(float), scenes, SR)]
+    ]
+    assert np.mean(held) > 0.88
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from("abc")), min_size=2, max_size=12))
+def test_intervals_hold_their_mean_and_stay_in_range(pairs):
+    values, scenes = zip(*pairs, strict=True)
+    found = estimate_mean(values, scenes, SPL)
+    assert 0 <= found.low <= found.value + 1e-9 and found.value - 1e-9 <= found.high <= 100
+    difference = estimate_difference(values, values[::-1], scenes, SPL)
+    assert -100 <= difference.low <= difference.value + 1e-9 and difference.value - 1e-9 <= difference.high <= 100
+
+
+def test_all_alike_is_not_certainty():
+    zero = estimate_mean([0.0] * 6, ["a", "b"] * 3, SR)
+    assert (zero.value, zero.low) == (0.0, 0.0) and zero.high > 30
+    same = estimate_difference([1.0] * 6, [1.0] * 6, ["a", "b"] * 3, SR)
+    assert same.low < -10 and same.high > 10 and not same.excludes_zero
+
+
+def outcome(arm, episode, success, status="done", actions=30.0):
+    metrics = {"success": success, "actions": actions, "spl": success} if status == "done" else {}
+    return {"arm": arm, "episode": episode, "scene": f"s{episode % 3}", "status": status, "metrics": metrics}
+
+
+def shown(summary, width=100):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(summary)
+    return console.file.getvalue()
+
+
+def test_the_table_claims_the_same_episodes_only_where_they_are():
+    rows = [outcome(arm, i, 1) for arm in ("none", "warp") for i in range(3)]
+    assert "on the same episodes" in shown(SummaryTable.of(summarise(["none", "warp"], rows, 3)))
+    rows[-1] = outcome("warp", 2, 0, status="failed")
+    assert "each on the episodes that it has finished" in shown(SummaryTable.of(summarise(["none", "warp"], rows, 3)))
+
+
+def test_episodes_that_were_not_judged_are_counted_and_said():
+    outcomes = [outcome("none", i, 0.0) for i in range(4)] + [outcome("warp", i, 1.0) for i in range(3)]
+    outcomes.append(outcome("warp", 3, 0.0, status="failed"))
+    summary = summarise(["none", "warp"], outcomes, episodes=5)
+    assert (summary["warp"].done, summary["warp"].failed, summary["warp"].pending) == (3, 1, 1)
+    assert summary["warp"].estimates["success"].value == 100.0
+    difference = summary.difference("warp", "none")
+    assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
+    assert (summary["warp"].asked, summary["warp"].judged, summary["none"].judged) == (5, "3/5", "4/5")
+    said = " ".join(notes(summary))
+    assert "warp: 3 of 5 episodes asked were judged, 1 failed for infrastructure, 1 still to run" in said
+    assert "over all 5, SR would lie between 60.0 and 100.0 %" in said
+
+
+@pytest.mark.parametrize(("failed", "invalid"), [(0, False), (2, False), (3, True)])
+def test_a_run_is_invalid_where_over_one_percent_of_an_arm_failed(failed, invalid):
+    outcomes = [outcome("warp", i, 1.0, status="failed" if i < failed else "done") for i in range(200)]
+    summary = summarise(["warp"], outcomes, episodes=200)
+    assert bool(summary.invalid) == invalid
+    assert any("INVALID RUN" in note and "3 of 200" in note for note in notes(summary)) == invalid
+
+
+def test_differences_are_paired_by_episode_and_signed_towards_the_better():
+    done = {
+        "a": {i: outcome("a", i, 1.0, actions=20.0) for i in (0, 1, 2)},
+        "b": {i: outcome("b", i, 0.0) for i in (1, 2, 3)},
+    }
+    rate, length = compare("a", "b", done, SR), compare("a", "b", done, TRAJ)
+    assert (rate.estimate.n, rate.wins, rate.estimate.value, rate.p_value) == (2, 2, 100.0, 0.5)
+    assert (length.estimate.value, length.wins, length.p_value) == (-10.0, 2, None)
+    assert compare("a", "b", {"a": {0: done["a"][0]}, "b": {3: done["b"][3]}}, SR) is None
+
+
+def test_one_scene_uses_intervals_over_episodes():
+    found = estimate_mean([1.0, 0.0, 0.0, 1.0], ["house"] * 4, SR)
+    assert found.method == "Wilson" and (found.low / 100, found.high / 100) == pytest.approx(wilson(0.5, 4))
+
+
+def test_empty_run_has_no_numbers():
+    summary = summarise(["none"], [], episodes=3)
+    assert summary["none"].pending == 3 and not summary["none"].estimates and summary.differences == ()
+    with pytest.raises(KeyError, match="it has none"):
+        summary["warp"]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_terminal_table_keeps_every_number(width):
+    arms = ["none", "copy", "heuristic", "geometric"]
+    outcomes = [outcome(arm, i, float((i + len(arm)) % 3 == 0)) for arm in arms for i in range(120)]
+    summary = SummaryTable.of(summarise(arms, outcomes, 120, policies=["none", "heuristic", "geometric"]))
+    with Console(width=width, file=io.StringIO(), record=True) as console:
+        console.print(summary)
+    shown = console.export_text()
+    assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
+    for difference in summary.differences:
+        assert f"{difference.wins}/{difference.losses}" in shown
+        assert show_estimate(difference.estimate, signed=True).split(" ", 1)[1] in shown
+
+
+def test_arms_say_what_they_are():
+    summary = summarise(["none", "geometric", "warp"], [], episodes=3, policies=["none", "geometric"])
+    roles = [line.role for line in summary.arms]
+    assert roles == ["the policy alone", "another policy, alone", "world model"]
+
+
+def test_t_over_scenes_is_the_cluster_robust_interval_of_statsmodels():
+    sm = pytest.importorskip("statsmodels.api")
+    rng = np.random.default_rng(5)
+    scenes = np.repeat(np.arange(12), 4)
+    data = rng.normal(0, 1, 12)[scenes] + rng.normal(0, 1, 48)
+    fit = sm.OLS(data, np.ones(48)).fit(cov_type="cluster", cov_kwds={"groups": scenes})
+    half = stats.t.ppf(0.975, 11) * fit.bse[0]
+    assert clustered_t(data, scenes, "length") == pytest.approx((data.mean() - half, data.mean() + half))
+
+
+def test_t_over_scenes_is_students_where_every_episode_is_its_own_scene():
+    data = np.random.default_rng(6).normal(40, 9, 23)
+    assert clustered_t(data, np.arange(23), "length") == pytest.approx(student(data))
+
+
+def test_made_up_episodes_by_hand():
+    scenes, t = np.repeat(np.arange(5), 4), stats.t.ppf(0.975, 4)
+    more = 2 * (stats.norm.ppf(0.975) / t) ** 2
+    n, q = 20 + more, more / 2 / (20 + more)
+    assert clustered_t(np.zeros(20), scenes, "rate") == pytest.approx((0.0, q + t * math.sqrt(q * (1 - q) / n)))
+    assert clustered_t(np.zeros(20), scenes, "difference")[1] == pytest.approx(t * math.sqrt(more / 2) / n)
+    with pytest.raises(ArgumentError, match="at least 2 clusters, got 1"):
+        clustered_t(np.zeros(4), np.zeros(4), "rate")
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=9))
+def test_holm_is_statsmodels(p_values):
+    multitest = pytest.importorskip("statsmodels.stats.multitest")
+    assert holm(p_values) == pytest.approx(multitest.multipletests(p_values, method="holm")[1])
+
+
+def test_arms_of_one_table_are_one_family_of_tests():
+    wins = {"none": 0, "copy": 1, "warp": 6, "oracle": 9}
+    outcomes = [outcome(arm, i, float(i < wins[arm])) for arm in wins for i in range(12)]
+    summary = summarise(list(wins), outcomes, episodes=12)
+    found = [summary.difference(arm, "none") for arm in ("copy", "warp", "oracle")]
+    assert [d.p_value for d in found] == pytest.approx([1.0, 2 / 2**6, 2 / 2**9])
+    assert [d.p_adjusted for d in found] == pytest.approx([1.0, 2 * 2 / 2**6, 3 * 2 / 2**9])
+    assert summary.difference("warp", "copy").p_adjusted == pytest.approx(2 * 2 / 2**5 / 2)  # two arms, the larger p
+
+
+def test_few_scenes_that_happen_to_be_alike_do_not_make_an_interval_narrow():
+    spl = [0.9, 0.0, 0.88, 0.0, 0.0, 0.91]  # one of two reached in each of three scenes
+    low, high = clustered_t(spl, ["a", "a", "b", "b", "c", "c"], "rate")
+    assert high - low > 0.6
+
+
+def test_intervals_of_means_end_where_values_do():
+    actions, scenes = [3, 60, 60, 60], ["a", "a", "b", "b"]
+    found, plain = (estimate_mean(actions, scenes, headline) for headline in (TRAJ, replace(TRAJ, least=-math.inf)))
+    assert plain.low < 0 and found.low == 0 and found.high == plain.high
+    worse = estimate_difference([0, 0, 50, 50], [3, 60, 60, 60], scenes, TRAJ)
+    assert worse.low < 0
