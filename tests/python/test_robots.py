@@ -16,8 +16,8 @@ import wiw
 from wiw.errors import ArgumentError, FileError
 from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
 from wiw.runs.recipes import AgentRecipe
-from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.robot import load_panda, load_robot
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE, Thing, Workbench
 from wiw.tasks.manipulation import Manipulation
 
