@@ -152,7 +152,7 @@ def _build_robot(
         (left["child"], right["child"]),
         (left["name"], right["name"]),
         identity,
-        looks,
+        link_meshes,
     )
     _check_frame(robot)
     return robot
