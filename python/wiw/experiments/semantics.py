@@ -84,4 +84,4 @@ class Labelled(ImaginerWrapper, Privileged):
 def _label(source: Semantics, inputs: Any) -> NDArray[np.uint32]:
     own: list[ModelInput] = list(inputs)
     depth = stack_depths(own) if "depth" in source.needs else None
-    return source.panoramas(np.stack([shown.observation.panorama for shown in own]), depth)
+    return source.label_panoramas(np.stack([shown.observation.panorama for shown in own]), depth)
