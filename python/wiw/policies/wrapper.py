@@ -59,7 +59,7 @@ class PolicyWrapper(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[NDArray[np.float64]]:
-        """Score or prefer as the wrapped policy does, which may itself be a wrapper; or by the subclass's own `score`."""
+        """Score or prefer as the wrapped policy does, or by the `score` of a subclass that has one of its own."""
         if type(self).score is not PolicyWrapper.score:
             return super().score_or_prefer(situations, proposals, rollouts)
         return self.inner.score_or_prefer(situations, proposals, rollouts)
