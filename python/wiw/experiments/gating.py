@@ -84,8 +84,14 @@ class PartlyImagined(Imagination):
 
 def select(request: Request, places: Sequence[int]) -> Request:
     """Return the request of some of its episodes."""
-    names = ("keys", "observations", "inputs", "plans", "origins")
-    return replace(request, **{name: [getattr(request, name)[place] for place in places] for name in names})
+    return replace(
+        request,
+        keys=[request.keys[place] for place in places],
+        observations=[request.observations[place] for place in places],
+        inputs=[request.inputs[place] for place in places],
+        plans=[request.plans[place] for place in places],
+        origins=[request.origins[place] for place in places],
+    )
 
 
 def is_consulted(key: Key, fraction: float) -> bool:
