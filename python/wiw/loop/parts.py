@@ -82,8 +82,8 @@ def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
-            f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} makes "
-            f"them of {plan_space(made.space).words}"
+            f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
+            f"makes them of {plan_space(made.space).words}"
         )
     return made
 

@@ -120,7 +120,8 @@ class Policy(ABC):
         )
         if not isinstance(found, Sequence) or len(found) != len(places):
             raise ContractError(
-                f"{type(self.unwrapped).__name__}.score: expected scores for each of {len(places)} episodes, got {found!r}"
+                f"{type(self.unwrapped).__name__}.score: expected scores for each of {len(places)} episodes, got "
+                f"{found!r}"
             )
         for place, score in zip(places, found, strict=True):
             scores[place] = score
