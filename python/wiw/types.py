@@ -16,6 +16,10 @@ ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
 Space = Literal["discrete", "pose7"]
 """What plans are made of: primitives, or poses of a gripper (x, y, z, roll, pitch, yaw, gripper)."""
+PRIMITIVES: Literal["discrete"] = "discrete"
+"""Plans are ids of `wiw.action`, int8 [K]."""
+GRIPPER_POSES: Literal["pose7"] = "pose7"
+"""Plans are poses of a gripper, float64 [K, 7]."""
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,8 @@ def run(
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
         scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
-        episodes: How many; if not given, 20, for manipulation what the preset says: 50 of each task.
+        episodes: How many; if not given, all of --episode-file, else 20, for manipulation what the preset says: 50 of
+            each task.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.
         out: Folder of the run; runs/TASK-TIME if not given.

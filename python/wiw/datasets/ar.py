@@ -287,8 +287,8 @@ def _best_view(
     return _View(ends[end], int(primitives[end]), float(sizes[best]), min(1.0, float(shares[best])))
 
 
-def best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRules()) -> NDArray[np.float64]:
-    """Where the target is seen best within the budget: as the episode says, else as measured; float64 [3]."""
+def find_best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRules()) -> NDArray[np.float64]:
+    """Return where the target is seen best within the budget: as the episode says, else as measured; float64 [3]."""
     known = episode.info.get("best_position")
     if known is not None:
         return np.asarray(known, np.float64)
@@ -300,8 +300,10 @@ def best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRule
     return np.asarray(ends[seen(world, ends, COARSE)[:, target].argmax()], np.float64)
 
 
-def clarity(world: World, place: NDArray[np.float64], instance: int, rules: EpisodeRules = EpisodeRules()) -> float:
-    """How well an instance is seen from a place, 0 to 1: its visible share, times its size up to `rules.enough`."""
+def measure_clarity(
+    world: World, place: NDArray[np.float64], instance: int, rules: EpisodeRules = EpisodeRules()
+) -> float:
+    """Return how well an instance is seen, 0 to 1: its visible share, times its size up to `rules.enough`."""
     points = np.asarray(place, np.float64)[None]
     size = float(seen(world, points)[0, instance])
     whole = float(alone(world, points, instance)[0]) if size else 0.0
