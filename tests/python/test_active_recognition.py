@@ -216,7 +216,7 @@ def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
             run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     env = task.environment()
     shown, info = env.reset(options={"episode": 0})
-    with pytest.raises(ArgumentError, match=r"run\(actions, answer\)"):
+    with pytest.raises(ArgumentError, match=r"run\(plan, answer\)"):
         env.run([FORWARD])
     with pytest.raises(ArgumentError, match=r"env\.observation"):
         wiw.Agent(SizeReader()).decide(shown, env.goal, info["key"])

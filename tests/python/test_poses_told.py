@@ -17,8 +17,8 @@ import pytest
 from browser import COMMAND, WHY, Browser
 from PIL import Image, ImageSequence
 from pressing_policy import Pressing
-from test_evaluation_report import Page
 from test_export import contents_of
+from test_report import Page
 
 import wiw
 from wiw.errors import ArgumentError

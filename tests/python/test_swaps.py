@@ -14,7 +14,7 @@ import wiw
 from recognition_file import a_file
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.datasets import ar
-from wiw.datasets.visibility import seen, visible_share
+from wiw.datasets.visibility import measure_sizes, visible_share
 from wiw.errors import ArgumentError
 from wiw.loop.agent import Query
 from wiw.tasks.ar import AR
@@ -82,7 +82,7 @@ def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path
     env = started(task)
     state, target = env.state, int(env.state.episode.info["target"])
     place = env.fork().position
-    size, share = seen(state.world, place[None])[0, target], visible_share(state.world, place, target)
+    size, share = measure_sizes(state.world, place[None])[0, target], visible_share(state.world, place, target)
     clarity = ar.measure_clarity(state.world, place, target)
     assert clarity == pytest.approx(share * min(1, size / ar.EpisodeRules().enough)) and 0 < clarity < 1
     best = task.find_destination(state)

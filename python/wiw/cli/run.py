@@ -45,7 +45,7 @@ def run(
     width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
     robot: Annotated[Path | None, arg(metavar="URDF")] = None,
-    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
     live: Count = 4,
@@ -103,7 +103,8 @@ def run(
         width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         robot: For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given.
-        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
+            given. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.

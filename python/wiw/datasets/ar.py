@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.visibility import COARSE, alone, seen
+from wiw.datasets.visibility import COARSE, measure_sizes, measure_unhidden_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
 from wiw.types import Episode
@@ -156,7 +156,7 @@ def generate(
     key = core.fold_key([seed, first, 0xA12])
     things = _targets(world, categories)
     points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
-    survey = Survey(points, seen(world, points, COARSE))
+    survey = Survey(points, measure_sizes(world, points, COARSE))
     made: list[Episode] = []
     tally = Counter(before)
     for round_ in range(count):
@@ -249,9 +249,9 @@ def _starts(
     if not len(near):
         return
     points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
-    sizes = seen(world, points)[:, instance]
+    sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
-    shares = np.minimum(1.0, sizes / np.maximum(alone(world, points, instance), 1e-9))
+    shares = np.minimum(1.0, sizes / np.maximum(measure_unhidden_sizes(world, points, instance), 1e-9))
     # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
     for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
         yield points[i], float(sizes[i]), float(shares[i])
@@ -272,13 +272,13 @@ def _best_view(
     large enough, the one with the greatest visible share.
     """
     ends, primitives = _reachable(world, start, yaw, rules.budget)
-    rough = seen(world, ends, COARSE)[:, instance]
+    rough = measure_sizes(world, ends, COARSE)[:, instance]
     largest = np.argsort(-np.minimum(rough, rules.enough), kind="stable")[:6]
     largest = largest[rough[largest] >= rules.large / 2]
     if not len(largest):
         return None
-    sizes = seen(world, ends[largest])[:, instance]
-    shares = sizes / np.maximum(alone(world, ends[largest], instance), 1e-9)
+    sizes = measure_sizes(world, ends[largest])[:, instance]
+    shares = sizes / np.maximum(measure_unhidden_sizes(world, ends[largest], instance), 1e-9)
     fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
     if not len(fit):
         return None
@@ -297,7 +297,7 @@ def find_best_place(world: World, episode: Episode, rules: EpisodeRules = Episod
     if best is not None:
         return best.position
     ends, _ = _reachable(world, start, episode.start_yaw, rules.budget)
-    return np.asarray(ends[seen(world, ends, COARSE)[:, target].argmax()], np.float64)
+    return np.asarray(ends[measure_sizes(world, ends, COARSE)[:, target].argmax()], np.float64)
 
 
 def measure_clarity(
@@ -305,8 +305,8 @@ def measure_clarity(
 ) -> float:
     """Return how well an instance is seen, 0 to 1: its visible share, times its size up to `rules.enough`."""
     points = np.asarray(place, np.float64)[None]
-    size = float(seen(world, points)[0, instance])
-    whole = float(alone(world, points, instance)[0]) if size else 0.0
+    size = float(measure_sizes(world, points)[0, instance])
+    whole = float(measure_unhidden_sizes(world, points, instance)[0]) if size else 0.0
     return min(1.0, size / whole) * min(1.0, size / rules.enough) if whole else 0.0
 
 
