@@ -49,7 +49,6 @@ def test_gymnasium_makes_what_wiw_makes(two_rooms: str) -> None:
         gymnasium.make("wiw/ImageNav-v0", scenes=two_rooms, render_mode="human")
 
 
-@pytest.mark.filterwarnings("ignore:.*WARN")
 def test_the_checker_of_gymnasium_passes_them(two_rooms: str) -> None:
-    check_env(gymnasium.make("wiw/ImageNav-v0", scenes=two_rooms).unwrapped, skip_render_check=True)
-    check_env(gymnasium.make("wiw/Manipulation-v0", tasks="push_buttons", size=32).unwrapped, skip_render_check=True)
+    check_env(gymnasium.make("wiw/ImageNav-v0", scenes=two_rooms).unwrapped)
+    check_env(gymnasium.make("wiw/Manipulation-v0", tasks="push_buttons", size=32).unwrapped)

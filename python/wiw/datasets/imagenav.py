@@ -21,7 +21,7 @@ _log = logging.getLogger("wiw.datasets")
 
 @dataclass(frozen=True)
 class EpisodeRules:
-    """What makes a start and a goal worth an episode. Lengths in metres."""
+    """Rules that a start and a goal of an episode satisfy. Lengths in metres."""
 
     shortest: float = 2.0
     """Least geodesic distance."""
@@ -40,7 +40,7 @@ class EpisodeRules:
 def generate(
     world: World, count: int, seed: int, rules: EpisodeRules = EpisodeRules(), *, first: int = 0
 ) -> list[Episode]:
-    """Episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
+    """Return episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
 
     Raises:
         ArgumentError: the scene has too few pairs of places that satisfy `rules`; says which rules they broke.
@@ -100,7 +100,7 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
 
 
 def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, turn: float = np.pi / 8) -> int:
-    """Primitives of a shortest path [N, 3] from heading `yaw`: its turns in whole steps, its length in strides."""
+    """Return the primitives of a path [N, 3] from heading `yaw`: its turns in whole steps, its length in strides."""
     legs = np.diff(path[:, [0, 2]], axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-6]
     headings = np.arctan2(-legs[:, 0], -legs[:, 1])
@@ -110,7 +110,7 @@ def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, t
 
 
 def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
-    """Whether the goal camera's place can be seen from the start camera's, by the depth along the ray between them."""
+    """Return whether the goal camera's place is seen from the start camera's, by the depth along the ray between."""
     eye, place = (np.add(p, [0.0, CAMERA_HEIGHT, 0.0]) for p in (start, goal))
     way = place - eye
     pose = camera_pose(start, float(np.arctan2(-way[0], -way[2])))
@@ -122,7 +122,7 @@ def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64]
 
 
 def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMERA_HEIGHT) -> NDArray[np.float64]:
-    """float64 [4, 4]: T_world_camera of an agent at `position` on the floor, heading `yaw` radians."""
+    """Return T_world_camera [4, 4] of an agent at `position` on the floor, heading `yaw` radians."""
     pose = np.eye(4)
     pose[0, 0] = pose[2, 2] = np.cos(yaw)
     pose[0, 2], pose[2, 0] = np.sin(yaw), -np.sin(yaw)
@@ -131,7 +131,7 @@ def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMER
 
 
 def _best_view(world: World, goal: NDArray[np.float64], yaws: NDArray[np.float64], rules: EpisodeRules) -> float | None:
-    """The heading whose view reaches deepest, if any view is worth looking at."""
+    """Return the heading whose view reaches deepest, if any view is worth looking at."""
     poses = np.stack([camera_pose(goal, float(yaw)) for yaw in yaws])
     views = world.renderer.perspective(poses, (60, 60), 90.0, outputs=("depth", "instance"))
     depths = np.median(views["depth"].reshape(len(yaws), -1), axis=1)

@@ -17,10 +17,10 @@ from wiw.types import Answer, Episode, Goal, Key, Truth
 
 @dataclass(frozen=True)
 class Segment:
-    """What carrying out the actions of one decision came to."""
+    """The outcome of carrying out the actions of one decision."""
 
     observation: Any
-    """What the agent perceives at its end, such as a `wiw.types.Observation`."""
+    """The view at its end, such as a `wiw.types.Observation`."""
     executed: NDArray[Any]
     """The actions carried out: fewer than planned where the episode ended on the way."""
     path: NDArray[np.float64]
@@ -72,12 +72,12 @@ class Env(ABC):
     @property
     @abstractmethod
     def goal(self) -> Goal:
-        """What the agent is asked to do in the running episode."""
+        """The goal of the running episode."""
 
     @property
     @abstractmethod
     def observation(self) -> Any:
-        """What the agent perceives now."""
+        """The agent's present view, such as a `wiw.types.Observation`."""
 
     @abstractmethod
     def truth(self) -> Truth:
@@ -100,7 +100,7 @@ class Env(ABC):
         raise self._lacks("has no true semantics, which `--semantics simulator` asks for", "semantic")
 
     def close(self) -> None:
-        """Release what the environment holds."""
+        """Release the resources of the environment."""
         return
 
     def _lacks(self, what: str, method: str) -> ArgumentError:

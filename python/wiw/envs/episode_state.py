@@ -19,13 +19,13 @@ from wiw.types import Answer, Episode, Goal, Observation, Truth
 
 
 class NavigationSpec(ABC):
-    """What environments in which an agent walks ask of their task: goals, and when one is reached."""
+    """The side of a navigation task that its environments use: goals, and when one is reached."""
 
     name: str
     seed: int
     backend: Literal["auto", "cpu", "gpu"]
     choices: tuple[str, ...] = ()
-    """What answers are chosen from, where the task asks for any."""
+    """Labels that answers are chosen from, where the task asks for any."""
 
     @property
     @abstractmethod
@@ -40,7 +40,7 @@ class NavigationSpec(ABC):
     @property
     @abstractmethod
     def motion(self) -> str:
-        """What happens to a blocked move: "refuse" or "slide"."""
+        """Rule for blocked moves: "refuse" or "slide"."""
 
     @property
     @abstractmethod
@@ -107,7 +107,7 @@ class EpisodeState:
     ended: bool = False
     """By success, by stopping, by an answer that was sure enough, or for want of a target."""
     answers: list[Answer] = field(default_factory=list)
-    """What the agent believed, decision by decision."""
+    """The agent's beliefs, decision by decision."""
 
     @property
     def actions(self) -> int:

@@ -50,7 +50,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         ArgumentError: no such camera, or a size below 1.
     """
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's name and type
 
     def __init__(
         self,
@@ -148,12 +148,12 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
 
     @property
     def goal(self) -> Goal:
-        """What the agent is asked to do."""
+        """The goal of the running episode."""
         return self.table.goal
 
     @property
     def observation(self) -> ArmObservation:
-        """What the agent perceives now."""
+        """The agent's present view."""
         self._require_episode()
         assert self._observation is not None
         return self._observation

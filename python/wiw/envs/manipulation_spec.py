@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an environment with an arm at a table asks of its task."""
+"""The side of a manipulation task that its environments use."""
 
 from __future__ import annotations
 

@@ -108,7 +108,7 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[A
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """What each agent is asked to do."""
+        """The goal of each agent."""
         return tuple(env.goal for env in self.envs)
 
     # ------------------------------------------------------------------------------------------------------------------

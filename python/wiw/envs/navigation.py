@@ -40,7 +40,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     right answer. Where the agent truly is stays in `truth()`, outside observation and info.
     """
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's name and type
 
     def __init__(self, task: NavigationSpec, depth: bool = False) -> None:
         self.task = task
@@ -142,14 +142,14 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
     @property
     def goal(self) -> Goal:
-        """What the agent is asked to reach."""
+        """The goal of the running episode."""
         self._require_episode()
         assert self._goal is not None
         return self._goal
 
     @property
     def observation(self) -> Observation:
-        """What the agent perceives now: plain images, and the target apart, as agents and world models are given it."""
+        """The agent's present view: plain images, and the target apart, as agents and world models are given it."""
         self._require_episode()
         assert self._observation is not None
         return self._observation

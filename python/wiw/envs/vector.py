@@ -124,7 +124,7 @@ class VectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[np.int64], ND
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """What each agent is asked to reach."""
+        """The goal of each agent."""
         self._require_episodes()
         return tuple(self._goals)
 

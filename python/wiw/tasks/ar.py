@@ -93,7 +93,7 @@ class AR(NavigationTask):
 
     @property
     def file_header(self) -> dict[str, Any]:
-        """What a file of its episodes says beside them."""
+        """Header of a file of its episodes."""
         return {**super().file_header, "categories": list(self.choices)}
 
     @property

@@ -32,7 +32,7 @@ class Task(ABC):
     seed: int = 0
     """Of the run, where it is not given another."""
     space: str = PRIMITIVES
-    """What plans are made of: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or a space of the task's own."""
+    """Elements of plans: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or a space of the task's own."""
     metrics: tuple[str, ...] = ("success",)
     """Names of the metrics that the paper reports of it."""
     default_policy: str | None = None
@@ -40,7 +40,7 @@ class Task(ABC):
     sensor_options: tuple[str, ...] = ()
     """Options of `wiw.make` that are the environment's, not the task's."""
     choices: tuple[str, ...] = ()
-    """What answers are chosen from, where the task asks for any."""
+    """Labels that answers are chosen from, where the task asks for any."""
     wording: Wording = Wording()
     """How reports speak of its episodes."""
     has_guide: bool = False
@@ -88,7 +88,7 @@ class Task(ABC):
 
     @property
     def file_header(self) -> dict[str, Any] | None:
-        """What `wiw episodes` writes into a file beside the episodes; None where they are not kept in files."""
+        """Header of a file of its episodes (`wiw episodes`); None where episodes are not kept in files."""
         return None
 
     @staticmethod

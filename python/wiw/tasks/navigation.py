@@ -98,7 +98,7 @@ class NavigationTask(NavigationSpec, Task):
 
     @property
     def motion(self) -> str:
-        """What happens to a blocked move: "refuse" or "slide"."""
+        """Rule for blocked moves: "refuse" or "slide"."""
         return str(self.rules.motion)
 
     @property
@@ -132,7 +132,7 @@ class NavigationTask(NavigationSpec, Task):
 
     @property
     def file_header(self) -> dict[str, Any]:
-        """What a file of its episodes says beside them."""
+        """Header of a file of its episodes."""
         return {"seed": self.seed, "scenes": self.scenes}
 
     def describe(self) -> dict[str, Any]:
