@@ -10,10 +10,10 @@ import torch
 from peft import LoraConfig
 
 from wiw.registry import WORLD_MODELS
-from wiw.world_models.actions import checkpoint
-from wiw.world_models.actions.config import ActionConfig
-from wiw.world_models.actions.encoder import ActionEncoder
-from wiw.world_models.actions.injection import width_of
+from wiw.world_models.video.actions import checkpoint
+from wiw.world_models.video.actions.config import ActionConfig
+from wiw.world_models.video.actions.encoder import ActionEncoder
+from wiw.world_models.video.actions.injection import embedding_width
 
 LORA = ("wan2.1-action", "wan2.2-a14b-action")
 
@@ -23,9 +23,15 @@ def save(name: str, pipeline: Any, folder: Path, **config: Any) -> Path:
     model = WORLD_MODELS.find(name)
     encoders = {}
     for place in model.denoisers:
-        width = width_of(getattr(pipeline, place))
-        said = {"base": model.base, "weights": str(folder.parent), "stride": model.stride, "width": width, **config}
-        encoders[place] = randomised(ActionEncoder(ActionConfig(**said)))
+        width = embedding_width(getattr(pipeline, place))
+        values = {
+            "base": model.base,
+            "weights": str(folder.parent),
+            "stride": model.generator_class.stride,
+            "width": width,
+            **config,
+        }
+        encoders[place] = randomised(ActionEncoder(ActionConfig(**values)))
         if name in LORA:
             layers = ["to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.net.2"]
             lora = LoraConfig(r=4, lora_alpha=8, target_modules=layers, init_lora_weights=False)

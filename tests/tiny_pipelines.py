@@ -271,7 +271,7 @@ def wan22_a14b() -> Any:
 
 
 def cosmos() -> Any:
-    from wiw.world_models.cosmos_predict2.stand_ins import no_filter
+    from wiw.world_models.video.cosmos import make_empty_filter
 
     transformer = CosmosTransformer3DModel(
         in_channels=17,
@@ -290,7 +290,7 @@ def cosmos() -> Any:
     )
     scheduler = FlowMatchEulerDiscreteScheduler(use_karras_sigmas=True)
     scheduler.register_to_config(sigma_max=80.0, sigma_min=0.002, sigma_data=1.0, final_sigmas_type="sigma_min")
-    return Cosmos2VideoToWorldPipeline(_t5(), _t5_tokenizer(), transformer, _wan_vae(), scheduler, no_filter())
+    return Cosmos2VideoToWorldPipeline(_t5(), _t5_tokenizer(), transformer, _wan_vae(), scheduler, make_empty_filter())
 
 
 def hunyuan(condition: str = "latent_concat") -> Any:

@@ -9,6 +9,7 @@
 
 #include "arrays.hpp"
 #include "physics_arrays.hpp"
+#include "physics_parts.hpp"
 #include "wiw/physics/articulation.hpp"
 #include "wiw/physics/inverse_kinematics.hpp"
 #include "wiw/physics/mesh_file.hpp"
@@ -153,7 +154,8 @@ shared between worlds and threads.)")
            py::arg("path"), py::call_guard<py::gil_scoped_release>(),
            "Reads a URDF file. FileError for a file or mesh that is missing or damaged (the message names the link), "
            "ArgumentError for impossible numbers and other joints. `package://NAME/...` is looked for in the folders "
-           "above the file.")
+           "above the file. It is read in this process; `wiw.tabletop.robot.robot_of` reads files of others in one of "
+           "its own.")
       .def_static(
           "from_text",
           [](const std::string& urdf, const std::filesystem::path& folder) {
@@ -161,6 +163,14 @@ shared between worlds and threads.)")
           },
           py::arg("urdf"), py::arg("folder") = std::filesystem::path(), py::call_guard<py::gil_scoped_release>(),
           "The same from text; mesh files are relative to `folder`.")
+      .def("to_parts", &bindings::articulation_to_parts,
+           "All of it as plain data that JSON can hold to the last bit, for `from_parts`.")
+      .def_static(
+          "from_parts",
+          [](const py::dict& parts) {
+            return std::const_pointer_cast<Articulation>(bindings::articulation_from_parts(parts));
+          },
+          py::arg("parts"), "The articulation whose `to_parts` this is. ArgumentError for parts that fit no tree.")
       .def_property_readonly("name", &Articulation::name)
       .def_property_readonly("links", &link_names, "Names, parents before their children.")
       .def_property_readonly("joints", &Articulation::movable_joints, "Names of the movable joints.")

@@ -6,6 +6,7 @@ from wiw._core import ArgumentError, BackendError, Error, FileError, NavigationE
 __all__ = [
     "ArgumentError",
     "BackendError",
+    "ConstructionError",
     "ContractError",
     "DependencyError",
     "DeviceMemoryError",
@@ -20,17 +21,39 @@ __all__ = [
     "StoreError",
     "VlmError",
     "WeightsError",
+    "asks_to_stop",
 ]
+
+
+def asks_to_stop(error: BaseException) -> bool:
+    """Return whether an exception stops the process itself: Ctrl-C, or one of wiw's own for a signal.
+
+    Any other is an error of the code that raised it, also `SystemExit`: a plugged-in model ends no run.
+    """
+    own = type(error).__module__.partition(".")[0] == "wiw" and not isinstance(error, Exception)
+    return own or isinstance(error, KeyboardInterrupt)
 
 
 class RegistryError(Error, LookupError):
     """A name is not registered. The message lists what is, nearest first."""
 
 
+class ConstructionError(Error):
+    """A world model, a policy or another part cannot be made: its constructor failed.
+
+    `kind` is "raised", or "deadline" where it did not return in time.
+    """
+
+    def __init__(self, message: str = "", kind: str = "raised") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
 class ContractError(Error, TypeError):
     """A plugged-in model, policy or metric broke its contract (wrong shape, dtype, count, or NaN).
 
-    `kind` names a breach of a world model: "type", "dtype", "nan", "shape" or "frames" (another number of them).
+    `kind` names a breach of a world model: "type", "dtype", "nan", "shape", "frames" (another number of them),
+    "frame 0" (not the observation), "channels" (BGR), "scale" (0 to 1 cast to uint8) or "memory".
     """
 
     def __init__(self, message: str = "", kind: str = "contract") -> None:

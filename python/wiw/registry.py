@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One small registry: a kind of thing is found by name in its own folder of `wiw`, by entry point, or by path.
 
-wiw.world_model("warp")                  python/wiw/world_models/warp/   (its class is named in `BUILT_IN`)
+wiw.world_model("warp")                  python/wiw/world_models/warp.py  (its class is named in `WORLD_MODELS`)
 wiw.world_model("remote:ws://HOST:1234") what follows the name is its first argument, for those that end with a colon
 wiw.world_model("mine")                  entry point group "wiw.world_models"
 wiw.world_model("model.py:MyModel")      a class in a file
@@ -25,7 +25,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import RegistryError
+from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
 from wiw.suggestions import did_you_mean
 
 
@@ -75,9 +75,10 @@ class Registry:
 
         Raises:
             RegistryError: see `find`; also when the options do not fit the constructor.
+            ConstructionError: the constructor raised something else than an error of wiw (the cause).
         """
         found = self.fitting(what, **options)
-        return self._checked(what, found(**options) if _makes(found) else found)
+        return self._checked(what, self._construct(what, found, options) if _makes(found) else found)
 
     def fitting(self, what: Any, **options: Any) -> Any:
         """What `make` would call with these options, or the instance that it would return.
@@ -95,13 +96,26 @@ class Registry:
             raise RegistryError(f"options {sorted(options)} cannot be applied to a ready-made {self.kind}")
         return found
 
+    def _construct(self, what: Any, factory: Callable[..., Any], options: dict[str, Any]) -> Any:
+        try:
+            return factory(**options)
+        except BaseException as error:
+            if isinstance(error, Error) or asks_to_stop(error):
+                raise
+            name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
+            raise ConstructionError(
+                f"{self.kind} '{name}' cannot be made: {type(error).__name__}: {error}{_where(error)}"
+            ) from error
+
     def _plugins(self) -> dict[str, Any]:
         return {point.name: point for point in entry_points(group=self.group)} if self.group else {}
 
     def _load(self, name: str, load: Callable[[], Any]) -> Any:
         try:
             found = load()
-        except Exception as error:
+        except BaseException as error:  # SystemExit too: a module must not end the process that imports it
+            if asks_to_stop(error):
+                raise
             raise RegistryError(
                 f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
             ) from error
@@ -172,27 +186,27 @@ WORLD_MODELS = Registry(
         "copy": "wiw.world_models.copy:Copy",
         "warp": "wiw.world_models.warp:Warp",
         "oracle": "wiw.world_models.oracle:Oracle",
-        "svd": "wiw.world_models.svd:SVD",
-        "ltx": "wiw.world_models.ltx:LTX",
-        "hunyuan": "wiw.world_models.hunyuan:Hunyuan",
-        "wan2.1": "wiw.world_models.wan2_1:Wan21",
-        "wan2.2-5b": "wiw.world_models.wan2_2_5b:Wan22Small",
-        "wan2.2-a14b": "wiw.world_models.wan2_2_a14b:Wan22",
-        "cosmos-predict2": "wiw.world_models.cosmos_predict2:CosmosPredict2",
-        "sana-wm": "wiw.world_models.sana_wm:SanaWM",
-        "runway-gen4": "wiw.world_models.runway_gen4:RunwayGen4",
-        "nwm": "wiw.world_models.nwm:NWM",
-        "pathdreamer": "wiw.world_models.pathdreamer:PathDreamer",
-        "se3ds": "wiw.world_models.se3ds:SE3DS",
-        "svd-action": "wiw.world_models.actions.variants:SVDAction",
-        "ltx-action": "wiw.world_models.actions.variants:LTXAction",
-        "wan2.1-action": "wiw.world_models.actions.variants:Wan21Action",
-        "wan2.2-5b-action": "wiw.world_models.actions.variants:Wan22SmallAction",
-        "wan2.2-a14b-action": "wiw.world_models.actions.variants:Wan22Action",
-        "cosmos-predict2-action": "wiw.world_models.actions.variants:CosmosPredict2Action",
-        "warpnet": "wiw.world_models.warpnet:WarpNet",
-        "armnet": "wiw.world_models.armnet:ArmNet",
-        "remote:": "wiw.world_models.remote:Remote",
+        "svd": "wiw.world_models.video.svd:SVD",
+        "ltx": "wiw.world_models.video.ltx:LTX",
+        "hunyuan": "wiw.world_models.video.hunyuan:Hunyuan",
+        "wan2.1": "wiw.world_models.video.wan:Wan21",
+        "wan2.2-5b": "wiw.world_models.video.wan:Wan22Small",
+        "wan2.2-a14b": "wiw.world_models.video.wan:Wan22",
+        "cosmos-predict2": "wiw.world_models.video.cosmos:CosmosPredict2",
+        "sana-wm": "wiw.world_models.video.sana:SanaWM",
+        "runway-gen4": "wiw.world_models.runway_gen4.model:RunwayGen4",
+        "nwm": "wiw.world_models.nwm.model:NWM",
+        "pathdreamer": "wiw.world_models.panoramic.pathdreamer:PathDreamer",
+        "se3ds": "wiw.world_models.panoramic.se3ds:SE3DS",
+        "svd-action": "wiw.world_models.video.actions.variants:SVDAction",
+        "ltx-action": "wiw.world_models.video.actions.variants:LTXAction",
+        "wan2.1-action": "wiw.world_models.video.actions.variants:Wan21Action",
+        "wan2.2-5b-action": "wiw.world_models.video.actions.variants:Wan22SmallAction",
+        "wan2.2-a14b-action": "wiw.world_models.video.actions.variants:Wan22Action",
+        "cosmos-predict2-action": "wiw.world_models.video.actions.variants:CosmosPredict2Action",
+        "warpnet": "wiw.world_models.warpnet.model:WarpNet",
+        "armnet": "wiw.world_models.armnet.model:ArmNet",
+        "remote:": "wiw.world_models.remote.model:Remote",
     },
     "wiw.world_models.base:WorldModel",
 )

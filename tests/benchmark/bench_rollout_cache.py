@@ -37,6 +37,7 @@ class Generator(wiw.WorldModel):
     """A video generator in all but its frames: 14 of 480x480, one batch a call."""
 
     accepts = wiw.accepts(control="trajectory", view="perspective", size=(480, 480), frames=14, cacheable=True)
+    version = "1"
     calls: ClassVar[int] = 0
 
     def rollout(self, observations, controls, seeds):
@@ -48,6 +49,7 @@ class Panoramas(wiw.WorldModel):
     """The same for panoramas of any length."""
 
     accepts = wiw.accepts(control="trajectory", causal=True, cacheable=True)
+    version = "1"
 
     def rollout(self, observations, controls, seeds):
         Generator.calls += 1

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import pickle
 import shutil
@@ -14,9 +15,9 @@ import pytest
 import wiw
 from wiw import action
 from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, DeviceMemoryError, WeightsError
+from wiw.errors import ArgumentError, DeviceMemoryError, RegistryError, WeightsError
 from wiw.types import Conditioning, Control
-from wiw.world_models.actions.config import ActionConfig
+from wiw.world_models.video.actions.config import ActionConfig
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
@@ -24,10 +25,9 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 import torch
 from test_loop_poses import asked, plan_of
 
-from wiw.world_models.actions import checkpoint
-from wiw.world_models.actions.encoder import HIDDEN, ActionEncoder
-from wiw.world_models.actions.injection import Injection
-from wiw.world_models.actions.model import PANORAMA
+from wiw.world_models.video.actions import checkpoint
+from wiw.world_models.video.actions.encoder import HIDDEN, ActionEncoder
+from wiw.world_models.video.actions.injection import Injection
 
 NAMES = [
     "svd-action",
@@ -58,13 +58,13 @@ def made(world_model_options):
 
 
 def control(model, plan) -> Control:
-    padded = action.pad(plan, model.frames - 1)
+    padded = action.pad(plan, model.accepts.frames - 1)
     views = action.to_trajectory(padded), action.to_viewpoints(padded)
     return Control(padded, *views, ids=action.with_null(padded), length=len(plan))
 
 
 def rollout(model, *plans, seed: int = 7):
-    image = np.random.default_rng(0).integers(0, 256, (1, *model.size, 3), np.uint8).repeat(len(plans), 0)
+    image = np.random.default_rng(0).integers(0, 256, (1, *model.accepts.size, 3), np.uint8).repeat(len(plans), 0)
     controls = [control(model, plan) for plan in plans]
     return model.rollout(Conditioning(image), controls, np.full(len(plans), seed, np.uint64)).astype(int)
 
@@ -120,7 +120,7 @@ def test_what_does_not_fit_the_encoder_is_named() -> None:
         config(kind="pose7", low=(0, 0, 0), high=(1, 0, 1))
     with pytest.raises(ArgumentError, match="in some order"):
         config(vocabulary=("null", "go"))
-    with pytest.raises(ArgumentError, match="no way is known to tell a Linear"):
+    with pytest.raises(ArgumentError, match="a Linear cannot be conditioned on actions"):
         Injection(torch.nn.Linear(1, 1))
 
 
@@ -134,22 +134,18 @@ def test_actions_steer_and_leave_no_trace(name: str, made) -> None:
     model = made(name, steps=2)
     left, right = rollout(model, [TURN_LEFT] * 2), rollout(model, [TURN_RIGHT] * 2)
     assert np.abs(left - right).mean() > 0.02
-    for encoder in model._encoders.values():
+    for encoder in model.conditioning.encoders.values():
         torch.nn.init.zeros_(encoder.mlp[-1].weight)
         torch.nn.init.zeros_(encoder.mlp[-1].bias)
     untrained = rollout(model, [TURN_LEFT] * 2)
     assert np.abs(left - untrained).mean() > 0.02
-    for injection in model._injections.values():
+    for injection in model.conditioning.injections.values():
         injection.remove()
     stock = rollout(model, [TURN_LEFT] * 2)
     assert np.abs(stock - untrained).max() <= 1  # the time goes token by token where it went in one piece
     np.testing.assert_array_equal(stock, rollout(model, [TURN_RIGHT] * 2))
-    base = type(model).__mro__[2]
-    options = {"checkpoint", "weights", "device", "steps", "size", "frames", "guidance"} & set(vars(model))
     if not model._lora:  # the trained denoiser is the stock one here, so the stock world model gives the same clip
-        stock_options = {key: getattr(model, key) for key in options - {"checkpoint"}}
-        guard = {"guardrail": False} if "cosmos" in name else {}
-        again = rollout(base(**stock_options, **guard), [TURN_LEFT] * 2)
+        again = rollout(type(model.generator)(**model.generator.options), [TURN_LEFT] * 2)
         np.testing.assert_array_equal(again[:, -1], stock[:, -1])
 
 
@@ -169,10 +165,10 @@ def test_layers_may_be_moved_in_and_out_while_told(name: str, made) -> None:
 
     model = made(name)
     frames = rollout(model, [FORWARD, TURN_LEFT])
-    for network in model._pipeline.components.values():
+    for network in model.generator.pipeline.components.values():
         if isinstance(network, torch.nn.Module):
             cpu_offload(network, torch.device("cpu"), offload_buffers=len(network._parameters) > 0)
-    assert getattr(model._pipeline, model.denoisers[0]).device.type == "meta"
+    assert getattr(model.generator.pipeline, model.denoisers[0]).device.type == "meta"
     for _ in range(2):
         np.testing.assert_array_equal(rollout(model, [FORWARD, TURN_LEFT]), frames)
 
@@ -181,7 +177,9 @@ def test_layers_may_be_moved_in_and_out_while_told(name: str, made) -> None:
 def test_checkpoints_come_back_as_they_went(name: str, made, tmp_path: Path) -> None:
     model = made(name)
     frames = rollout(model, [FORWARD, TURN_LEFT])
-    written = checkpoint.save(tmp_path / "again", model._encoders, model._pipeline, lora=model._lora)
+    written = checkpoint.save(
+        tmp_path / "again", model.conditioning.encoders, model.generator.pipeline, lora=model._lora
+    )
     assert (written / "pytorch_lora_weights.safetensors").is_file() == model._lora
     assert json.loads((written / "config.json").read_text())["base"] == model.base
     again = made(name, checkpoint=str(written))
@@ -204,7 +202,7 @@ def test_both_experts_and_their_lora_count(made, tmp_path: Path) -> None:
             tensors, metadata = {key: opened.get_tensor(key) * 3 for key in opened.keys()}, opened.metadata()  # noqa: SIM118
         save_file(tensors, other / file, metadata)
         assert np.abs(rollout(made("wan2.2-a14b-action", checkpoint=str(other)), [FORWARD]) - whole).max() > 1
-    for place, encoder in model._encoders.items():
+    for place, encoder in model.conditioning.encoders.items():
         kept = encoder.mlp[-1].weight.clone()
         encoder.mlp[-1].weight.zero_()
         assert np.abs(rollout(model, [FORWARD]) - whole).max() > 1, place
@@ -223,15 +221,16 @@ def test_poses_steer_a_front_view(made, world_model_options, tmp_path: Path) -> 
     assert (model.accepts.space, model.accepts.view, model.accepts.null_first) == ("pose7", "perspective", False)
 
     def told(height: float):
-        poses = np.tile([0.2, 0, height, 0, 0, 0, 1.0], (model.frames, 1))
-        row = Control(np.zeros(model.frames - 1, np.int8), np.zeros((2, 3)), np.zeros((2, 4, 4)), ids=poses)
+        poses = np.tile([0.2, 0, height, 0, 0, 0, 1.0], (model.accepts.frames, 1))
+        row = Control(np.zeros(model.accepts.frames - 1, np.int8), np.zeros((2, 3)), np.zeros((2, 4, 4)), ids=poses)
         image = np.full((1, 64, 64, 3), 90, np.uint8)
         return model.rollout(Conditioning(image), [row], np.array([1], np.uint64)).astype(int)
 
     assert np.abs(told(0.7) - told(1.5)).mean() > 0.02
-    assert options["frames"] == model.frames
-    usual = made("svd-action", checkpoint=str(folder), size=PANORAMA)
-    assert usual.size == usual.accepts.size == (448, 448) and pickle.loads(pickle.dumps(usual)).size == (448, 448)
+    assert options["frames"] == model.accepts.frames
+    usual = made("svd-action", checkpoint=str(folder), size=None)
+    assert usual.accepts.size == (448, 448) == pickle.loads(pickle.dumps(usual)).accepts.size
+    assert made("svd-action", checkpoint=str(folder), size=[576, 1024]).accepts.size == (576, 1024)
     (rollouts,) = asked(model, [plan_of(5, 0.3), plan_of(5, 0.7)]).rollouts
     assert [rollout.frames.shape for rollout in rollouts] == [(5, 48, 48, 3)] * 2
     assert np.abs(rollouts[0].frames.astype(int) - rollouts[1].frames).mean() > 0.02
@@ -279,7 +278,7 @@ def test_checkpoints_that_do_not_fit_are_named(made, world_model_options, tmp_pa
 def test_a_lora_of_a_pipeline_that_takes_none_is_refused(name: str, made, tmp_path: Path) -> None:
     model = made(name)
     with pytest.raises(ArgumentError, match="takes no LoRA: write its denoiser whole"):
-        checkpoint.save(tmp_path / "lora", model._encoders, model._pipeline, lora=True)
+        checkpoint.save(tmp_path / "lora", model.conditioning.encoders, model.generator.pipeline, lora=True)
     folder = shutil.copytree(model.checkpoint, tmp_path / "checkpoint")
     (folder / "pytorch_lora_weights.safetensors").write_bytes(b"of another trainer")
     rollout(made(name, checkpoint=str(folder)), [FORWARD])  # its whole denoiser counts
@@ -307,6 +306,35 @@ def test_where_a_checkpoint_lies_does_not_count(made, tmp_path: Path) -> None:
     assert made("svd-action", checkpoint=str(elsewhere)).fingerprint() != model.fingerprint()
 
 
+def test_the_versions_of_generator_and_conditioning_count(made, monkeypatch) -> None:
+    model = made("svd-action")
+    before = model.fingerprint()
+    for part in (type(model), type(model.generator)):
+        with monkeypatch.context() as patch:
+            patch.setattr(part, "version", "2")
+            assert model.fingerprint() != before, part
+    assert before and model.fingerprint() == before
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_options_are_those_of_the_generator_and_a_checkpoint(name: str, made) -> None:
+    model = wiw.registry.WORLD_MODELS.find(name)
+    options = inspect.signature(model).parameters
+    assert list(options) == ["checkpoint", *inspect.signature(model.generator_class).parameters]
+    assert options["checkpoint"].default is inspect.Parameter.empty and options["weights"].default == ""
+    assert options["frames"].default == model.accepts.frames
+    assert options["guidance"].default == (3.0 if name == "svd-action" else 1.0)
+    with pytest.raises(RegistryError, match=r"it takes .*checkpoint.*steps"):
+        made(name, speed=3)
+
+
+def test_a_description_is_the_generators_under_its_own_name(made) -> None:
+    model = made("ltx-action")
+    stock = {**model.generator.describe(), "name": "LTXAction", "checkpoint": model.checkpoint}
+    assert {**stock, "checkpoint_digest": model.describe()["checkpoint_digest"]} == model.describe()
+    assert model.describe()["pipeline"] == "LTXImageToVideoPipeline" and model.describe()["guidance"] == 1.0
+
+
 def test_a_lora_that_does_not_fit_on_the_gpu_is_answered_with_what_needs_less(made, monkeypatch) -> None:
     def full(*_, **__):
         raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
@@ -319,4 +347,4 @@ def test_a_lora_that_does_not_fit_on_the_gpu_is_answered_with_what_needs_less(ma
 def test_the_base_is_what_the_checkpoint_names(made, world_model_options) -> None:
     options = world_model_options("wan2.1-action")
     model = made("wan2.1-action", weights="")
-    assert model.weights == options["weights"]
+    assert model.describe()["weights"] == options["weights"]

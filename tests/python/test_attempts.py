@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import gc
 import pickle
+import re
 import threading
 import time
 
@@ -13,10 +14,11 @@ import pytest
 
 import wiw
 from wiw.action import FORWARD
-from wiw.errors import ArgumentError, RolloutError
+from wiw.errors import ArgumentError, ConstructionError, RolloutError
 from wiw.loop import attempts
-from wiw.loop.attempts import TRIES, Attempts
+from wiw.loop.attempts import TRIES, Attempts, make_model
 from wiw.types import Conditioning, Control
+from wiw.world_models.base import Requirements
 
 SEEDS = np.zeros(2, np.uint64)
 OBSERVATIONS = Conditioning(np.full((2, 8, 16, 3), 7, np.uint8))
@@ -156,3 +158,86 @@ def test_torch_finds_the_state_of_the_thread_that_asks() -> None:
         ask(model)
     ask(model)
     assert seen == [(False, False), (False, True), (True, False)]
+
+
+class Leaving(BaseException):
+    """What a library may use to leave all handlers of `Exception` behind."""
+
+
+@pytest.mark.parametrize("deadline", [5.0, float("inf")])
+@pytest.mark.parametrize("stop", [SystemExit(0), GeneratorExit(), Leaving("enough")], ids=repr)
+def test_a_model_ends_no_process(stop, deadline) -> None:
+    model = Scripted(stop)
+    with pytest.raises(RolloutError, match=re.escape(repr(stop))) as caught:
+        ask(model, deadline)
+    assert caught.value.kind == "raised" and model.calls == TRIES
+
+
+def test_ctrl_c_is_no_error_of_the_model() -> None:
+    model = Scripted(KeyboardInterrupt())
+    with pytest.raises(KeyboardInterrupt):
+        ask(model, float("inf"))
+    assert model.calls == 1
+
+
+class Slow(Scripted):
+    """Its constructor waits for what never comes."""
+
+    def __init__(self) -> None:
+        threading.Event().wait()
+
+
+class Fetching(Scripted):
+    """Like one that fetches weights, longer than the deadline of a call."""
+
+    requires = Requirements(weights="somebody/network")
+
+    def __init__(self) -> None:
+        super().__init__(GOOD)
+        time.sleep(0.2)
+
+
+class Wrong(Scripted):
+    def __init__(self, error) -> None:
+        raise error
+
+
+def test_a_constructor_is_held_to_the_deadline_and_its_errors_have_a_type(two_rooms) -> None:
+    with pytest.raises(ConstructionError, match=r"'Slow' cannot be made.*within 0\.1 s") as caught:
+        make_model(Slow, 0.1)
+    assert caught.value.kind == "deadline"
+    with pytest.raises(ConstructionError, match=r"within 0\.1 s"):
+        wiw.Agent("matcher", Slow, deadline=0.1)
+    assert isinstance(make_model(Fetching, 0.05), Fetching)
+    for error in (OSError("no weights"), SystemExit(3)):
+        with pytest.raises(ConstructionError, match=r"cannot be made: (OSError: no weights|SystemExit: 3)") as caught:
+            make_model(Wrong, 5, error=error)
+        assert caught.value.kind == "raised" and caught.value.__cause__ is error
+    with pytest.raises(ArgumentError, match="mine"):
+        make_model(Wrong, 5, error=ArgumentError("mine"))
+    with pytest.raises(KeyboardInterrupt):
+        wiw.world_model(Wrong, error=KeyboardInterrupt())
+
+
+class Threaded(Scripted):
+    """Starts a thread in its constructor and in each call, as samplers and loaders do."""
+
+    def __init__(self) -> None:
+        super().__init__(GOOD)
+        self.ended, self.started = threading.Event(), []
+        self.start()
+
+    def start(self) -> None:
+        self.started.append(threading.Thread(target=self.ended.wait))
+        self.started[-1].start()
+
+    def rollout(self, observations, controls, seeds):
+        self.start()
+        return super().rollout(observations, controls, seeds)
+
+
+def test_threads_of_a_model_do_not_keep_the_process_alive() -> None:
+    model = make_model(Threaded, 5.0)
+    ask(model)
+    assert len(model.started) == 2 and all(thread.daemon for thread in model.started)
+    model.ended.set()

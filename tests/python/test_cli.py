@@ -249,6 +249,69 @@ def test_errors_are_one_clean_line(tmp_path, capsys):
     assert "wiw resume" in capsys.readouterr().err
 
 
+def test_a_run_that_could_not_begin_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
+    """The server wants another token: once it has the right one, the same command begins the run."""
+    from wiw.serving.background import served
+
+    monkeypatch.delenv("WIW_TOKEN", raising=False)
+    with served("copy", token="right") as server:
+        asked = ["--revision", "matcher", "--world-model", f"remote:{server.address}", "--episodes", 1]
+        asked += ["--no-report", "--out", tmp_path / "run"]
+        for token in (None, "wrong"):
+            if token is not None:
+                monkeypatch.setenv("WIW_TOKEN", token)
+            assert run(*asked) == 2
+            assert "wants another token" in capsys.readouterr().err
+            assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_stops_after_it_recorded_something_stays(tmp_path):
+    (tmp_path / "bad.py").write_text(
+        "import wiw\n"
+        "class Bad(wiw.policies.base.Policy):\n"
+        "    def propose(self, situations, candidates, horizon):\n"
+        "        return None if situations[0].key.decision else "
+        "[[wiw.types.Proposal(__import__('numpy').ones(3, 'int8'))]] * len(situations)\n"
+        "    def score(self, situations, proposals, rollouts):\n"
+        "        return [[0.0]] * len(situations)\n"
+    )
+    assert main(["run", TASK, "--policy", f"{tmp_path / 'bad.py'}:Bad", "--out", str(tmp_path / "run")]) == 2
+    assert (tmp_path / "run/run.sqlite").exists()
+
+
+def test_errors_bring_no_escape_sequences_to_the_terminal(tmp_path, capsys):
+    assert main(["report", f"{tmp_path}/\x1b[31mred\x1b]0;title\x07\x9b2J\x1b(B\rover\x08"]) == 2
+    shown = capsys.readouterr().err
+    assert f"no run at {tmp_path}/redover/run.sqlite" in shown
+    assert not set(shown) & {chr(code) for code in (*range(10), *range(11, 32), *range(127, 160))}
+
+
+GONE = """
+import sys
+sys.path.insert(0, {here!r})
+from fakes import LineEnv, LineTask
+
+class Env(LineEnv):
+    def begin(self, episode):
+        raise OSError("\\x1b[31mgone")
+
+class Gone(LineTask):
+    def environment(self, depth=False):
+        return Env(self)
+
+def task(scenes="", seed=0, preset="", backend="", **rules):
+    return Gone(seed=seed)
+"""
+
+
+def test_causes_of_failed_episodes_bring_no_escape_sequences(tmp_path, capsys):
+    (tmp_path / "gone.py").write_text(GONE.format(here=str(FAKES.parent)))
+    command = ["run", f"{tmp_path / 'gone.py'}:task", "--policy", "heuristic", "--episodes", "2", "--no-report"]
+    assert main([*command, "--out", str(tmp_path / "run")]) == 1
+    shown = capsys.readouterr().err
+    assert "OSError: gone" in shown and "\x1b" not in shown
+
+
 def test_debug_shows_the_traceback(tmp_path):
     with pytest.raises(Exception, match="no run at"):
         main(["report", str(tmp_path), "--debug"])
@@ -345,3 +408,53 @@ def test_each_task_names_the_policy_that_runs_it():
     assert {default_policy(name) for name in named} <= set(POLICIES.names())
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
+
+
+LEAVING = """
+import sys
+import threading
+
+import wiw
+
+
+class Quits(wiw.WorldModel):
+    accepts = wiw.accepts(control="image", size=(48, 96))
+
+    def rollout(self, observations, controls, seeds):
+        sys.exit(0)
+
+
+class Unmade(Quits):
+    def __init__(self):
+        sys.exit(0)
+
+
+class Endless(Quits):
+    def __init__(self):
+        threading.Event().wait()
+"""
+
+
+def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, capsys, monkeypatch):
+    monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
+    file = tmp_path / "leaving.py"
+    file.write_text(LEAVING)
+    command = ["run", "imagenav", "--scenes", two_rooms, "--preset", str(short), "--episodes", "1"]
+
+    def ends(model, *more):
+        out = tmp_path / model
+        code = main([*command, "--world-model", f"{file}:{model}", "--out", str(out), "--no-report", *more])
+        return code, capsys.readouterr().err
+
+    code, said = ends("Quits")
+    assert code == 1 and "1 episode failed for infrastructure" in said and "SystemExit(0)" in said
+    code, said = ends("Unmade")
+    assert code == 2 and "cannot be made: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
+    code, said = ends("Endless", "--deadline", "0.2")
+    assert code == 2 and "did not return within 0.2 s" in said and "Traceback" not in said
+    for model, kind in (("Quits", "raised"), ("Unmade", "raised"), ("Endless", "deadline")):
+        assert main(["check-model", f"{file}:{model}", "--scenes", two_rooms, "--deadline", "5"]) == 1
+        assert kind in capsys.readouterr().out
+    file.write_text("import sys\nsys.exit(0)\n")
+    code, said = ends("Quits", "--seed", "1")
+    assert code == 2 and "cannot be loaded: SystemExit: 0 (leaving.py, line 2)" in said

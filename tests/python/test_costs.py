@@ -22,6 +22,7 @@ class Counted(wiw.WorldModel):
     """Repeats the observation; fails once; counts what reaches it over all instances."""
 
     accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective", best_batch=3)
+    version = "1"
     calls: ClassVar[int] = 0
     rows: ClassVar[int] = 0
 

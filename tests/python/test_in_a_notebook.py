@@ -14,6 +14,7 @@ from wiw.runs.recipes import TaskRecipe
 
 class Mine(wiw.WorldModel):
     accepts = wiw.accepts(control="trajectory", size=(48, 96), cacheable=True)
+    version = "1"
 
     def rollout(self, observations, controls, seeds):
         frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
@@ -51,10 +52,12 @@ def printed(tmp_path):
     return run
 
 
-def test_a_class_of_a_cell_is_named_by_its_code_evaluated_and_kept_from_worker_processes(printed, tmp_path, two_rooms):
+def test_a_class_of_a_cell_is_named_by_its_version_evaluated_and_kept_from_worker_processes(
+    printed, tmp_path, two_rooms
+):
     run = RUN.format(scene=two_rooms, out=str(tmp_path / "run"))
     workers = WORKERS.format(out=str(tmp_path / "workers"))
-    said = printed(MODEL, TOLD, MODEL.replace("//= 2", "//= 3"), TOLD, MODEL, TOLD, run, workers)
+    said = printed(MODEL, TOLD, MODEL.replace('"1"', '"2"'), TOLD, MODEL, TOLD, run, workers)
     first, edited, again = said[1], said[3], said[5]
     assert first == again != edited and len(first) == 40
     ended, arms = ast.literal_eval(said[6])

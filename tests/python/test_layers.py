@@ -22,6 +22,7 @@ FACES = {
     "errors",
     "files",
     "gymnasium_ids",
+    "json_text",
     "registry",
     "suggestions",
     "networks",

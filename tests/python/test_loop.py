@@ -52,9 +52,10 @@ class Stamp(wiw.WorldModel):
 
     def rollout(self, observations, controls, seeds):
         frames = np.zeros((len(controls), len(controls[0].actions) + 1, 576, 1024, 3), np.uint8)
+        frames[:, 0] = observations.image
         for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
             for k in range(len(control.actions)):
-                frames[row, k + 1] = 1 + int(seed) % 200 if k == control.length - 1 else 0
+                frames[row, k + 1] = 2 + int(seed) % 200 if k == control.length - 1 else 0
         return frames
 
 
@@ -149,6 +150,14 @@ def test_a_decision_keeps_its_evidence(task: ImageNav) -> None:
 def test_without_a_model_the_policy_takes_its_own_best(task: ImageNav) -> None:
     decision = run(task, wiw.Agent(Greedy()), count=1).decisions[0, 0].decision
     assert decision.rollouts is None and decision.chosen == 0
+
+
+def test_an_observation_without_the_depth_that_is_needed_is_named(task: ImageNav) -> None:
+    env = task.environment()
+    observation, info = env.reset()
+    for agent in (wiw.Agent("matcher"), wiw.Agent("heuristic", "warp", revision="matcher")):
+        with pytest.raises(ArgumentError, match="make the environment with depth=True"):
+            agent.decide(observation, env.goal, key=info["key"])
 
 
 def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) -> None:

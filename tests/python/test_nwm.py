@@ -24,10 +24,10 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 import torch
 
 from tiny_nwm import TINY, TinyNWM, randomised
-from wiw.world_models.nwm import NWM
 from wiw.world_models.nwm.cdit import SIZES, Architecture, Block, CDiT, MotionEmbedder, NumberEmbedder
 from wiw.world_models.nwm.diffusion import sample, scheduler
 from wiw.world_models.nwm.images import rows_seen, to_frames, to_network
+from wiw.world_models.nwm.model import NWM
 
 
 @pytest.fixture(scope="module")

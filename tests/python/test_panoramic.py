@@ -185,7 +185,7 @@ def test_unknown_categories_are_refused(pathdreamer: Served) -> None:
 
 
 def test_another_model_no_server_and_a_wrong_token_are_told_plainly(official: Path, se3ds: Served) -> None:
-    address = se3ds._given[0]
+    address = se3ds._arguments[0]
     with pytest.raises(RemoteError, match="serves SE3DS, not PathDreamer") as caught:
         wiw.world_model("pathdreamer", address=address)
     assert caught.value.kind == "model"
@@ -202,7 +202,7 @@ def test_another_model_no_server_and_a_wrong_token_are_told_plainly(official: Pa
 
 
 def test_pages_of_browsers_are_refused(se3ds: Served) -> None:
-    with pytest.raises(InvalidStatus), connect(se3ds._given[0], origin="http://example.com"):
+    with pytest.raises(InvalidStatus), connect(se3ds._arguments[0], origin="http://example.com"):
         pass
 
 
@@ -252,7 +252,7 @@ BAD_ROWS: dict[str, Callable[[], bytes]] = {
 
 @pytest.mark.parametrize("name", BAD_ROWS)
 def test_bad_rows_are_refused_and_the_server_goes_on(name: str, se3ds: Served) -> None:
-    said, _ = dialogue(se3ds._given[0], ask(BAD_ROWS[name]()))
+    said, _ = dialogue(se3ds._arguments[0], ask(BAD_ROWS[name]()))
     assert isinstance(said, Refusal) and said.id and said.kind in ("row", "message")
 
 
@@ -273,7 +273,7 @@ BAD_MESSAGES: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("name", BAD_MESSAGES)
 def test_malformed_messages_end_their_connection(name: str, se3ds: Served) -> None:
-    said, client = dialogue(se3ds._given[0], BAD_MESSAGES[name]())
+    said, client = dialogue(se3ds._arguments[0], BAD_MESSAGES[name]())
     assert isinstance(said, Refusal) and not said.id and said.kind in ("message", "version")
     with pytest.raises(ConnectionClosed):
         client.recv(timeout=5)

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 import wiw
 from wiw.action import FORWARD
 from wiw.tasks.imagenav import ImageNav
-from wiw.world_models.panoramic import memory
-from wiw.world_models.panoramic.memory import Memory, Sight
+from wiw.world_models.panoramic.server import memory
+from wiw.world_models.panoramic.server.memory import Memory, Sight
 
 SCALE = 10.0
 SIZE = (16, 32)
@@ -64,7 +64,7 @@ def test_the_splat_is_its_twin(seed: int, stood: tuple, position: tuple) -> None
     remembered = Memory(SCALE)
     for colours, depth, place in views:
         remembered.add(colours, depth, place)
-    found, expected = remembered.seen_from(position, SIZE), twin(views, position, SIZE)
+    found, expected = remembered.view_from(position, SIZE), twin(views, position, SIZE)
     off = (found.features != expected.features).any(-1) | (found.seen != expected.seen)
     assert off.mean() <= 0.02  # points on the border of two pixels
     np.testing.assert_allclose(found.depth[~off], expected.depth[~off], atol=1e-5)
@@ -75,7 +75,7 @@ def test_from_its_own_place_a_panorama_is_as_it_was(seed: int, place: tuple) -> 
     colours, depth = panorama(seed)
     remembered = Memory(SCALE)
     remembered.add(colours, depth, place)
-    found = remembered.seen_from(place, SIZE)
+    found = remembered.view_from(place, SIZE)
     known = (depth > 0) & (depth < 1)
     np.testing.assert_array_equal(found.seen, known)
     np.testing.assert_array_equal(found.features, np.where(known[..., None], colours, 0))
@@ -89,7 +89,7 @@ def test_the_nearer_of_two_is_seen(near: float, far: float, near_first: bool) ->
     both = [(np.full(SIZE, 7, np.uint8), near), (np.full(SIZE, 9, np.uint8), far)]
     for labels, share in both if near_first else both[::-1]:
         remembered.add(labels, np.full(SIZE, share, np.float32), (0, 0, 0))
-    found = remembered.seen_from((0, 0, 0), SIZE)
+    found = remembered.view_from((0, 0, 0), SIZE)
     assert (found.features == 7).all() and found.seen.all()
     np.testing.assert_allclose(found.depth, near, atol=1e-6)
 
@@ -100,7 +100,7 @@ def test_what_lies_ahead_comes_nearer_by_the_step(distance: float, step: float) 
     colours[7, 15], depth[7, 15] = 200, distance / SCALE
     remembered = Memory(SCALE)
     remembered.add(colours, depth, (0, 0, 0))
-    found = remembered.seen_from((0, step, 0), (15, 31))
+    found = remembered.view_from((0, step, 0), (15, 31))
     assert found.features[7, 15] == 200 and found.seen.sum() == 1
     assert found.depth[7, 15] * SCALE == pytest.approx(distance - step, abs=1e-5)
 
@@ -118,7 +118,7 @@ def test_only_what_is_to_be_kept_is_remembered() -> None:
     keep[memory.sharp_rows(SIZE[0])] = True
     remembered = Memory(SCALE)
     remembered.add(colours, np.full(SIZE, 0.5, np.float32), (0, 0, 0), keep)
-    seen = remembered.seen_from((0, 0, 0), SIZE).seen
+    seen = remembered.view_from((0, 0, 0), SIZE).seen
     assert not seen[:2].any() and not seen[15:].any() and seen[2:15].all()
     assert memory.sharp_rows(512) == slice(64, 449)
 
@@ -127,22 +127,22 @@ def test_only_what_is_to_be_kept_is_remembered() -> None:
 def test_resizing_keeps_what_is_constant_and_labels_stay_labels(seed: int) -> None:
     colours, depth = panorama(seed, (18, 32))
     flat = np.full((18, 32, 3), 77, np.uint8)
-    np.testing.assert_array_equal(memory.smooth(flat, (16, 24)), 77)
-    assert set(np.unique(memory.nearest(depth, (16, 24)))) <= set(np.unique(depth))
-    np.testing.assert_array_equal(memory.nearest(colours, (18, 32)), colours)
-    np.testing.assert_array_equal(memory.smooth(colours, (18, 32)), colours)
+    np.testing.assert_array_equal(memory.resize_smooth(flat, (16, 24)), 77)
+    assert set(np.unique(memory.resize_nearest(depth, (16, 24)))) <= set(np.unique(depth))
+    np.testing.assert_array_equal(memory.resize_nearest(colours, (18, 32)), colours)
+    np.testing.assert_array_equal(memory.resize_smooth(colours, (18, 32)), colours)
 
 
 def test_viewpoints_of_plans_are_places_and_turns() -> None:
     for yaw in np.radians([0, 22.5, -90, 180]):
         cos, sin = np.cos(yaw), np.sin(yaw)
         pose = np.array([[cos, 0, sin, 0.3], [0, 1, 0, 0.1], [-sin, 0, cos, -2], [0, 0, 0, 1]])
-        position, found = memory.placed(pose)
+        position, found = memory.locate_camera(pose)
         assert position == (0.3, 2, 0.1) and math.isclose(math.cos(found - yaw), 1)
     image = np.random.default_rng(0).integers(0, 256, (4, 32, 3), np.uint8)
-    np.testing.assert_array_equal(memory.turned(image, np.radians(22.5)), wiw.panorama.rotate(image, 22.5))
+    np.testing.assert_array_equal(memory.turn_panorama(image, np.radians(22.5)), wiw.panorama.rotate(image, 22.5))
     with pytest.raises(ValueError, match="upright"):
-        memory.placed(np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]))
+        memory.locate_camera(np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]]))
 
 
 def test_a_step_in_a_room_shows_what_the_simulator_does(two_rooms: str) -> None:
@@ -157,7 +157,7 @@ def test_a_step_in_a_room_shows_what_the_simulator_does(two_rooms: str) -> None:
     pose = np.linalg.inv(_pose(env.fork())) @ before[0]
     remembered = Memory(SCALE)
     remembered.add(observation.panorama, (observation.depth / SCALE).clip(0, 1), (0, 0, 0))
-    found = remembered.seen_from(memory.placed(pose)[0], (576, 1024))
+    found = remembered.view_from(memory.locate_camera(pose)[0], (576, 1024))
     close = found.seen & (np.abs(found.depth * SCALE - truth["depth"]) < 0.02 * truth["depth"])
     error = np.abs(found.features.astype(float) - truth["panorama"])[close]
     assert close.mean() > 0.5 and np.linalg.norm(pose[:3, 3]) > 0.1

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 import logging
-import sys
 import threading
 from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
@@ -19,6 +19,7 @@ from wiw.loop.attempts import Attempts
 from wiw.loop.rollout_cache import Remembered, RolloutCache, default_folder, remember
 from wiw.runs.recipes import TaskRecipe
 from wiw.types import Conditioning, Control
+from wiw.world_models.base import Accepts
 
 H, W = 8, 16
 
@@ -27,10 +28,11 @@ class Counting(wiw.WorldModel):
     """A small image in which everything that it was asked can be read; counts the rows of all instances."""
 
     accepts = wiw.accepts(control="trajectory", size=(H, W), causal=True, cacheable=True)
+    version = "1"
     rows: ClassVar[int] = 0
 
     def __init__(self, weights: float = 1.0) -> None:
-        self.weights = np.full(3, weights, np.float32)
+        self.weights = weights
 
     def rollout(self, observations, controls, seeds):
         Counting.rows += len(controls)
@@ -38,7 +40,7 @@ class Counting(wiw.WorldModel):
         for row, (control, seed) in enumerate(zip(controls, seeds, strict=True)):
             for k in range(frames.shape[1]):
                 said = int(observations.image[row, 0, 0, 0]) + 31 * int(seed) + 7 * control.actions[:k].sum()
-                frames[row, k] = (said * int(self.weights[0]) + 13 * k) % 256
+                frames[row, k] = (said * int(self.weights) + 13 * k) % 256
         return frames
 
 
@@ -196,46 +198,68 @@ def test_who_is_cached(tmp_path, monkeypatch) -> None:
     assert not isinstance(remember(Attempts(Counting()), "off"), Remembered)
 
 
-def test_a_model_whose_content_cannot_be_told_says_so(tmp_path) -> None:
-    model = Counting()
-    model.session = object()
-    with pytest.raises(ArgumentError, match=r"Counting\.session.*def fingerprint"):
-        make(tmp_path, model)
-    model.fingerprint = lambda: "mine"
-    make(tmp_path, model)
+def fingerprint_of(**changes) -> str:
+    """Of a model whose class, options or declaration differ in something."""
+    options = {name: changes.pop(name) for name in ("weights", "_hidden") if name in changes}
+    model = type("Counting", (Counting,), changes)()
+    vars(model).update(options)
+    return model.fingerprint()
 
 
-def test_networks_count_by_content() -> None:
-    torch = pytest.importorskip("torch")
-
-    def model(fill, dtype=torch.float32):
-        made = Counting()
-        made.net = torch.nn.Linear(2, 2)
-        torch.nn.init.constant_(made.net.weight, fill)
-        torch.nn.init.constant_(made.net.bias, 0)
-        made.net.to(dtype)
-        return made.fingerprint()
-
-    prints = [model(1), model(1), model(2), model(1, torch.bfloat16)]
-    assert prints[0] == prints[1] and len(set(prints)) == 3
+def test_a_version_and_public_options_name_what_is_kept() -> None:
+    plain = fingerprint_of()
+    assert len(plain) == 40 and plain == fingerprint_of() == fingerprint_of(_hidden=object())
+    others = [fingerprint_of(version="2"), fingerprint_of(weights=2.0), fingerprint_of(__qualname__="Other")]
+    assert len({plain, *others}) == 4
+    assert fingerprint_of(weights=2.0, immaterial=("weights",)) == fingerprint_of(weights=3.0, immaterial=("weights",))
 
 
-def test_an_instances_own_declaration_counts() -> None:
-    def declared(**changes):
-        made = Counting()
-        made.accepts = replace(made.accepts, **changes)
-        return made.fingerprint()
+@pytest.mark.parametrize("kind", [str, Path])
+def test_files_among_the_options_count_by_content(tmp_path, kind) -> None:
+    file = tmp_path / "weights.bin"
+    file.write_bytes(b"one")
+    first = fingerprint_of(weights=kind(file))
+    file.write_bytes(b"two")
+    assert first != fingerprint_of(weights=kind(file))
+    file.write_bytes(b"one")
+    assert first == fingerprint_of(weights=kind(file))
 
-    assert declared(frames=9) == declared(frames=9) != declared(frames=5)
+
+def test_a_model_without_a_version_is_never_cached_and_a_warning_names_it(tmp_path, caplog) -> None:
+    class Nameless(Counting):
+        version = ""
+
+    ask = Attempts(Nameless())
+    assert not ask.model.fingerprint()
+    with caplog.at_level(logging.WARNING, "wiw.rollouts"):
+        assert remember(ask, tmp_path / "x") is ask and remember(ask, "auto") is ask
+        assert remember(ask, "off") is ask
+    assert caplog.text.count("rollouts of Nameless are not cached: it declares no version") == 1
+    assert "version = '1'" in caplog.text and not (tmp_path / "x").exists()
 
 
-def test_what_needs_no_torch_has_one_name_with_and_without_it(monkeypatch) -> None:
-    torch = pytest.importorskip("torch")
-    there = Counting().fingerprint()
-    monkeypatch.setattr(torch, "get_float32_matmul_precision", lambda: "medium")
-    assert Counting().fingerprint() != there
-    monkeypatch.delitem(sys.modules, "torch")
-    assert Counting().fingerprint() == there
+def test_an_edited_file_is_another_model(tmp_path) -> None:
+    file = tmp_path / "logged.py"
+    file.write_text(MODEL)
+    before = wiw.world_model(f"{file}:Logged").fingerprint()
+    assert before == wiw.world_model(f"{file}:Logged").fingerprint()
+    file.write_text(MODEL.replace("251", "2510"))
+    assert before != wiw.world_model(f"{file}:Logged").fingerprint()
+
+
+@pytest.mark.parametrize("name", ["copy", "warp", "warpnet", "armnet"])
+def test_built_in_models_declare_a_version(name) -> None:
+    if name.endswith("net"):
+        pytest.importorskip("torch")
+    model = wiw.world_model(name)
+    assert model.version and model.fingerprint() == wiw.world_model(name).fingerprint() != ""
+
+
+def test_whatever_is_cacheable_declares_a_version() -> None:
+    for name in wiw.registry.list_world_models():
+        kind = wiw.registry.WORLD_MODELS.find(name) if not name.endswith(":") else None
+        if isinstance(kind, type) and isinstance(kind.accepts, Accepts) and kind.accepts.cacheable:
+            assert kind.version or kind.fingerprint is not wiw.WorldModel.fingerprint, name
 
 
 MODEL = """
@@ -247,12 +271,15 @@ import wiw
 
 class Logged(wiw.WorldModel):
     accepts = wiw.accepts(control="trajectory", size=(64, 64), view="perspective", cacheable=True)
+    version = "1"
 
     def rollout(self, observations, controls, seeds):
         with Path(__file__).with_suffix(".log").open("a") as log:
             log.write("asked\\n")
         fill = np.array([int(seed) % 251 for seed in seeds], np.uint8)
-        return np.broadcast_to(fill[:, None, None, None, None], (len(fill), len(controls[0].actions) + 1, 64, 64, 3))
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+        frames[:, 1:] = fill[:, None, None, None, None]
+        return frames
 """
 
 

@@ -158,6 +158,10 @@ def test_the_key_is_nowhere_in_the_records(made):
     assert pickle.loads(pickle.dumps(model)).fingerprint() == model.fingerprint()
 
 
+def test_a_model_that_costs_nothing_has_no_credits() -> None:
+    assert wiw.world_model("copy").credits is None
+
+
 def test_an_agent_notes_the_credits(service, made, two_rooms, tmp_path):
     from wiw.tasks.imagenav import ImageNav
 

@@ -451,6 +451,26 @@ def test_a_scene_that_cannot_be_kept_is_used_all_the_same(
     assert "not kept" in caplog.text
 
 
+@pytest.mark.parametrize("isolate", [False, True])
+def test_an_imported_scene_needs_no_cache_that_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, isolate: bool
+) -> None:
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "file"))
+    assert scenes.load(square(tmp_path), isolate=isolate).triangle_count == 2
+    assert "not kept" in caplog.text
+
+    def forbidden(self: Path, *_: object) -> None:
+        raise PermissionError(13, "Read-only file system", str(self))
+
+    monkeypatch.setenv("WIW_CACHE", str(tmp_path / "cache"))
+    (tmp_path / "cache/scenes").mkdir(parents=True)
+    monkeypatch.setattr(Path, "touch", forbidden)
+    caplog.clear()
+    assert scenes.load(square(tmp_path), isolate=isolate).triangle_count == 2
+    assert "Read-only file system" in caplog.text and not list((tmp_path / "cache/scenes").iterdir())
+
+
 def test_a_file_that_ends_the_importer_is_an_error_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "cut.glb").write_bytes(square(tmp_path).read_bytes()[:-10])
     with pytest.raises(FileError, match=r"cut.glb: should have .* \(truncated file\)"):

@@ -29,6 +29,7 @@ import wiw
 from wiw.errors import ArgumentError, ContractError, InfrastructureError, RemoteError, RolloutError
 from wiw.loop import attempts
 from wiw.loop.attempts import Attempts
+from wiw.serving import outbox
 from wiw.serving import server as serving
 from wiw.serving.background import served
 from wiw.serving.known import Known
@@ -38,8 +39,9 @@ from wiw.types import Conditioning, Control
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
-from wiw.world_models.remote import Remote, link
+from wiw.world_models.remote import link
 from wiw.world_models.remote.limits import check_row
+from wiw.world_models.remote.model import Remote
 
 SIZE = (8, 16)
 
@@ -592,6 +594,15 @@ def test_a_server_that_says_nothing_is_given_up_when_patience_ends(monkeypatch):
         mute.shutdown()
 
 
+@pytest.mark.parametrize("description", ["no JSON", "[" * 100_000 + "]" * 100_000, '"a name"'])
+def test_a_server_that_describes_its_model_in_nonsense_is_refused(description):
+    with served(Plain()) as server:
+        server._welcome = replace(server._welcome, model=description)
+        with pytest.raises(RemoteError, match="description of its model") as caught:
+            Remote(server.address)
+        assert caught.value.kind == "message"
+
+
 def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
     other_size = pack_row(Conditioning(np.zeros((1, 4, 4, 3), np.uint8)), 0, plans(1)[0], 7)
     wrong = {
@@ -865,3 +876,91 @@ def test_answers_are_kept_up_to_a_size():
     assert known.get(b"c") is None and known.get(b"b")
     known.put(b"e", b"1" * 11)
     assert known.get(b"e") is None and known.get(b"b") is None
+
+
+# -- a client that does not read ---------------------------------------------------------------------------------------
+
+
+class Pictures(Plain):
+    """Large frames: five of a row are 2 MB."""
+
+    accepts = wiw.accepts("image", size=(256, 512), best_batch=4)
+
+
+ANSWER = 5 * 256 * 512 * 3
+
+
+def large_ask(shade, seed=0):
+    row = pack_row(Conditioning(np.full((1, 256, 512, 3), shade, np.uint8)), 0, plans(1)[0], seed)
+    return Ask(row_id(row), row, 60.0, 0)
+
+
+@contextlib.contextmanager
+def unread(server):
+    """A client that has said hello and reads no more than its first message."""
+    with connect(server.address, compression=None, max_size=None, max_queue=1, close_timeout=0.1) as client:
+        client.send(encode(Hello("lazy")))
+        decode(client.recv())
+        yield client
+
+
+def unsent(server):
+    """Bytes in the buffers of the server's connections, and those that wait to get there."""
+    return sum(client.transport.get_write_buffer_size() for client in list(server._owed)) + server.unsent_bytes
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_a_client_that_does_not_read_fills_no_memory_and_is_sent_away(monkeypatch, known):
+    monkeypatch.setattr(outbox, "UNSENT_BYTES", 3 * ANSWER)
+    monkeypatch.setattr(serving, "UNREAD", 1.0)
+    peak = 0
+    with served(Pictures()) as server, unread(server) as client:
+
+        def insist():
+            with contextlib.suppress(ConnectionClosed):
+                if known:
+                    client.send(encode(large_ask(0)))
+                    wait_for(lambda: server.worker.rows == 1 and not server.taken)
+                for number in range(100):
+                    client.send(encode(large_ask(0, 0 if known else number)))
+
+        asking = threading.Thread(target=insist, daemon=True)
+        asking.start()
+        while server.clients and peak < 6 * ANSWER:
+            peak = max(peak, unsent(server))
+            time.sleep(0.002)
+        asking.join(20)
+        assert not asking.is_alive() and server.refused == 1
+        assert 2 * ANSWER < peak < 6 * ANSWER
+        with remote_of(server) as other:  # and nobody else is disturbed
+            assert other.rollout(
+                Conditioning(np.zeros((1, 256, 512, 3), np.uint8)), plans(1), np.zeros(1, np.uint64)
+            ).shape == (1, 6, 256, 512, 3)
+
+
+def test_a_client_that_reads_late_gets_all_answers(monkeypatch):
+    monkeypatch.setattr(outbox, "UNSENT_BYTES", 2 * ANSWER)
+    with served(Pictures()) as server, unread(server) as client:
+        asks = {said.id: said for said in (large_ask(shade) for shade in range(8))}
+        for said in asks.values():
+            client.send(encode(said))
+        wait_for(lambda: server.taken == 0 and server.worker.rows == len(asks))
+        answers, waited = {}, 0
+        while len(answers) < len(asks):
+            heard = decode(client.recv(20))
+            if isinstance(heard, Wait):
+                waited += 1
+                assert heard.reason == "earlier answers wait to be read"
+                client.send(encode(asks[heard.id]))
+            else:
+                answers[heard.id] = heard.frames[0, 0, 0, 0]
+        assert waited and [answers[each] for each in asks] == list(range(8))
+
+
+@contextlib.contextmanager
+def remote_of(server):
+    client = Remote(server.address)
+    try:
+        yield client
+    finally:
+        client.close()

@@ -286,6 +286,7 @@ def test_a_run_is_not_resumed_with_an_agent_that_has_changed(tmp_path, two_rooms
     evaluate(task, AgentRecipe("heuristic", first), 2, out=tmp_path / "run", progress=False)
     with sqlite3.connect(store_path(tmp_path / "run")) as store:
         store.execute("DELETE FROM outcome WHERE episode = 1")
+        store.execute("UPDATE run SET info = json_remove(info, '$.sources')")  # as of a run that kept none
     models(tmp_path, steps=6)
     monkeypatch.setattr(sys, "modules", {k: v for k, v in sys.modules.items() if not k.startswith("wiw_user_first")})
     with pytest.raises(StoreError, match="steps"):

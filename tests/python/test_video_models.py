@@ -29,8 +29,8 @@ from wiw.types import Conditioning, Control
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 
-from wiw.world_models.sana_wm import camera_path
-from wiw.world_models.video.weights import SAMPLE_BYTES, SAMPLES, digest
+from wiw.world_models.video.sana import interpolate_path
+from wiw.world_models.video.weights import SAMPLE_BYTES, SAMPLES, digest_folder
 
 NAMES = ["svd", "ltx", "hunyuan", "wan2.1", "wan2.2-5b", "wan2.2-a14b", "cosmos-predict2", "sana-wm"]
 BATCHED = ["svd", "ltx", "cosmos-predict2"]
@@ -114,13 +114,13 @@ def test_a_model_that_knows_no_plan_gives_its_frames_in_order(made):
 @pytest.mark.parametrize("name", [name for name in NAMES if name not in ("svd", "sana-wm")])
 def test_the_plan_reaches_the_pipeline_in_words(name, made):
     model = made(name)
-    pipeline, asked = model._pipeline, {}
+    pipeline, asked = model.pipeline, {}
 
     def listening(**given):
         asked.update(given)
         return pipeline(**given)
 
-    model._pipeline = listening
+    model.pipeline = listening
     listening.transformer = pipeline.transformer
     rollout(model)
     prompt = asked["prompt"] if isinstance(asked["prompt"], str) else asked["prompt"][0]
@@ -129,7 +129,7 @@ def test_the_plan_reaches_the_pipeline_in_words(name, made):
 
 
 def test_the_camera_path_is_interpolated_in_the_pipelines_axes():
-    path = camera_path(control([TURN_LEFT, FORWARD], 9), 9)
+    path = interpolate_path(control([TURN_LEFT, FORWARD], 9), 9)
     angle = np.deg2rad(22.5)
     ahead = np.array([-np.sin(angle), 0, np.cos(angle)])  # x right, y down, z ahead
     np.testing.assert_allclose(path[0], np.eye(4), atol=1e-6)
@@ -165,13 +165,13 @@ def test_hunyuan_shows_the_end_of_a_clip_whose_beginning_is_dropped(made):
 
     model = made("hunyuan", frames=9)
     shades = np.linspace(0, 1, 9 + 4, dtype=np.float32)  # of the clip with its beginning
-    transformer = model._pipeline.transformer
+    transformer = model.pipeline.transformer
 
     def dropping(**given):
         assert given["num_frames"] == len(shades)
         return SimpleNamespace(frames=np.broadcast_to(shades[None, 4:, None, None, None], (1, 9, *model.size, 3)))
 
-    model._pipeline = dropping
+    model.pipeline = dropping
     dropping.transformer = transformer
     found = rollout(model, [(FORWARD,) * 8])[0, 1:, 0, 0, 0]
     np.testing.assert_array_equal(found, np.rint(shades[[4, 4, 4, 6, 8, 9, 10, 12]] * 255))
@@ -232,7 +232,10 @@ def test_long_plans_go_on_from_the_last_frame(made, two_rooms):
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name != "sana-wm"])  # whose network refuses it on a CPU
 def test_half_precision_is_close(name, made):
-    whole, half = made(name, precision="float32"), made(name, precision=wiw.registry.WORLD_MODELS.find(name).half)
+    whole, half = (
+        made(name, precision="float32"),
+        made(name, precision=wiw.registry.WORLD_MODELS.find(name).half_precision),
+    )
     difference = np.abs(rollout(whole).astype(float) - rollout(half))
     assert 0 < difference.mean() < 4
     assert whole.fingerprint() != half.fingerprint()
@@ -241,7 +244,7 @@ def test_half_precision_is_close(name, made):
 def test_half_precision_leaves_some_networks_whole(made):
     import torch
 
-    networks = made("wan2.1", precision="bfloat16")._pipeline.components
+    networks = made("wan2.1", precision="bfloat16").pipeline.components
     assert networks["transformer"].dtype == networks["text_encoder"].dtype == torch.bfloat16
     assert networks["vae"].dtype == networks["image_encoder"].dtype == torch.float32
 
@@ -271,7 +274,7 @@ def test_large_weights_are_told_apart_by_samples(tmp_path):
         if place is not None:
             changed[place : place + size // 20] += 1
         file.write_bytes(changed.tobytes())
-        found.add(digest(tmp_path))
+        found.add(digest_folder(tmp_path))
     assert len(found) == 4
 
 
@@ -452,7 +455,7 @@ def test_a_full_gpu_is_answered_with_the_options_that_need_less(said, made):
     def full(**_):
         raise (torch.OutOfMemoryError if "GiB" in said else RuntimeError)(said)
 
-    model._pipeline = full
+    model.pipeline = full
     first = re.escape(said.splitlines()[0])
     with pytest.raises(DeviceMemoryError, match=rf"{first}.*batch=1.*bfloat16.*offload='model'.*smaller size.*frames"):
         rollout(model)
@@ -464,7 +467,7 @@ def test_other_errors_of_the_gpu_stay_what_they_are(made):
     def lost(**_):
         raise RuntimeError("CUDA error: unspecified launch failure")
 
-    model._pipeline = lost
+    model.pipeline = lost
     with pytest.raises(RuntimeError, match="launch failure"):
         rollout(model)
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import json
 import pickle
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -60,17 +62,17 @@ def test_what_goes_over_the_wire_is_what_was_asked(dialect: str) -> None:
         client = connect(server.url, dialect=dialect)
         assert client.model == "mock"
         replies = client.ask(REQUESTS)
-        asked = server.client.asked
+        asked = server.client.calls
         direct = MockClient()
         direct.ask(REQUESTS)
-        twins = {parts_of(call): call for call in direct.asked}
+        twins = {parts_of(call): call for call in direct.calls}
         for call in (call for call in asked if parts_of(call) in twins):
             twin = twins[parts_of(call)]
             assert call.schema == twin.schema and call.temperature in (twin.temperature, 1.0)
             assert call.labels == (() if dialect == "openai" else twin.labels)
             if call.logprobs:
                 assert (call.seed, call.max_tokens, call.logprobs) == (twin.seed, twin.max_tokens, twin.logprobs)
-        assert {parts_of(call) for call in direct.asked[:3]} <= {parts_of(call) for call in asked}
+        assert {parts_of(call) for call in direct.calls[:3]} <= {parts_of(call) for call in asked}
         assert all(reply.problem is None for reply in replies)
         assert [reply.by for reply in replies] == ["logprobs", "", "", "logprobs"]
         assert client.spent["vlm_calls"] == len(asked) and client.spent["vlm_retries"] == 0
@@ -212,6 +214,42 @@ def test_an_error_that_does_not_end_is_not_read_to_its_end(pause: float) -> None
     assert error.value.kind == "status" and len(written) < 1000
 
 
+@pytest.mark.parametrize("dripped", ["headers", "status line", "body"])
+def test_a_reply_that_drips_in_takes_no_longer_than_the_timeout(dripped: str) -> None:
+    """The server would need hours; each byte comes well within the time that a single read may take."""
+    opening = {
+        "headers": b"HTTP/1.1 200 OK\r\nX-Drip: ",
+        "status line": b"HTTP/1.1 2",
+        "body": b"HTTP/1.1 200 OK\r\n\r\n",
+    }
+    ended = threading.Event()
+
+    def drip(connection: socket.socket) -> None:
+        with connection, suppress(OSError):
+            connection.recv(1 << 16)
+            connection.sendall(opening[dripped])
+            while not ended.wait(0.05):
+                connection.sendall(b"0")
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+
+        def serve() -> None:
+            with suppress(OSError):
+                while True:
+                    threading.Thread(target=drip, args=(listener.accept()[0],), daemon=True).start()
+
+        threading.Thread(target=serve, daemon=True).start()
+        client = connect(f"http://127.0.0.1:{listener.getsockname()[1]}/v1", model="m", attempts=2, timeout=0.5)
+        with ThreadPoolExecutor(1) as pool:
+            asked = pool.submit(client.ask, REQUESTS[2:3])
+            done = wait([asked], 60).done
+            ended.set()
+        assert done, "the client still waits for the headers"
+        with pytest.raises(VlmError, match=r"not complete within 0\.5 s \(2 tries\)") as error:
+            asked.result()
+        assert error.value.kind == "timeout"
+
+
 def test_a_reply_that_is_cut_off_is_asked_for_again() -> None:
     with speaking([b"cut off", GOOD]) as url:
         (reply,) = connect(url, model="m", attempts=2, timeout=5).ask(REQUESTS[2:3])
@@ -310,7 +348,7 @@ def test_no_web_page_is_answered() -> None:
         del page["Origin"]
         with urlopen(HttpRequest(f"{server.url}/chat/completions", body, page), timeout=10) as said:
             assert said.status == 200
-    assert len(script.asked) == 1
+    assert len(script.calls) == 1
 
 
 def test_ports_that_are_none() -> None:

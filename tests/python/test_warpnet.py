@@ -26,8 +26,8 @@ from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.world_models.warpnet import BUILT_IN, WarpNet, to_network, turned  # noqa: E402
-from wiw.world_models.warpnet.network import Network, enlarged, rays, warp  # noqa: E402
+from wiw.world_models.warpnet.model import BUILT_IN, WarpNet, to_network, turn_panorama  # noqa: E402
+from wiw.world_models.warpnet.network import Network, enlarge_panorama, rays, warp  # noqa: E402
 from wiw.world_models.warpnet.weights import load, save  # noqa: E402
 
 SIZE = (96, 192)
@@ -106,10 +106,10 @@ def test_enlarging_knows_no_seam(size: tuple[int, int], columns: int, seed: int)
     small = torch.from_numpy(np.random.default_rng(seed).random((1, 2, *size), np.float32))
     step = 1024 // size[1] if 1024 % size[1] == 0 else 64
     turn = columns // step
-    large = enlarged(small, 48, 1024)
+    large = enlarge_panorama(small, 48, 1024)
     assert large.shape == (1, 2, 48, 1024)
     by = turn * size[1] // 16 if 1024 % size[1] else turn
-    torch.testing.assert_close(enlarged(small.roll(by, 3), 48, 1024), large.roll(by * 1024 // size[1], 3))
+    torch.testing.assert_close(enlarge_panorama(small.roll(by, 3), 48, 1024), large.roll(by * 1024 // size[1], 3))
     torch.testing.assert_close(large.mean((2, 3)), small.mean((2, 3)), atol=0.05, rtol=0)
 
 
@@ -129,10 +129,10 @@ def test_a_plan_is_one_jump() -> None:
     """Three strides are one of three lengths, and a turn before walking is one of the panorama."""
     image, model = noise(1), untrained()
     np.testing.assert_array_equal(
-        rollout(model, image, [control([FORWARD] * 3)])[0, 3], model.moved(image[0], 3 * 0.2, 0.0)
+        rollout(model, image, [control([FORWARD] * 3)])[0, 3], model.imagine_move(image[0], 3 * 0.2, 0.0)
     )
     turning = rollout(model, image, [control([TURN_LEFT, FORWARD])])[0, 2]
-    straight = rollout(model, turned(image[0], np.pi / 8)[None], [control([FORWARD])])[0, 1]
+    straight = rollout(model, turn_panorama(image[0], np.pi / 8)[None], [control([FORWARD])])[0, 1]
     np.testing.assert_array_equal(turning, straight)
 
 
@@ -157,7 +157,7 @@ def test_it_says_what_it_is(tmp_path: Path) -> None:
     again = WarpNet(tmp_path / "w.safetensors")
     copied = pickle.loads(pickle.dumps(again))
     image = noise(1)
-    np.testing.assert_array_equal(copied.moved(image[0], 0.5, 0.1), again.moved(image[0], 0.5, 0.1))
+    np.testing.assert_array_equal(copied.imagine_move(image[0], 0.5, 0.1), again.imagine_move(image[0], 0.5, 0.1))
 
 
 # -- the file ----------------------------------------------------------------------------------------------------------
@@ -207,7 +207,7 @@ def test_without_torch_it_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch
 
 
 def test_torch_is_not_loaded_before_it_is_needed() -> None:
-    code = "import sys, wiw.world_models.warpnet; assert 'torch' not in sys.modules"
+    code = "import sys, wiw.world_models.warpnet.model; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
@@ -219,7 +219,7 @@ def test_the_weights_that_come_with_it_beat_the_floor(two_rooms: str) -> None:
     model = wiw.world_model("warpnet")
     poses = np.stack([camera_pose(np.array([-2.4, 0, z]), 0.0) for z in (1.4, 0.8)])
     before, after = world(two_rooms).renderer.panorama(poses, outputs=("color",))["color"]
-    made = model.moved(before, 0.6, 0.0)
+    made = model.imagine_move(before, 0.6, 0.0)
     floor = wiw.metrics.psnr(before, after, weights="latitude")
     assert wiw.metrics.psnr(made, after, weights="latitude") > floor + 1.5
     assert BUILT_IN.stat().st_size < 4 * 2**20

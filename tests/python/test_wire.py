@@ -20,7 +20,7 @@ from wiw.wire.arrays import DTYPES, pack_array, unpack_array
 from wiw.wire.messages import VERSION, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import pack_row, row_id, stack, unpack_row
 from wiw.world_models.base import accepts
-from wiw.world_models.remote.declaration import declaration, declared
+from wiw.world_models.remote.declaration import declaration, parse_declaration, parse_description
 
 HEIGHT, WIDTH = 4, 6
 MESSAGES = [
@@ -120,7 +120,7 @@ def test_equal_questions_have_equal_ids_and_others_do_not():
     ids=lambda model: model.control,
 )
 def test_declarations_come_out_as_they_went_in(model):
-    found = declared(declaration(model))
+    found = parse_declaration(declaration(model))
     vocabulary = model.vocabulary and {name: list(own) for name, own in model.vocabulary.items()}
     same = {"template": None, "vocabulary": None}
     assert dataclasses.replace(found, **same) == dataclasses.replace(model, **same)
@@ -130,10 +130,20 @@ def test_declarations_come_out_as_they_went_in(model):
             assert getattr(found.template, name) == getattr(model.template, name)
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"control": "flying"}', "null"])
+LONG, DEEP = "x" * 2**20, "[" * 100_000 + "]" * 100_000
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"control": "flying"}', "null", DEEP, f'{{"vocabulary": {DEEP}}}'])
 def test_a_declaration_that_is_none_is_refused(text):
     with pytest.raises(RemoteError, match="declaration"):
-        declared(text)
+        parse_declaration(text)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "null", '{"a": "\\ud800"}', DEEP, f'{{"a": "{LONG}"}}'])
+def test_a_description_that_is_none_is_refused(text):
+    with pytest.raises(RemoteError, match="description") as caught:
+        parse_description(text)
+    assert caught.value.kind == "message"
 
 
 def test_another_version_is_told_from_nonsense():

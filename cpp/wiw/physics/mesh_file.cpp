@@ -13,6 +13,8 @@
 #include "wiw/core/error.hpp"
 #include "wiw/physics/shape.hpp"
 #include "wiw/scene/import/collada_check.hpp"
+#include "wiw/scene/import/file.hpp"
+#include "wiw/scene/import/obj_check.hpp"
 #include "wiw/scene/import/ply_header.hpp"
 
 namespace wiw::physics {
@@ -49,9 +51,12 @@ class MeshFile {
     importer_.SetPropertyInteger(AI_CONFIG_PP_SBP_REMOVE, aiPrimitiveType_LINE | aiPrimitiveType_POINT);
     importer_.SetPropertyInteger(AI_CONFIG_PP_RVC_FLAGS, aiComponent_NORMALS);
     importer_.SetPropertyFloat(AI_CONFIG_PP_GSN_MAX_SMOOTHING_ANGLE, kSmooth);
-    const aiScene* scene =
-        importer_.ReadFile(path_.string(), steps | aiProcess_PreTransformVertices | aiProcess_ValidateDataStructure);
+    const aiScene* scene = importer_.ReadFile(path_.string(), 0);
     if (scene == nullptr) throw error(importer_.GetErrorString());
+    for (unsigned m = 0; m < scene->mNumMeshes; ++m) check_faces(*scene->mMeshes[m]);
+    scene = importer_.ApplyPostProcessing(aiProcess_ValidateDataStructure);
+    if (scene != nullptr) scene = importer_.ApplyPostProcessing(steps | aiProcess_PreTransformVertices);
+    if (scene == nullptr) throw error("it has no faces that can be used: " + std::string(importer_.GetErrorString()));
     for (unsigned m = 0; m < scene->mNumMeshes; ++m) check(*scene->mMeshes[m]);
     return *scene;
   }
@@ -62,8 +67,24 @@ class MeshFile {
     try {
       if (extension_of(path_) == ".ply") check_ply(path_);
       if (extension_of(path_) == ".dae") check_collada(path_);
+      if (extension_of(path_) == ".obj") check_obj(path_);
     } catch (const FileError& damage) {
-      throw error(std::string(damage.what()).substr(path_.string().size() + 2));  // behind "path: "
+      const std::string text = damage.what();
+      const std::string own = path_.string() + ": ";
+      throw error(text.starts_with(own) ? text.substr(own.size()) : text);
+    }
+  }
+
+  /// The steps that follow take for granted that every face has corners and that every corner is a vertex.
+  void check_faces(const aiMesh& mesh) const {
+    for (unsigned f = 0; f < mesh.mNumFaces; ++f) {
+      const aiFace& face = mesh.mFaces[f];
+      if (face.mNumIndices == 0) throw error("face " + std::to_string(f) + " has no corners (damaged file)");
+      for (unsigned i = 0; i < face.mNumIndices; ++i) {
+        if (face.mIndices[i] < mesh.mNumVertices) continue;
+        throw error("face " + std::to_string(f) + " names vertex " + std::to_string(face.mIndices[i]) + " of " +
+                    std::to_string(mesh.mNumVertices) + " (damaged file)");
+      }
     }
   }
 
@@ -115,9 +136,7 @@ void check_scale(const MeshFile& file, const Eigen::Vector3d& scale) {
   if (!scale.allFinite() || (scale.array() == 0).any()) throw file.error("expected finite factors of scale, none zero");
 }
 
-}  // namespace
-
-Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+Surface read_surface(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
   check_scale(file, scale);
   unsigned steps =
@@ -130,7 +149,7 @@ Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, cons
   return surface;
 }
 
-std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+std::vector<Eigen::Vector3d> read_hull(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
   check_scale(file, scale);
   const aiScene& scene = file.read(aiProcess_JoinIdenticalVertices);
@@ -144,6 +163,16 @@ std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vec
   const HullMesh hull = hull_mesh(points);
   if (hull.vertices.empty()) throw file.error("its vertices span no volume");
   return hull.vertices;
+}
+
+}  // namespace
+
+Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+  return read_as_file(path, [&] { return read_surface(path, scale, link); });
+}
+
+std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+  return read_as_file(path, [&] { return read_hull(path, scale, link); });
 }
 
 fs::path find_mesh(const std::string& name, const fs::path& folder) {

@@ -4,15 +4,15 @@
 
 #include <algorithm>
 #include <cmath>
-#include <fstream>
 #include <limits>
 #include <mutex>
-#include <sstream>
 #include <unordered_set>
 
 #include "wiw/core/error.hpp"
 #include "wiw/physics/articulation.hpp"
 #include "wiw/physics/mesh_file.hpp"
+#include "wiw/physics/urdf_text.hpp"
+#include "wiw/scene/import/file.hpp"
 
 namespace wiw::physics {
 
@@ -36,7 +36,8 @@ class ErrorLog final : public console_bridge::OutputHandler {
   std::string first_;
 };
 
-urdf::ModelInterfaceSharedPtr parse_xml(const std::string& text, const std::string& source) {
+urdf::ModelInterfaceSharedPtr parse_xml(const std::string& unchecked, const std::string& source) {
+  const std::string text = check_urdf_text(unchecked, source);
   static std::mutex one_at_a_time;  // the handler is the process's
   const std::scoped_lock lock(one_at_a_time);
   const ErrorLog errors;
@@ -49,7 +50,8 @@ urdf::ModelInterfaceSharedPtr parse_xml(const std::string& text, const std::stri
     cause = error.what();
   }
   if (!model || !cause.empty()) {
-    throw FileError(source, "not a robot description (URDF): " + (cause.empty() ? "no robot in it" : cause));
+    throw FileError(
+        source, "not a robot description (URDF): " + (cause.empty() ? "no robot in it" : restore_percent_signs(cause)));
   }
   return model;
 }
@@ -65,7 +67,8 @@ Pose to_pose(const urdf::Pose& from, const std::string& what) {
   return pose;
 }
 
-constexpr int kDeepest = 1000;  // links one below another; arms have some ten
+constexpr int kDeepest = 1000;                // links one below another; arms have some ten
+constexpr std::size_t kMaxBytes = 64u << 20;  // of a description
 
 class Reader {
  public:
@@ -82,7 +85,10 @@ class Reader {
       return values;
     };
     limits = {vector(&Range::lower), vector(&Range::upper), vector(&Range::velocity), vector(&Range::effort)};
-    return std::make_shared<Articulation>(model_.getName(), std::move(links_), std::move(joints_), std::move(limits));
+    for (Link& link : links_) link.name = restore_percent_signs(link.name);
+    for (Joint& joint : joints_) joint.name = restore_percent_signs(joint.name);
+    return std::make_shared<Articulation>(restore_percent_signs(model_.getName()), std::move(links_),
+                                          std::move(joints_), std::move(limits));
   }
 
  private:
@@ -162,8 +168,8 @@ class Reader {
     if (from.inertial) link.inertial = to_inertial(*from.inertial, from.name);
     for (const urdf::CollisionSharedPtr& each : from.collision_array) {
       if (!each || !each->geometry) continue;
-      link.collision.push_back(
-          {to_shape(*each->geometry, from.name), to_pose(each->origin, "collision of link '" + from.name + "'")});
+      link.collision.push_back({to_shape(*each->geometry, restore_percent_signs(from.name)),
+                                to_pose(each->origin, "collision of link '" + from.name + "'")});
       check_part(link.collision.back(), source_ + ": link '" + from.name + "'");
       note_mesh(*each->geometry, link);
     }
@@ -177,7 +183,11 @@ class Reader {
 
   void note_mesh(const urdf::Geometry& from, Link& link) const {
     const auto* mesh = dynamic_cast<const urdf::Mesh*>(&from);
-    if (mesh != nullptr) link.meshes.push_back(find_mesh(mesh->filename, folder_));
+    if (mesh != nullptr) link.meshes.push_back(mesh_of(*mesh));
+  }
+
+  [[nodiscard]] fs::path mesh_of(const urdf::Mesh& mesh) const {
+    return find_mesh(restore_percent_signs(mesh.filename), folder_);
   }
 
   [[nodiscard]] MassProperties to_inertial(const urdf::Inertial& from, const std::string& name) const {
@@ -197,7 +207,7 @@ class Reader {
 
   [[nodiscard]] Shape to_shape(const urdf::Geometry& from, const std::string& link) const {
     if (const auto* mesh = dynamic_cast<const urdf::Mesh*>(&from)) {
-      return ConvexHull{hull_of_file(find_mesh(mesh->filename, folder_), to_eigen(mesh->scale), link)};
+      return ConvexHull{hull_of_file(mesh_of(*mesh), to_eigen(mesh->scale), link)};
     }
     return primitive(from);
   }
@@ -212,7 +222,7 @@ class Reader {
   [[nodiscard]] Visual to_visual(const urdf::Visual& from, const std::string& link) const {
     Visual visual{.pose = to_pose(from.origin, "visual of link '" + link + "'")};
     if (const auto* mesh = dynamic_cast<const urdf::Mesh*>(from.geometry.get())) {
-      visual.mesh = find_mesh(mesh->filename, folder_);
+      visual.mesh = mesh_of(*mesh);
       visual.scale = to_eigen(mesh->scale);
     } else {
       visual.shape = primitive(*from.geometry);
@@ -233,19 +243,25 @@ class Reader {
   std::vector<Range> ranges_;
 };
 
+ArticulationPtr read_model(const std::string& text, const std::string& source, const fs::path& folder) {
+  const auto model = parse_xml(text, source);
+  try {
+    return Reader(*model, source, folder).read();
+  } catch (const ArgumentError& error) {
+    throw ArgumentError(restore_percent_signs(error.what()));
+  }
+}
+
 }  // namespace
 
 ArticulationPtr Articulation::load(const fs::path& urdf) {
-  std::ifstream file(urdf);
-  std::stringstream text;
-  if (!file || !(text << file.rdbuf())) throw FileError(urdf.string(), "cannot be read");
-  const auto model = parse_xml(text.str(), urdf.string());
-  return Reader(*model, urdf.string(), urdf.parent_path()).read();
+  if (size_of_file(urdf) > kMaxBytes) throw FileError(urdf.string(), "larger than 64 MiB, which no robot has need of");
+  const auto bytes = read_file(urdf);
+  return read_model({bytes.begin(), bytes.end()}, urdf.string(), urdf.parent_path());
 }
 
 ArticulationPtr Articulation::parse(const std::string& urdf, const fs::path& folder) {
-  const auto model = parse_xml(urdf, "robot description");
-  return Reader(*model, "robot description", folder).read();
+  return read_model(urdf, "robot description", folder);
 }
 
 }  // namespace wiw::physics

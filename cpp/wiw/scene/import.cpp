@@ -17,12 +17,14 @@
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/gltf_check.hpp"
 #include "wiw/scene/import/guarded_io.hpp"
+#include "wiw/scene/import/obj_check.hpp"
 #include "wiw/scene/import/ply_header.hpp"
+#include "wiw/scene/text.hpp"
 
 namespace wiw {
 namespace {
 
-constexpr int kImporterVersion = 2;  // raise it whenever the same file and options give another scene
+constexpr int kImporterVersion = 3;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {
@@ -43,11 +45,12 @@ void check_indices(const aiScene& file, const std::filesystem::path& path) {
   }
 }
 
-const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options) {
+const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& path, const ImportOptions& options,
+                     FileContents contents) {
   // The file's axes are turned by UpAxis alone, so that one rule holds for every format.
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_IGNORE_UP_DIRECTION, true);
   importer.SetPropertyBool(AI_CONFIG_IMPORT_COLLADA_USE_COLLADA_NAMES, true);
-  importer.SetIOHandler(new GuardedIo(options));  // NOLINT(cppcoreguidelines-owning-memory): the importer owns it
+  importer.SetIOHandler(new GuardedIo(options, std::move(contents)));  // NOLINT(*-owning-memory): the importer owns it
   const aiScene* file = importer.ReadFile(path.string(), 0);
   if (!file) throw FileError(path.string(), "cannot be read: " + std::string(importer.GetErrorString()));
   if ((file->mFlags & AI_SCENE_FLAGS_INCOMPLETE) || !file->mRootNode) {
@@ -59,13 +62,38 @@ const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& pa
   return *file;
 }
 
-/// Refuses damage that assimp does not survive, and warns of what it drops in silence.
-void check_content(const FileContext& context, Scene& scene) {
+/// Refuses damage that assimp does not survive, and warns of what it drops in silence. Returns what assimp is to read
+/// in place of the files.
+FileContents check_content(const FileContext& context, Scene& scene) {
   check_signature(context.path, context.format);
   if (context.format == MeshFormat::kPly) check_ply(context.path);
   if (context.format == MeshFormat::kDae) check_collada(context.path);
-  if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return;
-  for (std::string& warning : check_gltf(context.path, context.format)) scene.warnings.push_back(std::move(warning));
+  if (context.format == MeshFormat::kObj) check_obj(context.path);
+  if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return {};
+  GltfRewrite rewrite = check_gltf(context.path, context.format, context.options);
+  for (std::string& warning : rewrite.warnings) scene.warnings.push_back(std::move(warning));
+  return std::move(rewrite.files);
+}
+
+ScenePtr import_mesh(const std::filesystem::path& path, const ImportOptions& options) {
+  const MeshFormat format = mesh_format_of(path);
+  check_limit(path.string(), "bytes", size_of_file(path), options.limits.file_bytes, "file_bytes");
+  const FileContext context{path, format, options};
+  auto scene = std::make_shared<Scene>();
+  FileContents contents = check_content(context, *scene);
+
+  const auto importer = make_importer();
+  const aiScene& file = parse(*importer, path, options, std::move(contents));
+  const UpAxis up = up_axis_of(path, format, options.up);
+  scene->name = path.stem().string();
+  scene->attributes["up"] = up.text();
+  convert_materials(file, context, *scene);
+  convert_nodes(file, context, up, *scene);
+  if (scene->instances.empty()) throw FileError(path.string(), "holds no triangles");
+  check_imported(*scene, path);
+  if (options.ceiling_height) add_ceiling(*scene, *options.ceiling_height);
+  make_text_utf8(*scene);
+  return scene;
 }
 
 }  // namespace
@@ -77,23 +105,7 @@ std::string importer_version() {
 }
 
 ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& options) {
-  const MeshFormat format = mesh_format_of(path);
-  check_limit(path.string(), "bytes", size_of_file(path), options.limits.file_bytes, "file_bytes");
-  const FileContext context{path, format, options};
-  auto scene = std::make_shared<Scene>();
-  check_content(context, *scene);
-
-  const auto importer = make_importer();
-  const aiScene& file = parse(*importer, path, options);
-  const UpAxis up = up_axis_of(path, format, options.up);
-  scene->name = path.stem().string();
-  scene->attributes["up"] = up.text();
-  convert_materials(file, context, *scene);
-  convert_nodes(file, context, up, *scene);
-  if (scene->instances.empty()) throw FileError(path.string(), "holds no triangles");
-  check_imported(*scene, path);
-  if (options.ceiling_height) add_ceiling(*scene, *options.ceiling_height);
-  return scene;
+  return read_as_file(path, [&] { return import_mesh(path, options); });
 }
 
 }  // namespace wiw

@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`python -m wiw.cli` is `wiw`."""
 
-import sys
-
-from wiw.cli import main
+from wiw.cli import run_process
 
 if __name__ == "__main__":
-    sys.exit(main())
+    run_process()

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import tyro
 
@@ -26,7 +26,8 @@ from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
-from wiw.cli.stop import EXIT_RESUME, Terminated, terminable
+from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, terminable
+from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
 from wiw.cli.view import view
@@ -63,10 +64,29 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
     (collect, "collect", "Collect demonstrations of manipulation tasks, to learn from."),
-    (train, "train", "Train the recogniser of Active Recognition."),
+    (train, "train", "Train a network: recogniser, warpnet, armnet or diffuser."),
 )
 
-EXIT_ERROR, EXIT_INTERRUPTED = 2, 130
+EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130
+
+
+def run_process() -> NoReturn:
+    """Run the command that the process was started with, and end the process with its exit code."""
+    try:
+        code: Any = main()
+    except SystemExit as stop:
+        code = 0 if stop.code is None else stop.code
+        if not isinstance(code, int):
+            print(code, file=sys.stderr)
+            code = EXIT_CRASH
+    except KeyboardInterrupt:  # while the command was being closed
+        code = EXIT_INTERRUPTED
+    except Terminated:
+        code = EXIT_RESUME
+    except BaseException:
+        sys.excepthook(*sys.exc_info())
+        code = EXIT_CRASH
+    end_process(code)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Error as error:
         if debug:
             raise
-        print(f"wiw: {error}", file=sys.stderr)
+        print(f"wiw: {printable(error)}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED

@@ -9,6 +9,13 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, model_options
 
+MARKS = {
+    "passed": "[green]passed [/]",
+    "wrong": "[red]wrong  [/]",
+    "note": "[yellow]note   [/]",
+    "skipped": "[dim]skipped[/]",
+}
+
 
 def check_model(
     model: Positional[Annotated[str, arg(metavar="MODEL")]],
@@ -24,27 +31,33 @@ def check_model(
     $ wiw check-model svd --world-model-option steps=2
     $ wiw check-model remote:ws://127.0.0.1:8765
 
-    Looked at are type, dtype, shape, number of frames and NaN, frame 0, what the model does to its inputs, whether the
-    same seeds give the same frames, whether a row depends on those beside it, whether `causal` is true, whether the
-    plan makes a difference, and how long it takes, if it answers at all. Exit code 1 if the contract is broken.
+    Everything that is looked at is listed with its result: type, dtype, shape, number of frames and NaN; frame 0;
+    channel order, scale, orientation and order in time of the frames, beside what an agent would truly see; networks
+    left in training mode; what the model does to its inputs and to earlier answers; whether the same seeds give the
+    same frames, whether a row depends on those beside it, whether `causal` is true, whether the plan makes a
+    difference; and how long a rollout takes. Exit code 1 if the contract is broken.
 
     Args:
         model: Name, path.py:Class, package.module:Class, or remote:ws://HOST:PORT. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
         scenes: Where the observations come from: apartments:val:1, a mesh, or a Gazebo world. Those of models that take
             poses of a gripper come from the tables of manipulation.
-        deadline: Most seconds for a call of the model, as in `wiw run`.
+        deadline: Most seconds for a call of the model or its constructor, as in `wiw run`.
     """
     from rich.console import Console
     from rich.markup import escape
 
     from wiw.studies import model_check
 
-    findings = model_check.check_model(model, scenes, deadline=deadline, **model_options(model, world_model_option))
+    options = model_options(model, world_model_option)
+    checks = model_check.examine_model(model, scenes, deadline=deadline, **options)
     console = Console(highlight=False, soft_wrap=True)
-    for finding in findings:
-        mark = "[red]wrong[/]" if finding.serious else "[yellow]note[/] "
-        console.print(f"{mark}  [bold]{finding.kind}[/]  {escape(finding.text)}")
-    broken = any(finding.serious for finding in findings)
+    for check in checks:
+        question = escape(check.detail or model_check.CHECKS[check.name])
+        because = escape(f" ({check.skipped})") if check.skipped else ""
+        console.print(f"{MARKS[check.result]}  [bold]{check.name:<12}[/]  {question}{because}")
+        for finding in check.findings:
+            console.print(f"{'':>9}{escape(finding.kind)}: {escape(finding.text)}")
+    broken = any(check.result == "wrong" for check in checks)
     console.print(f"{escape(model)} {'breaks its contract' if broken else 'keeps its contract'}")
     return int(broken)

@@ -12,6 +12,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
 from wiw.cli.stop import stoppable
+from wiw.cli.terminal import printable
 
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
@@ -114,7 +115,7 @@ def run(
         deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
             episode is recorded as failed for infrastructure, which is never a failure of the task.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
-            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model; or off.
+            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
         fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
         lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where
@@ -190,7 +191,7 @@ def finish(log: Any, report: bool) -> int:
         count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
         first, cause = failed[0], failed[0]["error"].strip().splitlines()[-1]
         print(
-            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {cause}",
+            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {printable(cause)}",
             file=sys.stderr,
         )
         print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)

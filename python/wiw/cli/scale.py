@@ -82,7 +82,7 @@ def scale(
         live: Episodes kept live at a time in a process, so that model calls are batched.
         deadline: Most seconds for a call of the world model, 300 if not given.
         cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
-            folder for every model; or off.
+            folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder.
         vlm: For policy vlm, as in `wiw run`.
         vlm_model: Likewise.

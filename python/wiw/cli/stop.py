@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 EXIT_RESUME = 75
 """EX_TEMPFAIL: whoever stopped the run, such as a batch system, may start `wiw resume`."""
@@ -22,6 +23,22 @@ GRACE = 4.0
 
 class Terminated(BaseException):
     """SIGTERM has come; raised so that everything is closed on the way out."""
+
+
+def end_process(code: int) -> NoReturn:
+    """End the process with an exit code, also while threads of models are still inside compiled code.
+
+    Python's shutdown ends such a thread as it comes back from a call, by unwinding its C++ frames; where these do not
+    allow that, the process aborts (SIGABRT) in place of its exit code. So once the exit handlers have run and the
+    output is flushed, the process ends without a shutdown if any other thread is alive.
+    """
+    if threading.active_count() == 1:
+        sys.exit(code)
+    atexit._run_exitfuncs()  # prints what a handler raises, and goes on
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # a closed pipe, a closed stream
+            stream.flush()
+    os._exit(code)
 
 
 @contextmanager

@@ -6,17 +6,22 @@ from __future__ import annotations
 import gzip
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields, replace
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from wiw.datasets import habitat
-from wiw.errors import FileError
-from wiw.scenes import absolute, is_generated
+from wiw.datasets.fields import integer, number, point, text
+from wiw.errors import ArgumentError, FileError
+from wiw.json_text import parse_json
+from wiw.scenes import absolute, is_generated, resolve
 from wiw.types import Episode
 
 VERSION = 1
+MOST_BYTES = 256 << 20
+"""Of an episode file, unpacked; 100,000 episodes take about 50 MB."""
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
@@ -49,7 +54,17 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
     own = isinstance(body, Mapping) and body.get("format") == "wiw-episodes"
     folder = Path(scenes) if scenes or not own else Path(path).parent
     read = _own(body, path) if own else _foreign(body, path)
-    return [replace(e, scene=absolute(e.scene if is_generated(e.scene) else folder / e.scene)) for e in read]
+    return [replace(e, scene=_scene(e.scene, folder, f"{path}: episode {i}")) for i, e in enumerate(read)]
+
+
+def _scene(name: str, folder: Path, where: str) -> str:
+    """The spec of one scene, from its name in a file whose paths are relative to `folder`."""
+    try:
+        if is_generated(name) and resolve(name) != [name]:
+            raise ValueError("expected a single one, such as apartments:val/3")
+        return absolute(name if is_generated(name) else folder / name)
+    except (ArgumentError, ValueError, RuntimeError) as error:  # RuntimeError: "~" of a user who is not known
+        raise FileError(f"{where}: scene '{name}': {error}") from error
 
 
 def _foreign(body: Any, path: str | Path) -> list[Episode]:
@@ -67,33 +82,60 @@ def _foreign(body: Any, path: str | Path) -> list[Episode]:
 def _own(body: Mapping[str, Any], path: str | Path) -> list[Episode]:
     if body.get("version") != VERSION:
         raise FileError(f"{path}: version {body.get('version')}, this release reads version {VERSION}")
-    return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(body.get("episodes", []))]
+    items = body.get("episodes")
+    if not isinstance(items, list):
+        raise FileError(f"{path}: episodes: expected a list, got {type(items).__name__}")
+    return [_episode(item, f"{path}: episode {i}") for i, item in enumerate(items)]
 
 
 def read_json(path: str | Path) -> Any:
     """Return the parsed file, gunzipped when its name ends in .gz.
 
     Raises:
-        FileError: it cannot be read or parsed; names file and cause.
+        FileError: it cannot be read or parsed, or is larger than `MOST_BYTES` once unpacked; names file and cause.
     """
     try:
-        raw = Path(path).read_bytes()
-        return json.loads(gzip.decompress(raw) if str(path).endswith(".gz") else raw)
-    except (OSError, EOFError, ValueError) as error:
+        with (gzip.open if str(path).endswith(".gz") else open)(path, "rb") as file:
+            raw = file.read(MOST_BYTES + 1)
+        if len(raw) > MOST_BYTES:
+            raise ValueError(
+                f"expected an episode file of at most {MOST_BYTES} bytes when unpacked, and it holds more; split it"
+            )
+        return parse_json(raw)
+    except (OSError, EOFError, ValueError, zlib.error) as error:
         raise FileError(f"{path}: {error}") from error
 
 
 def _episode(item: Any, where: str) -> Episode:
-    names = [f.name for f in fields(Episode)]
-    missing = [name for name in names if name != "info" and (not isinstance(item, Mapping) or name not in item)]
+    missing = [name for name in _FIELDS if not isinstance(item, Mapping) or name not in item]
     if missing:
         raise FileError(f"{where} lacks {', '.join(missing)}")
-    values = {name: item[name] for name in names if name in item}
-    for name in ("start_position", "goal_position"):
-        point = values[name]
-        if not isinstance(point, Sequence) or len(point) != 3:
-            raise FileError(f"{where}: {name} must be [x, y, z] in metres, got {point!r}")
-        values[name] = tuple(float(x) for x in point)
-    if values["geodesic"] is None:
-        values["geodesic"] = math.nan
-    return Episode(**values)
+    try:
+        values = {name: read(item[name], name) for name, read in _FIELDS.items()}
+        return Episode(**values, info=_info(item.get("info", {})))
+    except (ValueError, ArithmeticError) as error:
+        raise FileError(f"{where}: {error}") from error
+
+
+def _info(info: Any) -> dict[str, Any]:
+    if not isinstance(info, dict):
+        raise ValueError(f"info: expected an object, got {info!r:.80}")
+    json.dumps(info, allow_nan=False)
+    return info | {name: read(info[name], f"info.{name}") for name, read in _INFO.items() if name in info}
+
+
+def _length(value: Any, name: str) -> float:
+    return math.nan if value is None else number(value, name)
+
+
+_FIELDS: Mapping[str, Callable[[Any, str], Any]] = {
+    "episode_id": text,
+    "scene": text,
+    "start_position": point,
+    "start_yaw": number,
+    "goal_position": point,
+    "goal_yaw": number,
+    "geodesic": _length,
+}
+_INFO: Mapping[str, Callable[[Any, str], Any]] = {"ideal_primitives": integer, "radius": number, "best_position": point}
+"""What tasks compute with."""

@@ -12,10 +12,13 @@ from typing import Any, Literal
 import numpy as np
 
 from wiw._core import core
+from wiw.datasets.fields import name_of, number, point, text
 from wiw.errors import FileError
 from wiw.types import Episode
 
 Order = Literal["xyzw", "wxyz"]
+_UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError)
+"""What an item of another shape raises."""
 
 
 def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
@@ -25,17 +28,25 @@ def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
         FileError: not four numbers, not of unit length, or tilted by more than 5 degrees; names `where`.
     """
     values = np.asarray(quaternion, float)
-    if values.shape != (4,) or abs(np.linalg.norm(values) - 1) > 1e-2:
-        raise FileError(f"{where}: expected a unit quaternion in order {order}, got {quaternion!r}")
+    if values.shape != (4,) or not abs(np.linalg.norm(values) - 1) <= 1e-2:
+        raise FileError(f"{where}: expected a unit quaternion in order {order}, got {quaternion!r:.80}")
     x, y, z, w = values if order == "xyzw" else np.roll(values, -1)
     if np.hypot(x, z) > np.sin(np.radians(2.5)):
-        raise FileError(f"{where}: rotation {quaternion!r} ({order}) is not about the vertical; is the order right?")
+        raise FileError(
+            f"{where}: rotation {quaternion!r:.80} ({order}) is not about the vertical; is the order right?"
+        )
     return float(2 * np.arctan2(y, w))
 
 
 def is_habitat(body: Any) -> bool:
     """Whether a parsed file has the layout of habitat-lab's navigation episodes."""
-    return isinstance(body, Mapping) and bool(body.get("episodes")) and "start_rotation" in body["episodes"][0]
+    return "start_rotation" in _first(body, "episodes")
+
+
+def _first(body: Any, name: str) -> Mapping[str, Any]:
+    """The first object of a list in a parsed file; an empty one where there is no such list."""
+    items = body.get(name) if isinstance(body, Mapping) else None
+    return items[0] if isinstance(items, list) and items and isinstance(items[0], Mapping) else {}
 
 
 def read_habitat(body: Mapping[str, Any], path: str) -> list[Episode]:
@@ -50,20 +61,20 @@ def read_habitat(body: Mapping[str, Any], path: str) -> list[Episode]:
 def _habitat(item: Mapping[str, Any], where: str) -> Episode:
     try:
         goal = item["goals"][0]
-        name = str(item["episode_id"])
+        name = name_of(item["episode_id"], "episode_id")
         rotation = goal.get("rotation")
         yaw = yaw_of(rotation, "xyzw", where) if rotation is not None else heading_of(name)
         return Episode(
             episode_id=name,
-            scene=str(item["scene_id"]).removeprefix("data/scene_datasets/"),
-            start_position=_point(item["start_position"]),
+            scene=text(item["scene_id"], "scene_id").removeprefix("data/scene_datasets/"),
+            start_position=point(item["start_position"], "start_position"),
             start_yaw=yaw_of(item["start_rotation"], "xyzw", where),
-            goal_position=_point(goal["position"]),
+            goal_position=point(goal["position"], "goals[0].position"),
             goal_yaw=yaw,
             geodesic=float(item.get("info", {}).get("geodesic_distance", float("nan"))),
             info={"source": "habitat", "goal_heading": "file" if rotation is not None else "episode id"},
         )
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except _UNREADABLE as error:
         raise FileError(
             f"{where}: not a navigation episode of habitat-lab ({type(error).__name__}: {error})"
         ) from error
@@ -71,7 +82,7 @@ def _habitat(item: Mapping[str, Any], where: str) -> Episode:
 
 def is_world_in_world(body: Any) -> bool:
     """Whether a parsed file has the layout of World-in-World's published ImageNav episodes."""
-    return isinstance(body, Mapping) and bool(body.get("data")) and "goal_image_relpath" in body["data"][0]
+    return "goal_image_relpath" in _first(body, "data")
 
 
 def read_world_in_world(body: Mapping[str, Any], path: str) -> list[Episode]:
@@ -86,26 +97,26 @@ def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
     try:
         steps = item.get("step_to_goal")
         return Episode(
-            episode_id=str(item["episode_id"]),
-            scene=str(item["scene_relpath"]),
-            start_position=_point(item["start_position"]),
+            episode_id=name_of(item["episode_id"], "episode_id"),
+            scene=text(item["scene_relpath"], "scene_relpath"),
+            start_position=point(item["start_position"], "start_position"),
             start_yaw=yaw_of(item["start_rotation"], "wxyz", where),
-            goal_position=_point(item["goal_position"]),
+            goal_position=point(item["goal_position"], "goal_position"),
             goal_yaw=yaw_of(item["goal_rotation"], "wxyz", where),
             geodesic=float("nan"),
             info={
                 "source": "world-in-world",
-                "radius": float(item["goal_radius"]),
+                "radius": number(item["goal_radius"], "goal_radius"),
                 **({} if steps is None else {"ideal_primitives": int(steps)}),
             },
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except _UNREADABLE as error:
         raise FileError(f"{where}: not a World-in-World ImageNav item ({type(error).__name__}: {error})") from error
 
 
 def is_active_recognition(body: Any) -> bool:
     """Whether a parsed file has the layout of World-in-World's published Active Recognition episodes."""
-    return isinstance(body, Mapping) and bool(body.get("episodes")) and "target_id" in body["episodes"][0]
+    return "target_id" in _first(body, "episodes")
 
 
 def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]:
@@ -120,9 +131,9 @@ def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]
 def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
     try:
         return Episode(
-            episode_id=str(item["episode_id"]),
-            scene="/".join(str(item["scene_id"]).split("/")[-2:]),
-            start_position=_point(item["start_position"]),
+            episode_id=name_of(item["episode_id"], "episode_id"),
+            scene="/".join(text(item["scene_id"], "scene_id").split("/")[-2:]),
+            start_position=point(item["start_position"], "start_position"),
             start_yaw=yaw_of(item["start_rotation"], "wxyz", where),
             goal_position=(float("nan"),) * 3,
             goal_yaw=0.0,
@@ -130,11 +141,11 @@ def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
             info={
                 "source": "world-in-world",
                 "target": int(item["target_id"]),
-                "category": str(item["target_categrory"]),
+                "category": text(item["target_categrory"], "target_categrory"),
                 "difficulty": int(item["difficulty"]),
             },
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except _UNREADABLE as error:
         raise FileError(
             f"{where}: not a World-in-World Active Recognition episode ({type(error).__name__}: {error})"
         ) from error
@@ -143,8 +154,3 @@ def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
 def heading_of(name: str) -> float:
     """A heading in [0, 2 pi) that is a function of an episode's id, the same on every machine and in every process."""
     return float(2 * np.pi * core.uniform(core.fold_key(list(name.encode())), 1)[0])
-
-
-def _point(values: Sequence[float]) -> tuple[float, float, float]:
-    x, y, z = (float(v) for v in values)
-    return x, y, z

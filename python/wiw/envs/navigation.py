@@ -24,7 +24,7 @@ from wiw.envs.navigation_guide import NavigationGuide, ShortestPath
 from wiw.envs.spaces import FIRST_ACTION, LAST_PRIMITIVE, action_space, answer_of, observation_space
 from wiw.errors import ArgumentError
 from wiw.perception.semantics import TrueSemantics
-from wiw.perception.simulator import categories_of
+from wiw.perception.simulator import read_categories
 from wiw.types import Answer, Episode, Goal, Key, Observation, Truth
 
 
@@ -164,9 +164,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
 
         For agents that are granted the simulator's semantics, as others are granted depth.
         """
-        source = TrueSemantics(categories_of(self.state.world.scene))
+        source = TrueSemantics(read_categories(self.state.world.scene))
         ids = self._core.observe(["panorama_ids"])["panorama_ids"]
-        return source.panoramas(self.observation.panorama[None], ids=ids[None])[0]
+        return source.label_panoramas(self.observation.panorama[None], ids=ids[None])[0]
 
     # -- privileged ----------------------------------------------------------------------------------------------------
 

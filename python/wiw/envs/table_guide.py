@@ -27,7 +27,7 @@ class TableGuide(Guide):
         """Return the furthest that a plan gets, by the task's progress after each of its poses."""
         probe, found = self.bench.fork(), []
         for pose in plan:
-            probe.go(pose)
+            probe.move_to(pose)
             found.append(self.task.measure_progress(self.table, probe))
         return max(found)
 

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.loop.attempts import DEADLINE, Attempts
+from wiw.loop.attempts import DEADLINE, Attempts, make_model
 from wiw.loop.beam import Beams
 from wiw.loop.clock import Clock
 from wiw.loop.contract import (
     PLANS,
     check_answerer,
+    check_depth,
     check_model,
     check_proposals,
     checked_answers,
@@ -35,7 +36,7 @@ from wiw.loop.rollout_cache import BUDGET_GB, Asking, remember
 from wiw.loop.swaps import GUIDED, checked_swaps, true_plans, true_scores
 from wiw.metrics import Lpips
 from wiw.policies.base import Policy, Situation
-from wiw.registry import POLICIES, WORLD_MODELS
+from wiw.registry import POLICIES
 from wiw.types import ArmObservation, Decision, Fidelity, Goal, Key, Observation, Proposal, Rollout, Space
 from wiw.world_models.base import WorldModel
 
@@ -99,9 +100,10 @@ class Agent:
             extends the best plans by `horizon` primitives, as `Policy.extend` proposes from their imagined ends.
             Without a model nothing is imagined, and there is one level.
         width: plans of an episode that are kept and extended; None means `candidates`.
-        deadline: seconds that a call of the world model may take before it counts as failed (`wiw.loop.attempts`).
+        deadline: seconds that a call of the world model, or its constructor, may take before it counts as failed
+            (`wiw.loop.attempts`).
         cache: "auto" keeps the rollouts of models that declare themselves `cacheable` in `~/.cache/wiw/rollouts`, a
-            folder keeps those of any model there, "off" keeps none (`wiw.loop.rollout_cache`).
+            folder keeps those of any model with a `version` there, "off" keeps none (`wiw.loop.rollout_cache`).
         cache_gb: most gigabytes of that folder; what was not used for longest goes first.
         pool: plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ
             in `candidates` alone are nested; None proposes as many as are kept.
@@ -118,6 +120,7 @@ class Agent:
             both; None means the task's own, else the policy's.
 
     Raises:
+        ConstructionError: the constructor of a model or policy raised; a model's did not return by the deadline.
         WeightsError: those of LPIPS are not there.
         ArgumentError: a number out of range; a policy that makes plans of another kind; a model that would not be given
             what it needs; with depth > 1, a model that shows no panorama or a policy that needs depth, which no
@@ -154,7 +157,8 @@ class Agent:
         """The numbers that were not left to the task."""
         self._given_space = space
         self.policy: Policy = _of_space(POLICIES.make(policy), space)
-        self.model: WorldModel | None = None if model is None else WORLD_MODELS.make(model).for_space(self.policy.space)
+        made = None if model is None else make_model(model, deadline)
+        self.model: WorldModel | None = None if made is None else made.for_space(self.policy.space)
         self._given_revision = revision
         self.revision: Policy = self._reviser(revision)
         if self.revision.space != self.policy.space:
@@ -226,6 +230,7 @@ class Agent:
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
         """One decision for each live episode; model and reviser see all candidates of all of them at once."""
+        check_depth(self.needs, [query.observation for query in queries])
         clock, meter = Clock(), self.meter()
         proposing, revising = self._situations(queries)
         with clock("propose"):

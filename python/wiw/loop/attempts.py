@@ -6,10 +6,14 @@ the process ends, with its memory, and on a GPU with its place in the queue. The
 that a model that is merely slow is never entered twice at a time; then it asks in a new thread, which mends a lost
 request to a server. A GPU kernel that never ends lets every try pass its deadline, and the episode fails. Compiled code
 that hangs while it holds Python's lock stops the process: nothing in it can look at a clock.
+
+A model cannot end the process: `sys.exit()` in it is an error of its own like any exception. Threads that it starts in
+its constructor or in a call are daemons unless it says otherwise, for they are started in one.
 """
 
 from __future__ import annotations
 
+import inspect
 import queue
 import sys
 import threading
@@ -19,12 +23,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ContractError, RolloutError
+from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
+from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import WorldModel, checked_rollout, patience
 
@@ -88,9 +94,10 @@ class Attempts:
 
         Raises:
             LateError: no answer within the deadline.
-            ContractError: the answer breaks the contract; and whatever the model raises.
+            ContractError: the answer breaks the contract.
+            ExitError: the model tried to end the process; and whatever else the model raises.
         """
-        return self._ask(lambda: checked_rollout(self.model, observations, controls, seeds))
+        return self._ask(lambda: _contain(lambda: checked_rollout(self.model, observations, controls, seeds)))
 
     def _count(self, controls: Sequence[Control]) -> None:
         self.tally["calls"] += 1
@@ -98,7 +105,7 @@ class Attempts:
         self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
-        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError) else "raised"
+        kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
         name = type(self.model).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
@@ -113,10 +120,57 @@ class Attempts:
             return self._helper.do(work, self.deadline)
 
 
+def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldModel | None:
+    """Make a world model as `wiw.world_model` does, within a deadline; None for "none".
+
+    A model whose class declares published weights (`requires.weights`) has no deadline: fetching them the first time
+    may take hours, and whoever fetches them has timeouts of their own.
+
+    Raises:
+        RegistryError: unknown name, or options that do not fit.
+        ConstructionError: the constructor raised, or did not return in time; and other errors of wiw that it raises.
+    """
+    found = WORLD_MODELS.find(what) if isinstance(what, str) else what
+    makes = inspect.isclass(found) or isinstance(found, partial) or inspect.isfunction(found)
+    fetches = inspect.isclass(found) and issubclass(found, WorldModel) and bool(found.requires.weights)
+    make = partial(world_model, what, **options)
+    if not makes or fetches or deadline > threading.TIMEOUT_MAX:
+        made: WorldModel | None = make()
+        return made
+    try:
+        made = _Helper().do(make, deadline)
+    except LateError as error:
+        name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
+        raise ConstructionError(
+            f"world model '{name}' cannot be made: its constructor did not return within {deadline:g} s (deadline). "
+            "Does it wait for a download, a lock, a server or a prompt? If it is only slow, give a longer deadline",
+            "deadline",
+        ) from error
+    return made
+
+
 class LateError(Exception):
     """The deadline has passed."""
 
     kind = "deadline"
+
+
+class ExitError(Exception):
+    """A model has raised what is meant to end the process, such as `SystemExit`."""
+
+    kind = "raised"
+
+
+def _contain(work: Callable[[], Any]) -> Any:
+    """Return what the work returns; a model's attempt to end the process becomes an `ExitError`."""
+    try:
+        return work()
+    except BaseException as error:
+        if isinstance(error, Exception) or asks_to_stop(error):
+            raise
+        raise ExitError(
+            f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
+        ) from error
 
 
 class _Errand:
@@ -172,7 +226,7 @@ def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
 
 def _said(error: Exception) -> str:
     text = " ".join(str(error).split())
-    return text if isinstance(error, ContractError | LateError) else f"{type(error).__name__}: {text}"
+    return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
 
 
 def _torch_state() -> tuple[bool, bool, int | None] | None:

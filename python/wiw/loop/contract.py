@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,18 @@ GIVEN = ("depth", "simulator")
 """What the loop can give a world model beyond the image; semantics too where the agent has a source of them."""
 PLANS = {"discrete": "discrete primitives", "pose7": "poses of a gripper"}
 """By space, in words."""
+
+
+def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
+    """Hold observations to the depth that an agent with these `needs` reads.
+
+    Raises:
+        ArgumentError: an observation has none.
+    """
+    if "depth" in needs and any(getattr(observation, "depth", None) is None for observation in observations):
+        raise ArgumentError(
+            "this agent needs observations with depth, and got one without: make the environment with depth=True"
+        )
 
 
 def check_model(model: WorldModel, longest: int, space: Space = "discrete", semantics: bool = False) -> None:

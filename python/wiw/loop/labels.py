@@ -45,5 +45,5 @@ def labelled(source: Semantics | str | None, queries: Sequence[Any]) -> list[Any
         if any(query.observation.depth is None for query in queries):
             raise ArgumentError(f"{type(source).__name__} needs depth: make the environment with depth=True")
         depth = np.stack([query.observation.depth for query in queries])
-    labels = source.panoramas(np.stack([query.observation.panorama for query in queries]), depth)
+    labels = source.label_panoramas(np.stack([query.observation.panorama for query in queries]), depth)
     return [replace(query, semantic=own) for query, own in zip(queries, labels, strict=True)]

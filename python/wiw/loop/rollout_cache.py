@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rollouts on disk, so that the same question is put to a world model once.
 
-An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: code, options, weights,
-precision), the observation's bytes, the control and the seed. It holds the frames of one row, raw: a panorama is read
-in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG would take 10 ms. Files appear under their names whole, so
-any number of processes may share a folder. When it outgrows its budget, what was not used for longest goes first.
+An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: class, declared version,
+options, weights), the observation's bytes, the control and the seed. A model without a version is never cached. An
+entry holds the frames of one row, raw: a panorama is read in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG
+would take 10 ms. Files appear under their names whole, so any number of processes may share a folder. When it outgrows
+its budget, what was not used for longest goes first.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -209,14 +211,25 @@ def remember(ask: Attempts, cache: str | Path, budget_gb: float = BUDGET_GB) -> 
     """The model behind a cache: with "auto" where it declares itself `cacheable`, never with "off", else in a folder.
 
     A model that is handed the simulator is never cached: its answer depends on a whole scene, which no key can hold.
-
-    Raises:
-        ArgumentError: the model's content cannot be told; see `WorldModel.fingerprint`.
+    Nor is one without a `version`, for nobody could tell when its answers change: a warning names it.
     """
     accepts = ask.model.accepts
     if cache == "off" or "simulator" in accepts.needs or (cache == "auto" and not accepts.cacheable):
         return ask
+    if not ask.model.fingerprint():
+        _warn_unversioned(type(ask.model).__name__)
+        return ask
     return Remembered(ask, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
+
+
+@lru_cache(None)
+def _warn_unversioned(name: str) -> None:
+    """Says once in a process that a model is not cached."""
+    _log.warning(
+        "rollouts of %s are not cached: it declares no version. Give the class one, as `version = '1'`, and raise it "
+        "whenever its answers change; or leave the cache off",
+        name,
+    )
 
 
 def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:

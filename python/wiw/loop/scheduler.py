@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, ContractError, RolloutError, VlmError
+from wiw.errors import ArgumentError, ContractError, RolloutError, VlmError, asks_to_stop
 from wiw.loop.agent import Agent, Query
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
 
@@ -125,7 +125,9 @@ def _start(
     try:
         stranger = _first_moment(agent, env, strangers[index], Key(seed, index)) if strangers else None
         observation = env.begin(episode)
-    except Exception as error:  # whatever went wrong, the run goes on and the record says so
+    except BaseException as error:  # whatever went wrong, the run goes on and the record says so
+        if asks_to_stop(error):
+            raise
         envs.append(env)
         sink.episode(_failed(index, episode, begin, "environment", error))
         return
@@ -148,7 +150,9 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
         decisions = agent.decide_batch([trial.query(agent) for trial in trials])
     except (ArgumentError, ContractError):
         raise
-    except Exception as error:
+    except BaseException as error:
+        if asks_to_stop(error):
+            raise
         kind = _kind(error)
         sink.lost({**(agent.meter() - before), "seconds": time.perf_counter() - begin})
         for trial in trials:
@@ -162,7 +166,9 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
         try:
             record = trial.carry_out(decision)
             result = _finished(trial) if trial.done else None
-        except Exception as error:
+        except BaseException as error:
+            if asks_to_stop(error):
+                raise
             trial.done = True
             sink.lost({**decision.spent, "seconds": sum(decision.seconds.values())})
             sink.episode(_failed(trial.index, trial.episode, trial.begin, "environment", error))
@@ -173,7 +179,7 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
     return []
 
 
-def _kind(error: Exception) -> str:
+def _kind(error: BaseException) -> str:
     if isinstance(error, RolloutError):
         return f"world_model/{error.kind}"
     return f"vlm/{error.kind}" if isinstance(error, VlmError) else "agent"
@@ -185,7 +191,7 @@ def _finished(trial: Trial) -> EpisodeResult:
     return EpisodeResult(trial.index, trial.episode.episode_id, trial.episode.scene, "done", metrics, seconds)
 
 
-def _failed(index: int, episode: Episode, begin: float, kind: str, error: Exception) -> EpisodeResult:
+def _failed(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     seconds = time.perf_counter() - begin
     return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, seconds, text, kind)

@@ -13,6 +13,7 @@ from wiw.runs.progress import Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
 from wiw.runs.scene_map import keep_scene_maps
+from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
@@ -32,6 +33,27 @@ def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
             "wiw.runs.recipes.AgentRecipe, or `wiw run`"
         )
     return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+
+
+def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:
+    """Return digests, by path, of the user's own source files that a run of these recipes depends on."""
+    found = dict(task.sources())
+    for recipe in agents.values():
+        found |= recipe.sources()
+    return found
+
+
+def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
+    """Hold a run to the user's own source files that it was begun with; closes the store where they have changed.
+
+    Raises:
+        StoreError: a file has changed since.
+    """
+    try:
+        require_sources(store.path.parent, store.info.get("sources"), sources_of(task, agents))
+    except StoreError:
+        store.close()
+        raise
 
 
 def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
@@ -78,7 +100,9 @@ def run_pending(
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
-    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes)
+    plan = Plan(
+        task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes, info.get("sources", {})
+    )
     board = make_board(progress and any(pending.values()))
     try:
         for arm, indices in pending.items():

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
+from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 
 NUMBERS = ("candidates", "horizon", "execute", "depth", "width")
@@ -40,6 +41,12 @@ class TaskRecipe:
         from wiw.registry import task_class
 
         return {"name": absolute(self.name), "options": task_class(self.name).make_portable(self.options)}
+
+    def sources(self) -> dict[str, str]:
+        """Digests of the user's own source files, by path."""
+        from wiw.registry import TASKS
+
+        return {} if self.name in TASKS.built_in else source_digests(TASKS.find(self.name))
 
 
 @dataclass(frozen=True)
@@ -82,12 +89,13 @@ class AgentRecipe:
         `limits` are what a run gives every agent beyond its identity: deadline, cache, fidelity and the like.
         """
         from wiw.loop.agent import Agent
-        from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+        from wiw.loop.attempts import DEADLINE, make_model
+        from wiw.registry import POLICIES, SEMANTICS
 
         given = {name: value for name, value in asdict(self).items() if value is not None}
         options = given.pop("model_options")
         if options:
-            given["model"] = WORLD_MODELS.make(self.model, **options)
+            given["model"] = make_model(self.model, limits.get("deadline", DEADLINE), **options)
         semantics = given.pop("semantics_options")
         if self.model is None:  # nobody would look at them
             given.pop("semantics", None)
@@ -136,6 +144,18 @@ class AgentRecipe:
                 for policy, options in self.policy_options.items()
             }
         return said
+
+    def sources(self) -> dict[str, str]:
+        """Digests of the user's own source files of model, policies and source of semantics, by path."""
+        from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+
+        parts = [(WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.revision)]
+        parts += [(SEMANTICS, None if self.model is None else self.semantics)]
+        found: dict[str, str] = {}
+        for registry, name in parts:
+            if name is not None and name not in registry.built_in:
+                found |= source_digests(registry.find(name))
+        return found
 
     def require(self, task: Mapping[str, Any]) -> None:
         """Sees that the world model is made for a task that describes itself so.
@@ -193,6 +213,10 @@ class Ready:
     def to_json(self) -> None:
         """Nothing: an object in memory cannot be written down."""
 
+    def sources(self) -> dict[str, str]:
+        """Digests of the user's own source files, by path."""
+        return source_digests(self.thing)
+
 
 @dataclass(frozen=True)
 class ReadyAgent(Ready):
@@ -206,6 +230,13 @@ class ReadyAgent(Ready):
         """What the agent says of itself, less the numbers that it leaves open."""
         said, given = self.thing.describe(), self.thing.given
         return {name: value for name, value in said.items() if name not in NUMBERS or name in given}
+
+    def sources(self) -> dict[str, str]:
+        """Digests of the user's own source files of model, policies and source of semantics, by path."""
+        agent, found = self.thing, dict[str, str]()
+        for part in (agent.model, agent.policy, agent.revision, agent.semantics):
+            found |= {} if part is None or isinstance(part, str) else source_digests(part)
+        return found
 
 
 def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskRecipe | Ready:

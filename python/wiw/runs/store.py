@@ -12,7 +12,7 @@ import json
 import math
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -22,6 +22,7 @@ import wiw
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.faults import explained, remedy
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
 SCHEMA_VERSION = 7
@@ -203,16 +204,18 @@ class RunStore:
     @property
     def config(self) -> dict[str, Any]:
         """Task, arms and seed."""
-        return dict(json.loads(self._value("config")))
+        return dict(parse_column("config", self._value("config"), str(self.path)))
 
     @property
     def info(self) -> dict[str, Any]:
         """Platform, how to rebuild task and agents, which episodes keep pictures."""
-        return dict(json.loads(self._value("info")))
+        return dict(parse_column("info", self._value("info"), str(self.path)))
 
     def episodes(self) -> list[Episode]:
         """The episodes that every arm runs; their place in the list is their index."""
-        return [_episode(row) for row in self._rows("SELECT * FROM episode ORDER BY episode")]
+        rows = self._typed("episode", self._rows("SELECT * FROM episode ORDER BY episode"))
+        infos = [parse_column("episode.info", row["info"], self._place("episode", row)) for row in rows]
+        return [_episode(row, info) for row, info in zip(rows, infos, strict=True)]
 
     def outcomes(self) -> list[dict[str, Any]]:
         """Ended episodes of all arms; those of a task with several kinds say of which ("task")."""
@@ -221,8 +224,11 @@ class RunStore:
             "FROM outcome o JOIN episode e USING (episode) "
             "ORDER BY arm, episode"
         )
+        rows = self._typed("outcome", rows)
         named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
-        return [{**row, "metrics": json.loads(row["metrics"])} for row in named]
+        return [
+            {**row, "metrics": parse_column("metrics", row["metrics"], self._place("outcome", row))} for row in named
+        ]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Decisions of ended episodes, of one arm or episode if named, in order."""
@@ -231,9 +237,11 @@ class RunStore:
             "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
             (arm, episode),
         )
-        for row in rows:
+        for row in self._typed("decision", rows):
             for column in DECISION_JSON:
-                row[column] = None if row[column] is None else json.loads(row[column])
+                if row[column] is not None:
+                    row[column] = parse_column(column, row[column], self._place("decision", row))
+            check_decision(row, self._place("decision", row))
         return rows
 
     def totals(self, column: str) -> dict[str, dict[str, float]]:
@@ -274,7 +282,8 @@ class RunStore:
     def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
         """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
         for row in self._rows("SELECT * FROM scene_map WHERE scene = ?", (scene,)):
-            return row["webp"], json.loads(row["world_to_pixel"])
+            where = f"{self.path}: map of {scene}"
+            return row["webp"], parse_column("world_to_pixel", row["world_to_pixel"], where)
         return None
 
     def pending(self, arm: str, retry_failed: bool = False) -> list[int]:
@@ -403,11 +412,54 @@ class RunStore:
         with explained(self.path):
             return [dict(row) for row in self._connection.execute(query, values)]
 
+    def _typed(self, table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """The rows of a table, held to the types of its columns.
+
+        Raises:
+            StoreError: a value is of another type.
+        """
+        columns = self._rows(f"PRAGMA table_info({table})")
+        declared = {
+            column["name"]: _TYPES[column["type"]] + (() if column["notnull"] or column["pk"] else (type(None),))
+            for column in columns
+        }
+        for row in rows:
+            check_types(row, declared, self._place(table, row))
+        return rows
+
+    def _place(self, table: str, row: dict[str, Any]) -> str:
+        names = ", ".join(f"{name} {row[name]}" for name in ("arm", "episode", "decision") if name in row)
+        return f"{self.path}: {table} ({names})"
+
     def _value(self, column: str) -> Any:
         rows = self._rows("SELECT * FROM run")
         if not rows:
             raise StoreError(f"{self.path} is damaged: it does not say which run it holds")
         return rows[0][column]
+
+
+@contextmanager
+def removed_if_empty(path: Path) -> Iterator[None]:
+    """Around the work on a new run: where an error ends it before anything was recorded, the run is removed.
+
+    So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
+    interruption leaves it.
+    """
+    try:
+        yield
+    except Exception:
+        with suppress(StoreError), RunStore.read(path) as store:
+            (counted,) = store._rows(
+                "SELECT (SELECT count(*) FROM decision) + (SELECT count(*) FROM outcome) + (SELECT count(*) FROM lost) "
+                "AS n"
+            )
+            if counted["n"] == 0:
+                for name in ("", "-wal", "-shm"):
+                    path.with_name(path.name + name).unlink(missing_ok=True)
+                path.with_suffix(".lock").unlink(missing_ok=True)
+                with suppress(OSError):  # other files are in it
+                    path.parent.rmdir()
+        raise
 
 
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
@@ -524,7 +576,11 @@ def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
     )
 
 
-def _episode(row: dict[str, Any]) -> Episode:
+_TYPES: dict[str, tuple[type, ...]] = {"TEXT": (str,), "INTEGER": (int,), "REAL": (float, int), "BLOB": (bytes,)}
+"""Of Python, by SQLite's names."""
+
+
+def _episode(row: dict[str, Any], info: dict[str, Any]) -> Episode:
     return Episode(
         row["episode_id"],
         row["scene"],
@@ -533,5 +589,5 @@ def _episode(row: dict[str, Any]) -> Episode:
         (row["goal_x"], row["goal_y"], row["goal_z"]),
         row["goal_yaw"],
         math.nan if row["geodesic"] is None else row["geodesic"],
-        json.loads(row["info"]),
+        info,
     )

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.runs.execute import recipes_of, require_scenes
+from wiw.runs.execute import recipes_of, require_own_sources, require_scenes
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.store import DECISION_JSON, RunStore
 from wiw.runs.workers import Job, Plan, Runner
@@ -81,8 +81,8 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
 
     Raises:
         ArgumentError: fewer than one episode.
-        StoreError: no readable run, one that was begun with objects in memory, whose task has changed, or without an
-            ended episode.
+        StoreError: no readable run, one that was begun with objects in memory, whose task or source files have changed,
+            or without an ended episode.
         FileError: a scene is not there.
     """
     if episodes < 1:
@@ -103,6 +103,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
 
 def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, int], Facts]:
     task, agents = recipes_of(store)
+    require_own_sources(store, task, agents)
     built, info, all_episodes = task.build(), store.info, store.episodes()
     store.require_task(built.describe())
     require_scenes(built, store, [all_episodes[index] for _, index in keys])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, Error, InfrastructureError
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
+from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
 Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
@@ -53,6 +55,8 @@ class Plan:
     """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
     episodes: Sequence[Episode] = ()
     """All episodes of the run, for agents that are shown another one's."""
+    sources: Mapping[str, str] = field(default_factory=dict)
+    """Digests of the user's own source files, which every agent is built of."""
 
     def strangers(self, agent: Any, indices: Iterable[int]) -> dict[int, Episode]:
         """For an agent with placebo="swapped" the next episode of each, counted round; else nothing.
@@ -116,6 +120,7 @@ class Runner:
         if self._arm != job.arm:
             self._agent = None
             self._agent = self._plan.agents[job.arm].build(self._task.defaults, self._plan.limits)
+            require_unchanged(self._plan.sources)
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
         sink = RowSink(job, self._plan, send)
@@ -282,14 +287,21 @@ def _threads_shared(workers: int) -> Iterator[None]:
 
 
 def _work(pipe: Connection) -> None:
-    """A worker's life: None means "give me a job"; an end of the pipe means that the parent has gone."""
+    """A worker's life: None means "give me a job"; an end of the pipe means that the parent has gone.
+
+    It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     try:
         _serve(pipe)
     except (EOFError, BrokenPipeError):
-        return
+        pass
     except Exception as error:
         pipe.send(_portable(error))
+    pipe.close()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _serve(pipe: Connection) -> None:

@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from wiw import _core
@@ -86,9 +85,7 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
         return store.imported(file, options, build)
     if not isolate:
         return _core.scene.import_scene(file, **options)[0]
-    with TemporaryDirectory(prefix="wiw-scene-") as folder:
-        build(Path(folder) / "scene")
-        return _core.scene.map_cache(Path(folder) / "scene")  # the mapping outlives the file
+    return store.temporary(build)
 
 
 def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imports run in a process of their own.
+"""Read untrusted files in a child process.
 
 Readers of 3D formats are large programs that trust their input: a damaged file can make one crash, hang or eat all
-memory. In a child process each of these becomes a FileError, and a run of many scenes goes on.
+memory. In a child process each of these becomes a FileError, and a run of many scenes goes on. The child ends with its
+parent, and has limits of time and memory of its own.
 """
 
 from __future__ import annotations
@@ -17,42 +18,75 @@ from typing import Any
 
 import wiw
 from wiw import errors
-from wiw.errors import FileError
+from wiw.errors import ArgumentError, FileError
 from wiw.scenes.store import Sources
 
 TIMEOUT = 600.0
 """Seconds after which an import is given up; a file of two million triangles takes a few."""
 
+_ERRORS = {error.__name__: error for error in (ArgumentError, FileError)}
+
 
 def import_to(path: Path, options: dict[str, Any], out: Path) -> Sources:
-    """Imports `path` in a child process, which writes the scene to the cache file `out`.
+    """Import `path` in a child process, which writes the scene to the cache file `out`.
 
     Raises:
         FileError: the file is damaged, also where that ends the child: a crash, a time-out, no memory left.
         ArgumentError: an option is none.
     """
-    job = {"path": str(path), "out": str(out), "options": options}
+    reply = read_in_child("wiw.scenes.worker", {"path": str(path), "out": str(out), "options": options})
+    return Sources(tuple(map(Path, reply["read"])), tuple(map(Path, reply["absent"])))
+
+
+def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
+    """Run `python -m module`, which reads the file `job["path"]`, and return its reply (see `wiw.scenes.child`).
+
+    Raises:
+        FileError: the file is damaged, also where that ends the child: a crash, a time-out, no memory left.
+        ArgumentError: what the file asks for cannot be.
+        InfrastructureError: the child could not do its work, whatever the file.
+    """
+    path = job["path"]
+    # The thread that starts the child has to wait for it: the kernel takes the end of that thread for the parent's.
+    message = json.dumps({"job": job, "parent": os.getpid(), "seconds": TIMEOUT})
     try:
         child = subprocess.run(
-            [sys.executable, "-m", "wiw.scenes.worker"],
-            input=json.dumps(job),
+            [sys.executable, "-m", module],
+            input=message.encode(),
             capture_output=True,
-            text=True,
             timeout=TIMEOUT,
             check=False,
             env=_environment(),
         )
     except subprocess.TimeoutExpired:
-        raise FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was given up (damaged file?)") from None
+        raise _out_of_time(path) from None
+    if child.returncode in (-signal.SIGALRM, -signal.SIGXCPU):
+        raise _out_of_time(path)
     if child.returncode < 0:
         name = signal.Signals(-child.returncode).name
-        raise FileError(f"{path}: the importer crashed on it with {name} (damaged file)")
-    if child.returncode > 0:
-        raise errors.InfrastructureError(f"{path}: the importing process failed: {child.stderr.strip()[-2000:]}")
-    reply = json.loads(child.stdout)
+        raise FileError(
+            f"{path}: the importer crashed on it with {name} (damaged file; export it again, or open it in another "
+            "program to check it)"
+        )
+    return _reply(path, child)
+
+
+def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, Any]:
+    """What the child answers; its errors are raised here."""
+    try:
+        reply = json.loads(child.stdout) if child.returncode == 0 else None
+    except ValueError:
+        reply = None
+    if not isinstance(reply, dict):
+        end = child.stderr.decode(errors="replace").strip()[-2000:]
+        raise errors.InfrastructureError(f"{path}: the importing process failed (exit code {child.returncode}): {end}")
     if "error" in reply:
-        raise getattr(errors, reply["error"])(reply["message"])
-    return Sources(tuple(map(Path, reply["read"])), tuple(map(Path, reply["absent"])))
+        raise _ERRORS.get(reply["error"], errors.InfrastructureError)(reply["message"])
+    return reply
+
+
+def _out_of_time(path: str) -> FileError:
+    return FileError(f"{path}: importing took more than {TIMEOUT:.0f} s and was given up (damaged file?)")
 
 
 def _environment() -> dict[str, str]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 from wiw import _core
@@ -51,14 +52,20 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
     """The scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
 
     `build(path)` imports the scene and writes it to `path`. Paths in `options` must be absolute. A link to a source
-    counts as another source: its textures are looked for beside the link.
+    counts as another source: its textures are looked for beside the link. Where the folder cannot be written, a
+    warning says so and the scene is kept for this process alone.
     """
     manifest = folder() / f"{_key([str(source.absolute()), options])}.json"
     known = _known(manifest)
     if known is not None:
         return known
-    folder().mkdir(parents=True, exist_ok=True)
     draft = _draft(manifest)
+    try:
+        folder().mkdir(parents=True, exist_ok=True)
+        draft.touch()
+    except OSError as error:
+        _log.warning("an imported scene is not kept and will be imported again the next time: %s", error)
+        return temporary(build)
     started = time.time_ns()
     try:
         sources = build(draft)
@@ -73,6 +80,13 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
         absent = [str(path.absolute()) for path in dict.fromkeys(sources.absent)]
         _write(manifest, {"scene": scene.name, "read": entries, "absent": absent})
     return _core.scene.map_cache(scene)
+
+
+def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
+    """The scene that `build(path)` writes, mapped from a file that is removed at once; the mapping outlives it."""
+    with TemporaryDirectory(prefix="wiw-scene-") as place:
+        build(Path(place) / "scene")
+        return _core.scene.map_cache(Path(place) / "scene")
 
 
 def generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:

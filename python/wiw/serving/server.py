@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,9 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
+from wiw.runs.sources import source_digests
 from wiw.serving.known import Known
+from wiw.serving.outbox import Outbox
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
 from wiw.wire.messages import Answer, Ask, Hello, Message, Refusal, Wait, Welcome, decode, encode
@@ -42,6 +45,10 @@ AHEAD = 4
 """Full batches that one client may have unanswered, so that rows travel while others are computed."""
 HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0
 """Seconds: between pings, without an answer to one until a client counts as gone, and for a client's first message."""
+UNREAD = 30.0
+"""Seconds in which a client takes nothing of what waits for it, until it is sent away."""
+CLOSING = 1.0
+"""Seconds that a client has to end the connection in order."""
 TICK = 0.1
 POLICY_VIOLATION = 1008
 _log = logging.getLogger("wiw.serving.connections")
@@ -139,6 +146,8 @@ class Server:
         self._jobs: dict[bytes, Job] = {}
         self._known = Known(KNOWN_BYTES)
         self._owed: Counter[ServerConnection] = Counter()
+        """Rows of each client that wait, are computed, or whose answers have not left."""
+        self._outboxes: dict[ServerConnection, Outbox] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._ending = asyncio.Event()
@@ -152,6 +161,11 @@ class Server:
     def taken(self) -> int:
         """Rows that wait or are computed."""
         return len(self._jobs)
+
+    @property
+    def unsent_bytes(self) -> int:
+        """Bytes of messages that clients have not taken yet."""
+        return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
         """Serves until `end` is called; then finishes what it has taken.
@@ -199,7 +213,7 @@ class Server:
             ping_interval=HEARTBEAT,
             ping_timeout=SILENCE,
             open_timeout=HANDSHAKE,
-            close_timeout=1,
+            close_timeout=CLOSING,
             server_header=None,
             logger=_log,
         )
@@ -219,20 +233,25 @@ class Server:
         """One client, from its first message to its last."""
         self._owed[client] = 0
         self.queue.join(client)
+        outbox = self._outboxes[client] = Outbox(client, self._welcome.in_flight)
+        sending = asyncio.ensure_future(outbox.run())
         try:
             hello = decode(await asyncio.wait_for(client.recv(), HANDSHAKE))
             if not isinstance(hello, Hello):
                 raise RemoteError(f"expected a hello first, got {type(hello).__name__}", "message")
             await client.send(encode(self._welcome))
             async for data in client:
-                await self._hear(client, decode(data))
+                await outbox.room()  # what is not read from the client waits on its own machine
+                self._hear(client, outbox, decode(data))
         except RemoteError as error:
             self.refused += 1
             await self._dismiss(client, error)
         except (ConnectionClosed, asyncio.TimeoutError):
             pass
         finally:
-            del self._owed[client]
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+            del self._owed[client], self._outboxes[client]
             for job in self.queue.leave(client):
                 del self._jobs[job.id]
             for job in self._jobs.values():
@@ -243,7 +262,13 @@ class Server:
             await client.send(encode(Refusal(b"", error.kind, str(error))))
             await client.close(POLICY_VIOLATION, error.kind)
 
-    async def _hear(self, client: ServerConnection, said: Message) -> None:
+    async def _send_away(self, client: ServerConnection, outbox: Outbox) -> None:
+        reason = f"{len(outbox)} answers, {outbox.unsent_bytes} bytes, were not read for {UNREAD:g} s"
+        with contextlib.suppress(ConnectionClosed, asyncio.TimeoutError):
+            await asyncio.wait_for(client.close(POLICY_VIOLATION, reason), CLOSING)
+        client.transport.abort()  # the farewell waits behind what is not read
+
+    def _hear(self, client: ServerConnection, outbox: Outbox, said: Message) -> None:
         if not isinstance(said, Ask):
             raise RemoteError(f"expected an ask, got {type(said).__name__}", "message")
         if said.id != row_id(said.row):
@@ -252,9 +277,9 @@ class Server:
         taken = answer is None and not reason and self._take(client, said)
         self.queue.announce(client, said.rest)
         if answer is not None:
-            await client.send(answer)
+            outbox.put(answer)
         elif not taken:
-            await client.send(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
+            outbox.put(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
 
     def _cannot(self, client: ServerConnection) -> str:
         """Why no row of this client is taken now; empty where one is."""
@@ -276,7 +301,7 @@ class Server:
                 check_row(row, self.model.accepts)
             except RemoteError as error:
                 self.refused += 1
-                self._say(client, encode(Refusal(ask.id, error.kind, str(error))))
+                self._outboxes[client].put(encode(Refusal(ask.id, error.kind, str(error))))
                 return True
             job = Job(ask.id, row, now, now + ask.seconds)
             if not self.queue.put(job, client, ask.rest):
@@ -312,12 +337,14 @@ class Server:
         """Tells all who asked."""
         self._jobs.pop(job.id, None)
         for client in [client for client in self._owed if client in job.askers]:  # others have gone
-            self._owed[client] -= 1
             self.queue.answered(client)
-            self._say(client, answer)
+            outbox, message = self._outboxes[client], answer
+            if not outbox.takes(len(answer)):
+                message = encode(Wait(job.id, self._pause(), "earlier answers wait to be read"))
+            outbox.put(message, partial(self._release, client))
 
-    def _say(self, client: Any, message: bytes) -> None:
-        self._start(_send(client, message))
+    def _release(self, client: ServerConnection) -> None:
+        self._owed[client] -= 1
 
     def _start(self, work: Any) -> None:
         task = asyncio.ensure_future(work)
@@ -325,31 +352,37 @@ class Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _tick(self) -> None:
-        """Tells those whose rows were not begun in time."""
+        """Tells those whose rows were not begun in time, and sends those away who read nothing."""
+        leaving = set[ServerConnection]()
         while True:
             await asyncio.sleep(TICK)
+            leaving &= set(self._outboxes)
+            for client, outbox in self._outboxes.items():
+                if outbox.stalled_seconds() > UNREAD and client not in leaving:
+                    leaving.add(client)
+                    self.refused += 1
+                    self._start(self._send_away(client, outbox))
             for job in self.queue.expired():
                 self._settle(
                     job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
                 )
 
     async def _finished(self) -> None:
-        while self._jobs or self._tasks:
+        while self._jobs or self._tasks or any(self._outboxes.values()):
             await asyncio.sleep(TICK)
 
 
-async def _send(client: ServerConnection, message: bytes) -> None:
-    with contextlib.suppress(ConnectionClosed):
-        await client.send(message)
-
-
 def _welcome(model: WorldModel, in_flight: int) -> Welcome:
-    try:
-        fingerprint, unknown = model.fingerprint(), ""
-    except ArgumentError as error:
-        fingerprint, unknown = "", str(error)
-    described = json.dumps(model.describe(), default=str)
+    fingerprint = model.fingerprint()
+    unknown = "" if fingerprint else f"{type(model).__name__} declares no version"
+    described = json.dumps({**model.describe(), **_sources(model, fingerprint)}, default=str)
     return Welcome(declaration(model.accepts), described, fingerprint, unknown, in_flight)
+
+
+def _sources(model: WorldModel, fingerprint: str) -> dict[str, Any]:
+    """Return what tells versions of a model apart that declares none: digests of its source files, by name."""
+    digests = {} if fingerprint else source_digests(model)
+    return {"sources": {Path(path).name: digest for path, digest in digests.items()}} if digests else {}
 
 
 def _is_loopback(host: str) -> bool:

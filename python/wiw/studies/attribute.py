@@ -15,7 +15,7 @@ from typing import Any
 from wiw._core import core
 from wiw.analysis.blame import FOLDER, SWAPS, Blame, blame, failed_episodes, swapped, swaps_of
 from wiw.errors import ArgumentError
-from wiw.runs.execute import recipes_of, require_scenes, run_pending
+from wiw.runs.execute import recipes_of, require_own_sources, require_scenes, run_pending
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe
 from wiw.runs.store import RunStore
@@ -105,6 +105,7 @@ def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[
     """
     base.require_version()
     task, agents = recipes_of(base)
+    require_own_sources(base, task, agents)
     built, episodes = task.build(), base.episodes()
     base.require_task(built.describe())
     if not built.has_guide:

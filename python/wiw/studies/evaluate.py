@@ -13,10 +13,17 @@ from typing import Any, Literal
 
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.metrics import Lpips
-from wiw.runs.execute import recipes_of, require_left, run_pending, with_pictures
+from wiw.runs.execute import (
+    recipes_of,
+    require_left,
+    require_own_sources,
+    run_pending,
+    sources_of,
+    with_pictures,
+)
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
-from wiw.runs.store import RunStore
+from wiw.runs.store import RunStore, removed_if_empty
 from wiw.studies.run_log import RunLog
 from wiw.types import checked_seed
 
@@ -78,7 +85,8 @@ def evaluate(
 
     Raises:
         ArgumentError: options for a task that is already made; a number out of range.
-        StoreError: `out` holds a run and `resume` is off, or a run of another configuration.
+        StoreError: `out` holds a run and `resume` is off, or a run of another configuration, or of source files that
+            have changed since.
         ContractError: a policy or a world model broke its contract.
         InfrastructureError: worker processes cannot be started or given their work.
         WeightsError: those of LPIPS are not there; says which, and how to get them.
@@ -128,7 +136,8 @@ def resume_run(
     Raises:
         ArgumentError: fewer than one worker.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
-            its preset's file has changed, or the navigation mesh beside a scene has come or gone.
+            its preset's file or the source file of a model, policy or task of the user's own has changed, or the
+            navigation mesh beside a scene has come or gone.
         FileError: the scene of an episode that is left is not there; nothing is recorded.
     """
     if workers is not None:
@@ -139,6 +148,7 @@ def resume_run(
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
         task, agents = recipes_of(store)
+        require_own_sources(store, task, agents)
         built = task.build()
         store.require_task(built.describe())
     except Error:
@@ -241,6 +251,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     if options.resume and options.out is not None and RunStore.begun(options.out):
         store = RunStore.resume(options.out, config)
         require_left(built, store, agents)
+        require_own_sources(store, task, agents)
     else:
         started = time.perf_counter()
         episodes = built.episodes(options.episodes)
@@ -250,6 +261,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
+            "sources": sources_of(task, agents),
             "pictures": with_pictures(episodes, options.pictures),
             "scenes": used,
             "stage": built.stage,
@@ -261,6 +273,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes)
+        with removed_if_empty(store.path):
+            return _finish(store, task, agents, options.workers, options.progress)
     return _finish(store, task, agents, options.workers, options.progress)
 
 

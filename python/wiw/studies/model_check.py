@@ -5,24 +5,28 @@ from __future__ import annotations
 
 import json
 import sysconfig
+import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
-from wiw.errors import ArgumentError, ContractError, Error
-from wiw.loop.attempts import DEADLINE, LateError
+from wiw.errors import ArgumentError, ConstructionError, ContractError
+from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
 from wiw.loop.contract import check_model as check_needs
-from wiw.registry import world_model
+from wiw.studies.frame_faults import altered, exchange_turns, mean_correlation, share_of_jumps
+from wiw.studies.model_networks import place_of_computation, training_networks
 from wiw.studies.questions import Frames, Questions, Row
 from wiw.types import Control, Space
 from wiw.world_models.base import WorldModel
+from wiw.world_models.pictures import CLOSE, OTHER
 
 PRIMITIVES = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
 """No leading turns, which the loop makes itself. The first two begin alike, for models that say they are causal."""
@@ -47,7 +51,15 @@ ALIKE = 2
 SHORT = 2
 """Actions of a second length, for models that take any."""
 NOISE = 8
-"""Levels of 255 up to which a difference may come of the order in which a GPU adds up."""
+"""Levels of 255 up to which a difference may come of rounding."""
+MARGIN = 0.06
+"""By how much another order of the frames has to fit better, in correlation."""
+MANY_JUMPS = 0.005
+"""Share of neighbouring pixels that jump from black to white in no ordinary picture."""
+SETTLE = 0.3
+"""Seconds in which an answer that is still written to changes."""
+PICTURES: Mapping[str, str] = {"channels": "pictures", "scale": "pictures"}
+"""Kinds of a `ContractError` that belong to another check than the one in which they came up."""
 RUNS: Mapping[Space, tuple[str, int]] = {
     "discrete": ("100 episodes of ImageNav", 100 * 20 * 3),
     "pose7": ("200 episodes of manipulation", 200 * 3 * 5),
@@ -59,13 +71,33 @@ LONG_RUN = 24.0
 """Hours from which such a run is called slow."""
 
 
+Result = Literal["passed", "wrong", "note", "skipped"]
+CHECKS: Mapping[str, str] = {
+    "construction": "It can be made, and an agent can give it what it needs",
+    "answer": "It answers in time, with uint8 [rows, actions + 1, height, width, 3], no NaN",
+    "frame 0": "Frame 0 is the observation",
+    "pictures": "Frames are upright pictures of the place in RGB from 0 to 255",
+    "plan": "Frame k shows what follows action k, and different plans give different frames",
+    "training": "Its networks are in evaluation mode",
+    "random": "The same seeds give the same frames",
+    "batch": "A row does not depend on the rows beside it",
+    "causal": "As declared (causal), frames depend on no later action",
+    "inputs": "It leaves alone what it is given",
+    "memory": "It leaves alone what it has answered",
+    "length": "It takes plans of another length",
+    "identity": "It describes itself as JSON, and has a version if its rollouts are to be cached",
+    "speed": "How long a rollout takes",
+}
+"""What is looked at, in this order."""
+
+
 @dataclass(frozen=True)
 class Finding:
     """One thing that was found out about a world model."""
 
     kind: str
-    """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "inputs", "random", "batch", "causal",
-    "plan", "describe", "fingerprint", or "slow"."""
+    """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
+    "batch", "causal", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
     """What is wrong, what was seen, and what to do."""
     serious: bool = True
@@ -73,6 +105,26 @@ class Finding:
 
     def __str__(self) -> str:
         return self.text
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at, and what came of it."""
+
+    name: str
+    """A key of `CHECKS`."""
+    findings: tuple[Finding, ...] = ()
+    skipped: str = ""
+    """Why it was not looked at; empty if it was."""
+    detail: str = ""
+    """What else is to be said, such as a time."""
+
+    @property
+    def result(self) -> Result:
+        """In one word."""
+        if any(finding.serious for finding in self.findings):
+            return "wrong"
+        return "note" if self.findings else "skipped" if self.skipped else "passed"
 
 
 def check_model(
@@ -83,14 +135,15 @@ def check_model(
         for finding in wiw.check_model(MyModel()):
             print(finding)
 
-    Looked at are type, dtype, shape, number of frames and NaN, frame 0, what it does to its inputs and to earlier
-    answers, whether the same seeds give the same frames, whether a row depends on those beside it, whether `causal` is
-    true, whether the plan makes a difference, and how long it takes, if it answers at all.
+    Looked at are type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and order in
+    time of the frames, beside what an agent would truly see; networks left in training mode; what it does to its
+    inputs and to earlier answers; whether the same seeds give the same frames, whether a row depends on those beside
+    it, whether `causal` is true, whether the plan makes a difference, and how long it takes, if it answers at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
         scenes: where the observations come from; of a model that takes poses, from the tables of manipulation.
-        deadline: seconds that a call may take, after which it is not asked any more.
+        deadline: seconds that a call or the constructor may take, after which it is not asked any more.
         options: what the model is made with.
 
     Returns:
@@ -100,19 +153,35 @@ def check_model(
         RegistryError: no such model; other errors of wiw where it cannot be made.
         ArgumentError: a deadline that is not above 0.
     """
+    checks = examine_model(model, scenes, deadline=deadline, **options)
+    return [finding for check in checks for finding in check.findings]
+
+
+def examine_model(
+    model: Any, scenes: str | Path = "apartments:val:1", *, deadline: float = DEADLINE, **options: Any
+) -> list[Check]:
+    """Return everything that `check_model` looks at, each with what came of it."""
+    if not deadline > 0:
+        raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
     try:
-        made = world_model(model, **options)
-    except Error:
-        raise
-    except Exception as error:
-        return [Finding("raised", f"It cannot be made: {_told(error)}.")]
+        made = make_model(model, deadline, **options)
+    except ConstructionError as error:
+        cause = error.__cause__
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_told(cause)}."
+        return _only(Finding(error.kind, text))
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
         check_needs(made, LENGTH, made.accepts.space, semantics=True)
     except ArgumentError as error:
-        return [Finding("needs", f"{error}.")]
-    return list(_Check(made, str(scenes), deadline).findings())
+        return _only(Finding("needs", f"{error}."))
+    return _Check(made, str(scenes), deadline).checks()
+
+
+def _only(finding: Finding) -> list[Check]:
+    """A first check that leaves nothing to ask."""
+    first, *others = CHECKS
+    return [Check(first, (finding,)), *(Check(name, skipped="there is no model to ask") for name in others)]
 
 
 class _Check:
@@ -122,57 +191,172 @@ class _Check:
         self.model, self.accepts, self.deadline = model, model.accepts, deadline
         self.plans = PLANS[self.accepts.space]
         self.asking = Questions(model, scenes, deadline)
+        self.steps = min(LENGTH, self.accepts.frames - 1 if self.accepts.frames else LENGTH)
+        self.rows: list[Row] = []
+        self.frames: Frames = np.empty(0, np.uint8)
         self.row_seconds = 0.0
+        self._done: dict[str, Check] = {"construction": Check("construction")}
 
-    def findings(self) -> Iterator[Finding]:
-        """All there are, in the order in which they are found; the first broken answer ends the asking."""
+    def checks(self) -> list[Check]:
+        """All of them, in order; the first broken answer ends the asking."""
+        asked: Mapping[str, Callable[[], Iterable[Finding]]] = {
+            "answer": self._answer,
+            "frame 0": self._first_frames,
+            "pictures": self._pictures,
+            "plan": self._plan,
+            "training": self._training,
+            "random": self._again,
+            "batch": self._alone,
+            "causal": self._causal,
+            "length": self._short,
+            "inputs": self._inputs,
+            "memory": self._memory,
+        }
+        broken = ""
+        for name, look in asked.items():
+            broken = self._look(name, look, broken) or broken
+        self._done["identity"] = Check("identity", tuple(self._identity()))
+        self._done["speed"] = self._speed()
+        return [self._done[name] for name in CHECKS]
+
+    def _look(self, name: str, look: Callable[[], Iterable[Finding]], broken: str) -> str:
+        """Looks at one thing; returns why nothing more can be asked, if that is so."""
+        if name in self._done:  # it is what broke
+            return ""
+        skipped = broken or self._needless(name)
+        if skipped:
+            self._done[name] = Check(name, skipped=skipped)
+            return ""
         try:
-            yield from self._answers()
+            self._done[name] = Check(name, tuple(look()))
+            return ""
         except ContractError as error:
-            yield Finding(error.kind, f"{error}.")
+            finding = Finding(error.kind, f"{error}.")
         except LateError:
-            yield Finding(
+            finding = Finding(
                 "deadline",
                 f"No answer in {self.deadline:g} s, so it was asked no more. In a run such a call is made three times, "
                 "then its episode has failed. Does it wait for a download, a lock, a server or a prompt? If it is only "
                 "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
+        except ExitError as error:
+            text = (
+                f"`rollout` raised {_told(error.__cause__ or error)}. A model that cannot answer raises an Exception."
+            )
+            finding = Finding("raised", text)
         except Exception as error:
-            yield Finding("raised", f"`rollout` raised {_told(error)}.")
-        yield from self._identity()
-        yield from self._speed()
+            finding = Finding("raised", f"`rollout` raised {_told(error)}.")
+        where = finding.kind if finding.kind in CHECKS else PICTURES.get(finding.kind, name)
+        if where != name:
+            self._done[name] = Check(name)
+        self._done[where] = Check(where, (finding,))
+        return "it gave no usable answer"
 
-    def _answers(self) -> Iterator[Finding]:
-        steps = min(LENGTH, self.accepts.frames - 1 if self.accepts.frames else LENGTH)
-        rows = self.asking.rows([plan[:steps] for plan in self.plans])
-        self.asking.ask(rows[:1])  # the first call may load and compile
-        frames = self.asking.ask(rows)
+    def _needless(self, name: str) -> str:
+        """Why something need not be looked at, if that is so."""
+        if name in ("batch", "causal") and self._done["random"].findings:
+            return "every comparison would fail: its answers are random"
+        if name == "causal" and not self.accepts.causal:
+            return "it declares causal=False"
+        if name == "length" and self.accepts.frames:
+            return f"it declares {self.accepts.frames} frames"
+        return ""
+
+    def _answer(self) -> Iterator[Finding]:
+        self.rows = self.asking.rows([plan[: self.steps] for plan in self.plans])
+        self.asking.ask(self.rows[:1])  # the first call may load and compile
+        self.frames = self.asking.ask(self.rows)
         self.row_seconds = self.asking.row_seconds
-        yield from self._first_frames(rows, frames)
-        again = list(self._again(rows, frames, steps))
-        yield from again
-        if not again:  # else every comparison would fail
-            yield from self._alone(rows, frames, steps)
-            yield from self._causal(rows)
-        yield from self._plan(rows, frames, steps)
-        yield from self._inputs()
-        if not self.accepts.frames:
-            self.asking.ask(self.asking.rows([plan[:SHORT] for plan in self.plans]))
+        yield from ()
 
-    def _first_frames(self, rows: Sequence[Row], frames: Frames) -> Iterator[Finding]:
-        off = np.abs(frames[:, 0].astype(np.int16) - np.stack([row.image for row in rows]))
-        if off.any():
+    def _short(self) -> Iterator[Finding]:
+        self.asking.ask(self.asking.rows([plan[:SHORT] for plan in self.plans]))
+        yield from ()
+
+    def _first_frames(self) -> Iterator[Finding]:
+        off = np.abs(self.frames[:, 0].astype(np.int16) - np.stack([row.image for row in self.rows]))
+        if not off.any():
+            return
+        difference = f"it differs by up to {off.max()} of 255, {off.mean():.1f} on average"
+        if off.mean() <= CLOSE:
             yield Finding(
                 "frame 0",
-                f"Frame 0 is not the observation: it differs by up to {off.max()} of 255, {off.mean():.1f} on average. "
-                "Frame k is what follows action k; put the observation in front: frames[:, 0] = observations.image.",
+                f"Frame 0 is the observation only nearly: {difference}, as of a picture that was encoded and decoded. "
+                "That costs next to nothing; frames[:, 0] = observations.image mends it.",
+                serious=False,
+            )
+        else:
+            yield Finding(
+                "frame 0",
+                f"Frame 0 is not the observation: {difference}. Frame k is what follows action k; put the observation "
+                "in front: frames[:, 0] = observations.image.",
             )
 
-    def _again(self, rows: Sequence[Row], frames: Frames, steps: int) -> Iterator[Finding]:
-        shared = min(1, steps - 1)
-        off = _off(self.asking.ask(rows, shared), frames, shared, steps)
+    def _pictures(self) -> Iterator[Finding]:
+        own = self._own()
+        jumps, usual = share_of_jumps(own), share_of_jumps(np.stack([row.image for row in self.rows]))
+        if jumps > MANY_JUMPS + 4 * usual:
+            yield Finding(
+                "pictures",
+                f"Values wrap around: in {jumps:.1%} of places neighbouring pixels jump from nearly 0 to nearly 255 "
+                f"(in the observations: {usual:.1%}). Clip before the cast: np.clip(frames, 0, 255).astype(np.uint8).",
+            )
+            return
+        truth = self.asking.true_frames(self.rows, [row.plan for row in self.rows])
+        if fault := altered(truth, own):
+            yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
+
+    def _own(self) -> list[Frames]:
+        """The frames of each row that stand for its actions."""
+        if self.accepts.space == "discrete":
+            return [frames[1 : 1 + self.steps] for frames in self.frames]
+        places = action.frames_of_actions(self.steps, self.frames.shape[1], "resample")[:, 1]
+        return [frames[places] for frames in self.frames]
+
+    def _plan(self) -> Iterator[Finding]:
+        places = {id(row): place for place, row in enumerate(self.rows)}
+        pairs = [(self.frames[places[id(one)]], self.frames[places[id(other)]]) for one, other in _pairs(self.rows)]
+        if self.accepts.control == "image" or not pairs:
+            return
+        if all(np.array_equal(one[1 : 1 + self.steps], other[1 : 1 + self.steps]) for one, other in pairs):
+            yield Finding(
+                "plan",
+                "Different plans gave the same frames, so it cannot tell an agent which one is better. Does `rollout` "
+                f"read the control that it declares ('{self.accepts.control}')?",
+                serious=False,
+            )
+            return
+        own, plans = self._own(), [row.plan for row in self.rows]
+        truth = self.asking.true_frames(self.rows, plans)
+        alike = mean_correlation(truth, own)
+        if mean_correlation([frames[::-1] for frames in truth], own) > max(OTHER, alike + MARGIN):
+            yield Finding(
+                "plan",
+                "Time runs backwards: the frames are those of the plan from its end to its beginning. Frame k is what "
+                "follows action k: frames[:, 1:] = frames[:, :0:-1] turns them round.",
+            )
+        elif self.accepts.space == "discrete":
+            swapped = self.asking.true_frames(self.rows, [exchange_turns(plan) for plan in plans])
+            if mean_correlation(swapped, own) > max(OTHER, alike + MARGIN):
+                yield Finding(
+                    "plan",
+                    "Left and right are exchanged: the frames are those of the plan with every turn to the other side. "
+                    "Azimuths grow to the left (docs/conventions.md).",
+                )
+
+    def _training(self) -> Iterator[Finding]:
+        for path, layers in training_networks(self.model):
+            yield Finding(
+                "training",
+                f"{path} is in training mode, with {', '.join(layers)}: dropout draws without the seeds, and batch "
+                "statistics mix the rows. Call .eval() on it once it is loaded.",
+            )
+
+    def _again(self) -> Iterator[Finding]:
+        shared = min(1, self.steps - 1)
+        off = _off(self.asking.ask(self.rows, shared), self.frames, shared, self.steps)
         if off.any():
-            yield _differing(
+            yield self._differing(
                 "random",
                 f"Asked twice with the same seeds, {_share(off)} differ, by up to {off.max()} of 255. Draw all noise "
                 "from the row's own seed, as torch.Generator().manual_seed(int(seed)), switch dropout off (eval()), "
@@ -180,12 +364,13 @@ class _Check:
                 off,
             )
 
-    def _alone(self, rows: Sequence[Row], frames: Frames, steps: int) -> Iterator[Finding]:
-        shared, some = min(2, steps - 1), [len(rows) - 1, len(rows) // 2]
+    def _alone(self) -> Iterator[Finding]:
+        rows = self.rows
+        shared, some = min(2, self.steps - 1), [len(rows) - 1, len(rows) // 2]
         alone = np.concatenate([self.asking.ask([rows[place]], shared) for place in some])
-        off = _off(alone, frames[some], shared, steps)
+        off = _off(alone, self.frames[some], shared, self.steps)
         if off.any():
-            yield _differing(
+            yield self._differing(
                 "batch",
                 f"A row depends on the rows beside it: alone, {_share(off)} differ from the same in a batch of "
                 f"{min(len(rows), self.accepts.best_batch)}, by up to {off.max()} of 255. Draw each row's noise from "
@@ -194,48 +379,46 @@ class _Check:
                 off,
             )
 
-    def _causal(self, rows: Sequence[Row]) -> Iterator[Finding]:
+    def _causal(self) -> Iterator[Finding]:
         """Whether frames of a declared causal model stay the same when later primitives change."""
         alike = [
             (one, other)
-            for one, other in _pairs(rows)
+            for one, other in _pairs(self.rows)
             if len(one.control.actions) >= LENGTH and _begin_alike(one.control, other.control)
         ]
-        if not self.accepts.causal or not alike:
+        if not alike:
             return
         one, other = alike[0]
         answer = self.asking.ask([replace(other, seed=one.seed)])
         off = _off(answer, self.asking.ask([one]), 0, ALIKE)
         if off.any():
-            yield _differing(
+            yield self._differing(
                 "causal",
                 f"It declares causal=True, but frames before a changed action change with it, by up to {off.max()} "
                 "of 255; plans that begin alike would share frames that are not theirs. Declare causal=False.",
                 off,
             )
 
-    def _plan(self, rows: Sequence[Row], frames: Frames, steps: int) -> Iterator[Finding]:
-        places = {id(row): place for place, row in enumerate(rows)}
-        pairs = [(frames[places[id(one)]], frames[places[id(other)]]) for one, other in _pairs(rows)]
-        if self.accepts.control == "image" or not pairs:
-            return
-        if all(np.array_equal(one[1 : 1 + steps], other[1 : 1 + steps]) for one, other in pairs):
-            yield Finding(
-                "plan",
-                "Different plans gave the same frames, so it cannot tell an agent which one is better. Does `rollout` "
-                f"read the control that it declares ('{self.accepts.control}')?",
-                serious=False,
-            )
-
     def _inputs(self) -> Iterator[Finding]:
         if self.asking.changed:
             changed = ", ".join(sorted(self.asking.changed))
             yield Finding("inputs", f"It changes what it is given: {changed}. Work on a copy.")
+
+    def _memory(self) -> Iterator[Finding]:
+        time.sleep(SETTLE)  # for a thread that still writes
+        self.asking.look_back()
         if self.asking.reuses:
             yield Finding(
                 "memory",
-                "An answer lies in the memory of the one before, which is still looked at when the next call is made. "
+                "An answer lies in the memory of an earlier one, which is still looked at when the next call is made. "
                 "Return an array of its own, as frames.copy().",
+            )
+        elif self.asking.rewrites:
+            yield Finding(
+                "memory",
+                "An answer was written to after it was returned, while it was being looked at: by a later call, a "
+                "thread, or a copy from the GPU that nobody waited for. Return an array that nobody else holds, once "
+                "it is whole.",
             )
 
     def _identity(self) -> Iterator[Finding]:
@@ -243,23 +426,40 @@ class _Check:
             json.dumps(self.model.describe())
         except Exception as error:
             yield Finding("describe", f"`describe` gives no JSON for the run's record: {_told(error)}.")
-        if self.accepts.cacheable:
-            try:
-                self.model.fingerprint()
-            except Exception as error:
-                yield Finding("fingerprint", f"It declares cacheable=True, but: {_told(error)}.")
+        if self.accepts.cacheable and not self.model.fingerprint():
+            yield Finding(
+                "version",
+                "It declares cacheable=True, but no version, so nothing is cached. Give the class one, as "
+                "`version = '1'`, and raise it whenever its answers change.",
+            )
 
-    def _speed(self) -> Iterator[Finding]:
+    def _speed(self) -> Check:
+        if not self.row_seconds:
+            return Check("speed", skipped="it gave no usable answer")
         run, rows = RUNS[self.accepts.space]
         hours = self.row_seconds * rows / 3600
-        if hours > LONG_RUN:
-            yield Finding(
-                "slow",
-                f"A row takes {self.row_seconds:.3g} s. A run of {run} asks for about {rows} of them: "
-                f"{hours:.0f} hours. Fewer denoising steps, a larger best_batch or `wiw "
-                "serve` on a faster machine make it shorter; --cache asks nothing twice.",
-                serious=False,
-            )
+        batch = min(len(self.rows), self.accepts.best_batch)
+        detail = f"{self.row_seconds:.3g} s a rollout of {self.steps} actions, {batch} at a time"
+        found = Finding(
+            "slow",
+            f"A row takes {self.row_seconds:.3g} s. A run of {run} asks for about {rows} of them: "
+            f"{hours:.0f} hours. Fewer denoising steps, a larger best_batch or `wiw "
+            "serve` on a faster machine make it shorter; --cache asks nothing twice.",
+            serious=False,
+        )
+        return Check("speed", (found,) if hours > LONG_RUN else (), detail=detail)
+
+    def _differing(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
+        """A finding, which is no breach where it may be rounding."""
+        if off.max() > NOISE:
+            return Finding(kind, text)
+        where = place_of_computation(self.model)
+        cause = {
+            "gpu": "So little may come of the order in which a GPU adds up.",
+            "cpu": "So little may be rounding: a CPU adds up in another order where batches or threads differ.",
+            "elsewhere": "So little may be rounding on the machine that computes it.",
+        }
+        return Finding(kind, f"{text} {cause[where]}", serious=False)
 
 
 def _begin_alike(one: Control, other: Control) -> bool:
@@ -284,14 +484,7 @@ def _share(off: NDArray[np.int16]) -> str:
     return f"{sum(bool(row.any()) for row in off)} of {len(off)} rows"
 
 
-def _differing(kind: str, text: str, off: NDArray[np.int16]) -> Finding:
-    """A finding, which is no breach where it may be the order of additions on a GPU."""
-    if off.max() > NOISE:
-        return Finding(kind, text)
-    return Finding(kind, f"{text} So little may come of the order in which a GPU adds up.", serious=False)
-
-
-def _told(error: Exception) -> str:
+def _told(error: BaseException) -> str:
     """What was raised, and where: the last line before libraries were entered, which is the model's own."""
     frames = traceback.extract_tb(error.__traceback__)
     place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]

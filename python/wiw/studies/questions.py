@@ -4,23 +4,33 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw import panorama
 from wiw.loop.agent import Query
 from wiw.loop.attempts import DEADLINE, Attempts
 from wiw.loop.clock import Clock
+from wiw.loop.imagine import seed_of
 from wiw.loop.imagine_poses import IMAGINE
 from wiw.policies.base import FrameSpec
 from wiw.registry import TASKS
-from wiw.types import Conditioning, Control, Key, Proposal
+from wiw.types import Conditioning, Control, Key, Proposal, View
 from wiw.world_models.base import WorldModel
+from wiw.world_models.pictures import sample
 
 EPISODES = 2
+REMEMBERED = 4
+"""Answers that are looked at again."""
+SMALL = 96
+"""Columns of true frames."""
+TRUE_PANORAMA = (288, 512)
 PLAN = ("actions", "trajectory", "viewpoints", "ids")
 """Arrays of a control."""
 Frames = NDArray[np.uint8]
@@ -36,6 +46,10 @@ class Row:
     simulator: Any
     control: Control
     seed: np.uint64
+    query: Query
+    """The episode that asks."""
+    plan: NDArray[Any]
+    """Its actions, without padding."""
 
 
 class Questions:
@@ -59,8 +73,11 @@ class Questions:
         self.changed: set[str] = set()
         """What of its inputs the model has changed."""
         self.reuses = False
-        """Whether an answer lay in the memory of the one before."""
-        self._latest: Frames | None = None
+        """Whether an answer lay in the memory of an earlier one."""
+        self.rewrites = False
+        """Whether an answer has changed after it was given."""
+        self._answers: deque[tuple[Frames, Frames]] = deque(maxlen=REMEMBERED)
+        """The latest answers themselves, and what a sample of their pixels was when they came."""
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
         """The rows of these plans, of primitives or poses, in each episode."""
@@ -68,6 +85,11 @@ class Questions:
         proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._queries]
         origins = [range(len(plans)) for _ in proposals]
         IMAGINE[self._space](recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        asked = {
+            seed_of(query.key, number): (query, np.array(plan))
+            for query in self._queries
+            for number, plan in enumerate(plans)
+        }
         return [
             Row(
                 observations.image[place],
@@ -76,6 +98,7 @@ class Questions:
                 None if observations.simulators is None else observations.simulators[place],
                 replace(control, shared=0),
                 seeds[place],
+                *asked[int(seeds[place])],
             )
             for observations, controls, seeds in recorder.asked
             for place, control in enumerate(controls)
@@ -114,9 +137,26 @@ class Questions:
         self.changed |= {
             name for (name, array), before in zip(given, kept, strict=True) if not np.array_equal(array, before)
         }
-        self.reuses |= self._latest is not None and np.may_share_memory(frames, self._latest)
-        self._latest = frames
-        return np.array(frames)
+        self.reuses |= any(np.may_share_memory(frames, earlier) for earlier, _ in self._answers)
+        answer = np.array(frames)
+        self.look_back()
+        self._answers.append((frames, sample(answer)))
+        return answer
+
+    def look_back(self) -> None:
+        """See whether one of the latest answers has been written to since; sets `rewrites`."""
+        self.rewrites |= any(not np.array_equal(sample(frames), before) for frames, before in self._answers)
+
+    def true_frames(self, rows: Sequence[Row], plans: Sequence[NDArray[Any]]) -> list[Frames]:
+        """Return what an agent would truly see after each action of a plan, for the place of each row.
+
+        uint8 [K, H, W, 3], in the model's view, of some small size.
+        """
+        accepts = self._model.accepts
+        truth = _true_fronts if self._space == "pose7" else _true_views
+        height, width = accepts.size
+        small = max(1, round(SMALL * height / width)), SMALL
+        return [truth(row.query.simulator, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
 
 
 class _Recorder(Attempts):
@@ -131,6 +171,21 @@ class _Recorder(Attempts):
     ) -> NDArray[np.uint8]:
         self.asked.append((observations, controls, seeds))
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
+
+
+def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """What an agent that walks sees."""
+    poses = simulator.camera_poses_after(plan.astype(np.int8))
+    panoramas = np.empty((len(plan), *TRUE_PANORAMA, 3), np.uint8)
+    simulator.renderer.panorama(poses, TRUE_PANORAMA, panoramas, None, None)
+    if view == "perspective":
+        return np.asarray(panorama.to_perspective(panoramas, 90.0, size))
+    return np.stack([cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in panoramas])
+
+
+def _true_fronts(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """What stands before the camera of a manipulator."""
+    return np.asarray(simulator.fork().render_fronts_after(plan, size))
 
 
 def _in_scenes(scenes: str) -> list[Query]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from wiw.tabletop.kind import Kind, Setup
+from wiw.tabletop.base import TableSetup, TabletopTask
 from wiw.tabletop.robot import Robot
 from wiw.types import Goal
 
@@ -23,18 +23,18 @@ class Table:
 
     def __init__(
         self,
-        kind: Kind,
-        setup: Setup,
+        kind: TabletopTask,
+        setup: TableSetup,
         backend: Literal["auto", "cpu", "gpu"] = "auto",
         robot: Robot | None = None,
         task: str = "manipulation",
     ) -> None:
         self.kind, self.setup = kind, setup
-        self.bench = setup.bench(backend, robot)
+        self.bench = setup.build_workbench(backend, robot)
         self.goal = Goal(task, text=setup.instruction)
         self.objects = setup.objects
         """Names of what agents are told the place of."""
 
     def succeeded(self) -> bool:
         """Return whether what is asked for is done."""
-        return self.kind.succeeded(self.bench, self.setup)
+        return self.kind.is_success(self.bench, self.setup)

@@ -7,11 +7,12 @@ import email.utils
 import json
 import random
 import time
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
+from threading import Thread
 from typing import Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
@@ -135,7 +136,7 @@ class OpenAIClient(Client):
     def _cut_off(self, response: Any) -> None:
         """The SDK reads all of an error's body; of that, the beginning will do."""
         if response.is_error:
-            response.stream = _begin(response, self.timeout)
+            response.stream = _begin(response, self.timeout / 4)
 
     def _body(self, call: Call, images: dict[int, str]) -> dict[str, Any]:
         body: dict[str, Any] = {
@@ -189,7 +190,7 @@ class OpenAIClient(Client):
         retries = retries or _Retries()
         while True:
             try:
-                return work()
+                return _within(self.timeout, work)
             except openai.APIStatusError as error:
                 passing = error.status_code in _PASSING or error.status_code >= 500
                 said, kind, wait = (
@@ -214,6 +215,28 @@ class OpenAIClient(Client):
                 raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
             time.sleep(min(LONGEST_WAIT, retries.pause() if wait is None else wait))
             retries.count += 1
+
+
+def _within(seconds: float, work: Callable[[], Any]) -> Any:
+    """Do the work in a thread of its own, which is left behind where it takes longer.
+
+    The transport limits each read but not their sum, so headers that drip in would take any time.
+
+    Raises:
+        TimeoutError: it took longer; and whatever the work raises.
+    """
+    outcome: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            outcome.set_result(work())
+        except BaseException as error:
+            outcome.set_exception(error)
+
+    Thread(target=run, daemon=True, name="wiw vlm request").start()
+    if not wait([outcome], seconds).done:
+        raise TimeoutError(f"the reply was not complete within {seconds:g} s")
+    return outcome.result()
 
 
 @dataclass

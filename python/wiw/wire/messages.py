@@ -49,9 +49,9 @@ class Welcome:
     model: str
     """JSON of `WorldModel.describe()`."""
     fingerprint: str
-    """`WorldModel.fingerprint()`, or empty where it cannot be told."""
+    """`WorldModel.fingerprint()`, empty for a model without a version."""
     unknown: str
-    """Why it cannot."""
+    """Why it is empty."""
     in_flight: int
     """Most rows of a client that may be unanswered at a time."""
 

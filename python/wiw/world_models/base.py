@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import math
 import time
 from abc import ABC, abstractmethod
@@ -11,6 +12,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,6 +23,7 @@ from numpy.typing import NDArray
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
 from wiw.types import Conditioning, Control, ControlKind, Space, View
+from wiw.world_models.pictures import check_pictures, sample
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
@@ -73,8 +77,9 @@ def accepts(
         vocabulary: primitive id to the model's own id or vector, for control "action"; default: primitive ids.
         null_first: the model wants a null token for frame 0 in front of the actions.
         template: words of the prompt, for control "text"; see `wiw.action.TextTemplate`.
-        cacheable: keep rollouts on disk and never ask twice. Say so for a model that takes long and whose answer is a
-            function of what it is handed: not for one that draws without the seeds, nor for a server that may change.
+        cacheable: keep rollouts on disk by default and never ask twice; needs a `version`. Say so for a model that
+            takes long and whose answer is a function of what it is handed: not for one that draws without the seeds,
+            nor for a server that may change.
 
     Raises:
         ArgumentError: a value is not one of the above.
@@ -152,7 +157,14 @@ class WorldModel(ABC):
     """Predicts what an agent would see. Subclasses set `accepts` and write `rollout`."""
 
     accepts: Accepts
+    version: ClassVar[str] = ""
+    """Of the answers: the author raises it with every change of code that changes one. The rollout cache names what it
+    keeps by it, and keeps nothing of a model without one."""
+    immaterial: ClassVar[tuple[str, ...]] = ()
+    """Options in `describe()` that the answers do not depend on, such as where the weights lie."""
     requires: ClassVar[Requirements] = Requirements()
+    credits: float | None = None
+    """What a paid service has charged so far, in its credits; None where imagining costs nothing."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -198,20 +210,39 @@ class WorldModel(ABC):
         options = {name: str(value) if isinstance(value, Path) else value for name, value in public.items()}
         return {"name": type(self).__name__, **options}
 
-    def fingerprint(self) -> str:
-        """Text that changes with everything the answers depend on beside what the model is handed; names cached
-        rollouts.
+    def files(self) -> Sequence[Path]:
+        """Return the files whose content the answers depend on, such as weights.
 
-        Default: a digest of the class, its source file (in a notebook its code, and what that reads), `describe()` and
-        all attributes, arrays and torch networks by content. Override it where that takes long, or where an attribute
-        is of another kind.
-
-        Raises:
-            ArgumentError: an attribute's content cannot be told; names it.
+        Default: public attributes that name a file, less the `immaterial` ones. Override it for a folder, or where
+        `describe()` has a digest.
         """
-        from wiw.world_models.fingerprint import fingerprint
+        named = [
+            Path(value).expanduser()
+            for name, value in sorted(vars(self).items())
+            if not name.startswith("_") and name not in self.immaterial and isinstance(value, str | Path) and value
+        ]
+        return [path for path in named if _is_file(path)]
 
-        return fingerprint(self)
+    def identity(self) -> dict[str, Any]:
+        """Return what of `describe()` the answers depend on: all but the `immaterial` options."""
+        return {name: value for name, value in self.describe().items() if name not in self.immaterial}
+
+    def fingerprint(self) -> str:
+        """Return the digest that names cached rollouts; empty for a model without a `version`.
+
+        It is made of the class, its version, `identity()` and the content of `files()`. A class in a file
+        (`path.py:Class`) counts with the file's path and time of change. What else answers depend on, such as a network
+        that was handed over in memory, belongs into `describe()`.
+        """
+        if not self.version:
+            return ""
+        kind = type(self)
+        known = [kind.__module__, kind.__qualname__, self.version, self.identity()]
+        digest = blake2b(json.dumps(known, sort_keys=True, default=str).encode(), digest_size=20)
+        for file in self.files():
+            status = file.stat()
+            digest.update(_file_digest(file.resolve(), status.st_size, status.st_mtime_ns))
+        return digest.hexdigest()
 
 
 _GIVE_UP: ContextVar[float] = ContextVar("wiw_give_up", default=math.inf)
@@ -235,6 +266,23 @@ def seconds_left() -> float:
     return _GIVE_UP.get() - time.monotonic()
 
 
+@lru_cache(64)
+def _file_digest(path: Path, size: int, changed: int) -> bytes:
+    """Return the digest of a file's content; a file of the same size and time of change is not read again."""
+    digest = blake2b(digest_size=20)
+    with path.open("rb") as content:
+        while chunk := content.read(2**22):
+            digest.update(chunk)
+    return digest.digest()
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long for a name, or with a null byte: an option that is no path
+        return False
+
+
 def _is_plain(value: Any) -> bool:
     if isinstance(value, Mapping):
         return all(isinstance(name, str) and _is_plain(item) for name, item in value.items())
@@ -249,8 +297,10 @@ def checked_rollout(
     """`model.rollout` with its answer held to the contract.
 
     Raises:
-        ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected.
+        ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected; frames that
+            are no pictures of what was observed (`pictures.check_pictures`).
     """
+    observed = sample(observations.image).copy()  # a model may write into what it is handed
     frames = model.rollout(observations, controls, seeds)
     expected = (len(controls), len(controls[0].actions) + 1, *model.accepts.size, 3)
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
@@ -260,6 +310,7 @@ def checked_rollout(
             f"width, 3), got {came}",
             kind,
         )
+    check_pictures(type(model).__name__, observed, frames, controls)
     return frames
 
 

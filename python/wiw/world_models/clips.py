@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the clip of a video generator to the frames of a rollout."""
+"""Choose the frames of a rollout from the clip of a video generator."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from wiw import action
 
 
-def shown(length: int, clip: int, frames: int) -> NDArray[np.int64]:
-    """Which frame of a clip each frame of a rollout is, where the clip shows a plan evenly.
+def frames_after_actions(length: int, clip: int, frames: int) -> NDArray[np.int64]:
+    """Return which frame of a clip each frame of a rollout is, where the clip shows a plan evenly.
 
     Args:
         length: actions of the plan; the frames after it repeat the clip's last.

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from wiw.errors import DependencyError
-from wiw.networks import device, memory_guard
+from wiw.networks import memory_guard
+from wiw.networks import resolve_device as device
 from wiw.world_models.base import Requirements
 
 __all__ = ["device", "memory_guard", "require"]
 
 
 def require(requirements: Requirements) -> None:
-    """Raises DependencyError where a package is missing."""
+    """Raise DependencyError where a package is missing."""
     if missing := requirements.missing():
         raise DependencyError(f"{', '.join(missing)} not installed; pip install 'wiw[{requirements.extra}]'")

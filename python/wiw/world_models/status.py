@@ -12,7 +12,7 @@ from wiw.world_models.base import Requirements
 
 
 def lacks(requires: Requirements) -> list[str]:
-    """What is missing, in a few words each; empty where the model is ready."""
+    """List what is missing, in a few words each; empty where the model is ready."""
     packages = requires.missing()
     found = [f"{', '.join(packages)} (pip install 'wiw[{requires.extra}]')"] if packages else []
     if requires.served and not is_served(requires.served, requires.server):
@@ -26,9 +26,9 @@ def lacks(requires: Requirements) -> list[str]:
 
 
 def is_served(name: str, address: str) -> bool:
-    """Whether a server answers at an address and serves the model of that name; takes a second at most."""
+    """Return whether a server answers at an address and serves the model of that name; takes a second at most."""
     from wiw.errors import RemoteError
-    from wiw.world_models.remote import Remote
+    from wiw.world_models.remote.model import Remote
 
     uri = urlsplit(address)
     try:
@@ -42,17 +42,17 @@ def is_served(name: str, address: str) -> bool:
 
 
 def in_hub_cache(repository: str) -> bool:
-    """Whether some state of a repository lies in the Hugging Face cache."""
+    """Return whether some state of a repository lies in the Hugging Face cache."""
     snapshots = hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
     return any(snapshots.glob("*/*"))
 
 
 def hub_cache() -> Path:
-    """Where the hub's client keeps what it has downloaded."""
+    """Return the folder where the hub's client keeps what it has downloaded."""
     home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "huggingface"
     return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
 
 
 def has_gpu() -> bool:
-    """Whether the kernel shows a device that torch can compute on: NVIDIA's or AMD's."""
+    """Return whether the kernel shows a device that torch can compute on: NVIDIA's or AMD's."""
     return any(Path("/dev").glob("nvidia[0-9]*")) or Path("/dev/kfd").exists()

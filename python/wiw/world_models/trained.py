@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the world models of `wiw train` share: weights that come with wiw or from a file, and what they are told by."""
+"""What the world models of `wiw train` share: weights that come with wiw or from a file, and their identity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel
-from wiw.world_models.fingerprint import code_digest
 
 if TYPE_CHECKING:
     from torch import nn
@@ -29,6 +28,8 @@ class Trained(WorldModel):
         WeightsError: no such file, damaged, or of another version.
     """
 
+    version = "1"
+    immaterial = ("weights",)
     requires = Requirements(("torch", "safetensors"), "torch")
     _network: Any
 
@@ -40,17 +41,17 @@ class Trained(WorldModel):
     @staticmethod
     @abstractmethod
     def _load(weights: str | Path | None) -> tuple[nn.Module, dict[str, Any]]:
-        """Network and card of a file, or of the built-in one. Imports torch."""
+        """Return network and card of a file, or of the built-in one. Imports torch."""
 
     @classmethod
     def of(cls: type[T], network: nn.Module) -> T:
-        """The world model of a network at hand, such as one in training."""
+        """Make the world model of a network at hand, such as one in training."""
         model = cls.__new__(cls)
         model.weights, model._network, model.card = None, network.eval(), {}
         return model
 
     def describe(self) -> dict[str, Any]:
-        """The weights' file and a digest of them, and torch's version."""
+        """Return the weights' file, a digest of them, and torch's version."""
         import torch
 
         return {
@@ -59,11 +60,6 @@ class Trained(WorldModel):
             "digest": self._digest(),
             "torch": torch.__version__,
         }
-
-    def fingerprint(self) -> str:
-        """Digest of code, weights and torch's version; where the weights lie does not count."""
-        said = {**self.describe(), "weights": None}
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
 
     def _digest(self) -> str:
         digest = blake2b(digest_size=8)

@@ -18,9 +18,23 @@ float encoded(float linear) { return std::pow(std::clamp(linear, 0.f, 1.f), 1.f 
 
 bool is_gltf(MeshFormat format) { return format == MeshFormat::kGlb || format == MeshFormat::kGltf; }
 
-std::string texture_reference(const aiMaterial& material) {
+/// Emission of a glTF material whose base colour is black; black for all others.
+aiColor4D emitted_color(const aiMaterial& material, MeshFormat format) {
+  aiColor4D base(1, 1, 1, 1);
+  aiColor4D light(0, 0, 0, 1);
+  material.Get(AI_MATKEY_BASE_COLOR, base);
+  material.Get(AI_MATKEY_COLOR_EMISSIVE, light);
+  const bool is_black = base.r <= 0 && base.g <= 0 && base.b <= 0;
+  return is_gltf(format) && is_black ? aiColor4D(light.r, light.g, light.b, base.a) : aiColor4D(0, 0, 0, 1);
+}
+
+bool is_emissive(const aiColor4D& light) { return light.r > 0 || light.g > 0 || light.b > 0; }
+
+std::string texture_reference(const aiMaterial& material, MeshFormat format) {
   aiString path;
+  const bool is_light = is_emissive(emitted_color(material, format));
   for (const aiTextureType type : {aiTextureType_BASE_COLOR, aiTextureType_DIFFUSE, aiTextureType_EMISSIVE}) {
+    if (is_light && type != aiTextureType_EMISSIVE) continue;
     if (material.GetTexture(type, 0, &path) == aiReturn_SUCCESS && path.length > 0) return path.C_Str();
   }
   return {};
@@ -29,6 +43,8 @@ std::string texture_reference(const aiMaterial& material) {
 Eigen::Vector4f gltf_color(const aiMaterial& material) {
   aiColor4D color(1, 1, 1, 1);
   material.Get(AI_MATKEY_BASE_COLOR, color);
+  const aiColor4D light = emitted_color(material, MeshFormat::kGltf);
+  if (is_emissive(light)) color = light;
   return {encoded(color.r), encoded(color.g), encoded(color.b), std::clamp(color.a, 0.f, 1.f)};
 }
 
@@ -59,7 +75,8 @@ Material convert_material(const aiMaterial& source, MeshFormat format, const Tex
   Material material;
   aiString name;
   if (source.Get(AI_MATKEY_NAME, name) == aiReturn_SUCCESS) material.name = name.C_Str();
-  const std::string reference = texture_reference(source);
+  const std::string reference = texture_reference(source, format);
+  material.emissive = is_emissive(emitted_color(source, format));
   material.texture = textures.find(reference);
   if (!reference.empty() && material.texture == kNone) {
     material.base_color = {kNeutral, kNeutral, kNeutral, 1.f};
@@ -77,7 +94,7 @@ Material convert_material(const aiMaterial& source, MeshFormat format, const Tex
 void convert_materials(const aiScene& file, const FileContext& context, Scene& scene) {
   std::vector<std::string> references;
   for (unsigned i = 0; i < file.mNumMaterials; ++i) {
-    std::string reference = texture_reference(*file.mMaterials[i]);
+    std::string reference = texture_reference(*file.mMaterials[i], context.format);
     if (!reference.empty() && std::ranges::find(references, reference) == references.end()) {
       references.push_back(std::move(reference));
     }

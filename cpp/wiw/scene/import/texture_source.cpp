@@ -10,6 +10,7 @@
 
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
+#include "wiw/core/utf8.hpp"
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/image_file.hpp"
 
@@ -76,14 +77,21 @@ TextureSource::TextureSource(const aiScene& file, fs::path path, const ImportOpt
     : file_(file), path_(std::move(path)), options_(options) {}
 
 std::vector<fs::path> TextureSource::candidates(const std::string& reference) const {
-  const fs::path wanted = as_path(reference);
+  std::vector<fs::path> paths;
+  for (const std::string& spelling : {reference, to_utf8(reference)}) {
+    add_candidates(as_path(spelling), paths);
+    if (is_utf8(reference)) break;
+  }
+  return paths;
+}
+
+void TextureSource::add_candidates(const fs::path& wanted, std::vector<fs::path>& paths) const {
   const fs::path folder = path_.parent_path();
-  std::vector<fs::path> paths{folder / wanted};
+  paths.push_back(folder / wanted);
   constexpr std::array<const char*, 5> kFolders{"", "textures", "../textures", "materials/textures",
                                                 "../materials/textures"};
   for (const char* name : kFolders) paths.push_back(folder / name / wanted.filename());
   for (const fs::path& extra : options_.texture_folders) paths.push_back(extra / wanted.filename());
-  return paths;
 }
 
 TextureSource::Found TextureSource::look_for(const std::string& reference) const {

@@ -34,7 +34,9 @@ class TextureSource {
   void find_file(const std::string& reference, Found& found) const;
   static Texture decode(const std::string& reference, const Found& found);
   void check_bytes(const std::vector<Found>& found) const;
+  /// Names that are not UTF-8 are tried as they are and as Latin-1.
   [[nodiscard]] std::vector<std::filesystem::path> candidates(const std::string& reference) const;
+  void add_candidates(const std::filesystem::path& wanted, std::vector<std::filesystem::path>& paths) const;
 
   const aiScene& file_;
   std::filesystem::path path_;

@@ -11,6 +11,7 @@
 #include "wiw/scene/import/extent.hpp"
 #include "wiw/scene/import/up_axis.hpp"
 #include "wiw/scene/sdf/primitives.hpp"
+#include "wiw/scene/text.hpp"
 
 namespace wiw::sdf {
 namespace {
@@ -37,6 +38,7 @@ ScenePtr Assembler::assemble(const std::filesystem::path& path) {
   if (scene_->instances.empty()) throw FileError(path.string(), "holds no triangles");
   check_imported(*scene_, path);
   if (options_.ceiling_height) add_ceiling(*scene_, *options_.ceiling_height);
+  make_text_utf8(*scene_);
   return scene_;
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A plan carried out in imagination: the network in small, its composition in full size."""
+"""Imagine a plan: the network in small, its composition in full size."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ from wiw.world_models.armnet.network import (
     Mixture,
     Motion,
     Network,
-    cleared,
-    composed,
-    imagined_in_sight,
+    clear_arm,
+    compose_view,
+    find_visible_arm,
     in_sight,
     sources,
     still,
 )
 
 
-def imagined(network: Network, image: NDArray[np.uint8], poses: NDArray[np.float64]) -> Iterator[NDArray[np.uint8]]:
-    """uint8 [H, W, 3] after each pose but the first of [N, 7], from the view at the first.
+def imagine_views(
+    network: Network, image: NDArray[np.uint8], poses: NDArray[np.float64]
+) -> Iterator[NDArray[np.uint8]]:
+    """Yield a view, uint8 [H, W, 3], after each pose but the first of [N, 7], from the view at the first.
 
     H and W are the same whole multiple of the network's front view.
     """
@@ -41,25 +43,25 @@ def imagined(network: Network, image: NDArray[np.uint8], poses: NDArray[np.float
     here = next(arms)
     with torch.inference_mode():
         view, before = _image(image), _arm(here)
-        canvas = cleared(view, before, in_sight(view, before), bare, bare)
+        canvas = clear_arm(view, before, in_sight(view, before), bare, bare)
         for there in arms:
             arm, way = _arm(there), motion(here.pose[None], there.pose[None])
             seen = still(canvas, arm, bare)
             inner = Arm(_window(arm.color, scale), _window(arm.mask, scale))
             around, table = _window(canvas, scale), _window(bare, scale)
-            mixture = _mixture(network, around, inner, _window(before.mask, scale), way, table, scale)
-            _window(seen, scale)[:] = composed(mixture.shares, sources(mixture, around, inner, way, table, scale))
+            mixture = _mix_views(network, around, inner, _window(before.mask, scale), way, table, scale)
+            _window(seen, scale)[:] = compose_view(mixture.shares, sources(mixture, around, inner, way, table, scale))
             hidden = arm.mask > 0.5
-            _window(hidden, scale)[:] = imagined_in_sight(mixture.shares, inner)
-            canvas = cleared(seen, arm, hidden, bare, canvas)
+            _window(hidden, scale)[:] = find_visible_arm(mixture.shares, inner)
+            canvas = clear_arm(seen, arm, hidden, bare, canvas)
             here, before = there, arm
             yield (seen[0].permute(1, 2, 0) * 255).round().byte().numpy()
 
 
-def _mixture(
+def _mix_views(
     network: Network, canvas: Tensor, arm: Arm, before: Tensor, way: Motion, bare: Tensor, scale: int
 ) -> Mixture:
-    """How the network composes the window, in full size."""
+    """Return how the network composes the window, in full size."""
 
     def small(image: Tensor) -> Tensor:
         return functional.avg_pool2d(image, scale)
@@ -73,7 +75,7 @@ def _mixture(
 
 
 def _window(image: Tensor, scale: int) -> Tensor:
-    """The network's part of a front view that is so many times as large as it sees it."""
+    """Return the network's part of a front view that is so many times as large as it sees it."""
     rows, columns = (slice(side.start * scale, side.stop * scale) for side in WINDOW)
     return image[..., rows, columns]
 
@@ -83,5 +85,5 @@ def _arm(sight: Sight) -> Arm:
 
 
 def _image(image: NDArray[np.uint8]) -> Tensor:
-    """Float [1, 3, H, W] in [0, 1]."""
+    """Return the image as float [1, 3, H, W] in [0, 1]."""
     return torch.from_numpy(np.array(image)).permute(2, 0, 1)[None].float() / 255

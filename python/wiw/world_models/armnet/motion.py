@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the network is told of a gripper's way from one pose to the next."""
+"""What the network reads of a gripper's way from one pose to the next."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ METRE = 5.0
 
 
 def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Motion:
-    """Of B ways from poses [B, 7] to others."""
+    """Return the motions from poses [B, 7] to others."""
     numbers = np.concatenate(
         [
             before[:, 6:],
@@ -34,9 +34,9 @@ def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Motion:
 
 
 def _tips(points: NDArray[np.float64]) -> Tensor:
-    """[B, 3]: pixels in the window, and metres along the camera's axis, of points [B, 3]."""
+    """Return pixels in the window, and metres along the camera's axis, [B, 3] of points [B, 3]."""
     front = CAMERAS["front"]
-    pixels = front.pixels_of(points, FRONT) - (WINDOW[1].start, WINDOW[0].start)
+    pixels = front.project_points(points, FRONT) - (WINDOW[1].start, WINDOW[0].start)
     depth = (points - front.eye) @ -front.pose[:3, 2]
     return _float(np.concatenate([pixels, depth[:, None]], axis=1))
 

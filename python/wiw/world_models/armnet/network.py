@@ -66,33 +66,33 @@ class Mixture:
 
 
 def shade(bare: Tensor, plate: Tensor, mask: Tensor) -> Tensor:
-    """How much darker than without the arm each pixel is; 1 where the arm itself is."""
+    """Return how much darker than without the arm each pixel is; 1 where the arm itself is."""
     ratio = ((bare + 0.02) / (plate + 0.02)).clamp(0.25, 4.0)
     return torch.where(mask > 0.5, torch.ones_like(ratio), ratio)
 
 
 def still(canvas: Tensor, arm: Arm, plate: Tensor) -> Tensor:
-    """The view if nothing but the arm had moved."""
+    """Return the view if nothing but the arm had moved."""
     return torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, plate, arm.mask)).clamp(0, 1)
 
 
 def in_sight(image: Tensor, arm: Arm) -> Tensor:
-    """Where, [B, 1, H, W], a true view shows the arm itself, and no thing before it."""
+    """Return where, [B, 1, H, W], a true view shows the arm itself, and no object in front of it."""
     return (arm.mask > 0.5) & ((image - arm.color).abs().amax(1, keepdim=True) < ALIKE)
 
 
-def cleared(image: Tensor, arm: Arm, hidden: Tensor, plate: Tensor, before: Tensor) -> Tensor:
-    """The canvas after a view: the view without the arm and its shadow; where that is `hidden`, as it was `before`."""
+def clear_arm(image: Tensor, arm: Arm, hidden: Tensor, plate: Tensor, before: Tensor) -> Tensor:
+    """Return the canvas after a view: without the arm and its shadow; where that is `hidden`, as it was `before`."""
     return torch.where(hidden, before, (image / shade(arm.color, plate, arm.mask)).clamp(0, 1))
 
 
-def imagined_in_sight(shares: Tensor, arm: Arm) -> Tensor:
-    """The same of a view that was composed: where most of it is the arm."""
+def find_visible_arm(shares: Tensor, arm: Arm) -> Tensor:
+    """Return where, [B, 1, H, W], a composed view shows the arm itself: where most of it is the arm."""
     return (arm.mask > 0.5) & (shares[:, 2:3] > 0.5)
 
 
-def carried(canvas: Tensor, motion: Motion, flow: Tensor | None = None, scale: float = 1.0) -> Tensor:
-    """The canvas moved as a thing in the gripper's hand would: along, and larger the nearer it comes.
+def carry_canvas(canvas: Tensor, motion: Motion, flow: Tensor | None = None, scale: float = 1.0) -> Tensor:
+    """Move the canvas as an object in the gripper would move: along with it, and larger the nearer it comes.
 
     Args:
         canvas: [B, C, H, W], `scale` times as large as the motion's pixels are.
@@ -115,14 +115,14 @@ def carried(canvas: Tensor, motion: Motion, flow: Tensor | None = None, scale: f
 
 
 def sources(mixture: Mixture, canvas: Tensor, arm: Arm, motion: Motion, plate: Tensor, scale: float = 1.0) -> Tensor:
-    """[B, 4, 3, H, W] in the canvas's size: canvas, carried, arm or bare table, paint, as they would be seen."""
+    """Return canvas, carried canvas, arm or bare table, and paint as they would be seen: [B, 4, 3, H, W]."""
     dark = shade(arm.color, plate, arm.mask)
-    moved = carried(canvas, motion, mixture.flow, scale)
+    moved = carry_canvas(canvas, motion, mixture.flow, scale)
     return torch.stack([canvas * dark, moved * dark, arm.color, mixture.paint], dim=1)
 
 
-def composed(shares: Tensor, sources: Tensor) -> Tensor:
-    """The next view: sources [B, 4, 3, H, W] by their shares [B, 4, H, W]."""
+def compose_view(shares: Tensor, sources: Tensor) -> Tensor:
+    """Return the next view: sources [B, 4, 3, H, W] by their shares [B, 4, H, W]."""
     return (shares[:, :, None] * sources).sum(1).clamp(0, 1)
 
 
@@ -150,7 +150,7 @@ class Network(nn.Module):
         self.last.bias = nn.Parameter(torch.zeros(4 * 9))
 
     def forward(self, canvas: Tensor, arm: Arm, arm_before: Tensor, motion: Motion, plate: Tensor) -> Mixture:
-        """How the view after a motion is composed.
+        """Return how the view after a motion is composed.
 
         Args:
             canvas: [B, 3, 64, 120].
@@ -159,7 +159,7 @@ class Network(nn.Module):
             motion: in pixels of the window.
             plate: [1, 3, 64, 120], the bare table.
         """
-        seen = [canvas - 0.5, 3 * (canvas - plate), 3 * (carried(canvas, motion) - plate), arm.color - 0.5]
+        seen = [canvas - 0.5, 3 * (canvas - plate), 3 * (carry_canvas(canvas, motion) - plate), arm.color - 0.5]
         image = torch.cat([*seen, arm.mask, arm_before, _maps(motion)], dim=1)
         numbers = motion.scalars
         folded = functional.pixel_unshuffle(image, 2)
@@ -185,13 +185,15 @@ class Block(nn.Module):
         self.norm = nn.GroupNorm(4, outputs)
 
     def forward(self, image: Tensor) -> Tensor:
-        """[B, outputs, H / stride, W / stride]."""
+        """Return [B, outputs, H / stride, W / stride]."""
         return functional.silu(self.norm(self.convolution(image)))
 
 
 def _maps(motion: Motion) -> Tensor:
-    """[B, 7, H, W]: closeness to the finger tips before and after, to the way between them and to the table's point
-    under them, both coordinates seen from the tips, and how far along the way each pixel is.
+    """Return maps [B, 7, H, W] of a motion.
+
+    They are closeness to the finger tips before and after, to the table's point under them and to the way between them,
+    both coordinates seen from the tips, and how far along the way each pixel is.
     """
     height, width = (side.stop - side.start for side in WINDOW)
     grid = torch.stack(torch.meshgrid(torch.arange(width) + 0.5, torch.arange(height) + 0.5, indexing="xy"))[None]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What PathDreamer and SE3DS share: a memory of points, and the program that serves their official networks."""
+"""PathDreamer and SE3DS: panoramic RGB-D models whose official code is served from an environment of its own."""

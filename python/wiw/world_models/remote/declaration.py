@@ -11,11 +11,15 @@ import numpy as np
 
 from wiw.action import Action, TextTemplate
 from wiw.errors import ArgumentError, RemoteError
+from wiw.json_text import parse_json
 from wiw.world_models.base import Accepts, accepts
+
+MOST_DESCRIBED = 1 << 20
+"""Characters of a model's description, which goes into every record of a run."""
 
 
 def declaration(declared: Accepts) -> str:
-    """JSON of what a model accepts."""
+    """Return JSON of what a model accepts."""
     values = {field.name: getattr(declared, field.name) for field in fields(declared)}
     if declared.vocabulary is not None:
         values["vocabulary"] = [[int(name), np.asarray(own).tolist()] for name, own in declared.vocabulary.items()]
@@ -24,24 +28,41 @@ def declaration(declared: Accepts) -> str:
     return json.dumps(values)
 
 
-def declared(text: str) -> Accepts:
-    """What a model accepts, from such JSON.
+def parse_declaration(text: str) -> Accepts:
+    """Return what a model accepts, from such JSON.
 
     Raises:
-        RemoteError: it is none.
+        RemoteError: it cannot be read.
     """
     try:
-        values: dict[str, Any] = json.loads(text)
+        values: dict[str, Any] = parse_json(text)
         if values["vocabulary"] is not None:
             values["vocabulary"] = dict(values["vocabulary"])
         if values["template"] is not None:
             phrases = {Action(name): phrase for name, phrase in values["template"].pop("phrases")}
             values["template"] = TextTemplate(phrases=phrases, **values["template"])
         return accepts(**{**values, "size": tuple(values["size"])})
-    except (ValueError, KeyError, TypeError, AttributeError, ArgumentError) as error:
+    except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError, ArgumentError) as error:
         raise RemoteError(
             f"the server's declaration cannot be read: {type(error).__name__}: {error}", "message"
         ) from error
+
+
+def parse_description(text: str) -> dict[str, Any]:
+    """Return what a served model says of itself, from the JSON of its `describe()`.
+
+    Raises:
+        RemoteError: it is no JSON object.
+    """
+    try:
+        if len(text) > MOST_DESCRIBED:
+            raise ValueError(f"expected at most {MOST_DESCRIBED} characters, got {len(text)}")
+        values = parse_json(text)
+        if not isinstance(values, dict):
+            raise ValueError(f"expected an object, got {type(values).__name__}")
+    except ValueError as error:
+        raise RemoteError(f"the server's description of its model cannot be read: {error}", "message") from error
+    return values
 
 
 def _template(template: TextTemplate) -> dict[str, Any]:

@@ -15,7 +15,7 @@ CONTROL_BYTES = 2**20
 
 
 def most_bytes(accepts: Accepts) -> int:
-    """Of one message of a client."""
+    """Return the greatest size of one message of a client."""
     height, width = accepts.size
     needs = {"depth": 4, "semantic": 4, "history": 3 * HISTORY}
     pixel = 3 + sum(size for need, size in needs.items() if need in accepts.needs)
@@ -23,7 +23,7 @@ def most_bytes(accepts: Accepts) -> int:
 
 
 def check_row(row: Row, accepts: Accepts) -> None:
-    """Holds a row to what the model accepts, and its answer to what can be sent.
+    """Hold a row to what the model accepts, and its answer to what can be sent.
 
     Raises:
         RemoteError: what was expected and what came.

@@ -35,7 +35,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 HANDSHAKE = 10.0
 HEARTBEAT, SILENCE = 10.0, 30.0
 """Seconds between pings, and without an answer to one until the connection counts as lost."""
-BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "contract"})
+BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "frame 0", "channels", "scale", "contract"})
 """Kinds of `ContractError`."""
 
 Frames = NDArray[np.uint8]
@@ -73,7 +73,7 @@ class Link:
     # -- called by those who ask ---------------------------------------------------------------------------------------
 
     def welcome(self, seconds: float) -> Welcome:
-        """What is served.
+        """Return what is served.
 
         Raises:
             RemoteError: nobody has answered in time, or the server refuses.
@@ -85,7 +85,7 @@ class Link:
             raise RemoteError(f"nobody serves a world model at {self.address}: {self._trouble}", "connection") from None
 
     def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
-        """The frames of each row, in order.
+        """Return the frames of each row, in order.
 
         Raises:
             RemoteError: not all are there at the time `give_up` (`time.monotonic()`), or the server refuses one.
@@ -105,7 +105,7 @@ class Link:
             self._soon(lambda: self._leave(questions))
 
     def close(self) -> None:
-        """Ends the connection and the thread, and tells those who still wait."""
+        """End the connection and the thread, and tell those who still wait."""
         self._closed = True
         if self._thread.is_alive():
             self._soon(self._loop.stop)
@@ -138,7 +138,7 @@ class Link:
         self._loop.close()
 
     async def _keep(self) -> None:
-        """Connects whenever something is asked, and again while it is not answered."""
+        """Connect whenever something is asked, and again while it is not answered."""
         pause = FIRST_PAUSE
         while True:
             await self._wanted.wait()
@@ -191,7 +191,7 @@ class Link:
             )
 
     async def _talk(self, connection: ClientConnection) -> None:
-        """Asks and hears until the connection ends."""
+        """Ask and hear until the connection ends."""
         outbox: asyncio.Queue[_Question] = asyncio.Queue()
         room = asyncio.Semaphore(self._welcome.result().in_flight)
         asked: set[bytes] = set()
@@ -221,7 +221,7 @@ class Link:
         room: asyncio.Semaphore,
         asked: set[bytes],
     ) -> None:
-        """Asks what is in the outbox; a row that was asked on this connection and has no answer yet is not repeated."""
+        """Ask what is in the outbox; a row that was asked on this connection and has no answer yet is not repeated."""
         while True:
             question = await outbox.get()
             await room.acquire()
@@ -264,7 +264,7 @@ class Link:
                 question.answer.set_exception(_error(said))
 
     def _submit(self, question: _Question) -> _Question:
-        """The question itself, or the same one that is open already."""
+        """Open a question, or return the same one that is open already."""
         same = self._open.get(question.id)
         if same is not None and not same.answer.done():
             same.askers += 1
@@ -277,14 +277,14 @@ class Link:
         return question
 
     def _leave(self, questions: Sequence[_Question]) -> None:
-        """Forgets questions that nobody waits for any more."""
+        """Forget questions that nobody waits for any more."""
         for question in questions:
             question.askers -= 1
             if question.askers <= 0 and self._open.get(question.id) is question:
                 del self._open[question.id]
 
     def _give_up(self, error: RemoteError) -> None:
-        """Tells all who wait that waiting is of no use."""
+        """Pass the error on to all who wait."""
         self._trouble = str(error)
         if not self._welcome.done():
             self._welcome.set_exception(error)
@@ -300,7 +300,7 @@ def _error(refusal: Refusal) -> Exception:
 
 
 def _is_here(address: str) -> bool:
-    """Whether the address is of this machine, for which no proxy is asked."""
+    """Return whether the address is of this machine, for which no proxy is asked."""
     host = urlsplit(address).hostname or ""
     try:
         return ip_address(host).is_loopback

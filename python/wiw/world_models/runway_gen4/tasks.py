@@ -46,13 +46,13 @@ class Tasks:
         return sum(self._charged.values())
 
     def outputs(self, orders: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Addresses of the videos of some orders, as arguments of `image_to_video.create`.
+        """Return the addresses of the videos of some orders, as arguments of `image_to_video.create`.
 
         Raises:
             InfrastructureError: a task failed, was cancelled or did not end in time; the service refused; or the
                 budget is spent.
         """
-        names = [_name(order) for order in orders]
+        names = [_digest_order(order) for order in orders]
         for name, order in zip(names, orders, strict=True):
             if name not in self._begun:
                 self._begun[name] = self._begin(order)
@@ -77,7 +77,7 @@ class Tasks:
         return str(self._ask(self._client.image_to_video.create, **order).id)
 
     def _output(self, name: str) -> str | None:
-        """Address of a task's video; None while there is hope."""
+        """Return the address of a task's video; None while the task has not ended."""
         task = self._ask(self._client.tasks.retrieve, self._begun[name])
         if task.status in WAITING:
             return None
@@ -88,8 +88,8 @@ class Tasks:
         reason = f": {task.failure} ({task.failure_code})" if task.status == "FAILED" else ""
         raise InfrastructureError(f"RunwayGen4: task {task.id} ended as {task.status}{reason}")
 
-    def _ask(self, what: Any, *values: Any, **named: Any) -> Any:
-        """An answer of the service; the SDK tries again by itself where that may help.
+    def _ask(self, call: Any, *values: Any, **named: Any) -> Any:
+        """Return an answer of the service; the SDK tries again by itself where that may help.
 
         Raises:
             InfrastructureError: it refused, or is out of reach.
@@ -97,12 +97,12 @@ class Tasks:
         import runwayml
 
         try:
-            return what(*values, **named)
+            return call(*values, **named)
         except runwayml.AuthenticationError as error:
             raise InfrastructureError(f"RunwayGen4: the key in RUNWAYML_API_SECRET is refused ({error})") from error
         except runwayml.APIError as error:
             raise InfrastructureError(f"RunwayGen4: {type(error).__name__}: {error}") from error
 
 
-def _name(order: Mapping[str, Any]) -> str:
+def _digest_order(order: Mapping[str, Any]) -> str:
     return blake2b(json.dumps(order, sort_keys=True).encode(), digest_size=20).hexdigest()

@@ -19,14 +19,14 @@ SECONDS = 60.0
 """That the server may keep silent."""
 
 
-def data_uri(image: NDArray[np.uint8]) -> str:
-    """An image uint8 [H, W, 3] as PNG in a data URI."""
+def encode_data_uri(image: NDArray[np.uint8]) -> str:
+    """Encode an image uint8 [H, W, 3] as PNG in a data URI."""
     png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
     return f"data:image/png;base64,{base64.b64encode(png.tobytes()).decode('ascii')}"
 
 
-def fetch(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """All frames of the video at an address, uint8 [T, H, W, 3] in (height, width) `size`.
+def fetch_video(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return all frames of the video at an address, uint8 [T, H, W, 3] in (height, width) `size`.
 
     Raises:
         InfrastructureError: it cannot be had, is larger than 256 MB, or is no video.
@@ -40,11 +40,15 @@ def fetch(url: str, size: tuple[int, int]) -> NDArray[np.uint8]:
         raise InfrastructureError(f"RunwayGen4: the video cannot be downloaded: {error}") from error
     if len(content) > MOST_BYTES:
         raise InfrastructureError(f"RunwayGen4: the video is larger than {MOST_BYTES >> 20} MB")
-    return decoded(content, size)
+    return decode_video(content, size)
 
 
-def decoded(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """All frames of a video file's content. Raises InfrastructureError where there is none."""
+def decode_video(content: bytes, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return all frames of a video file's content, uint8 [T, H, W, 3] in (height, width) `size`.
+
+    Raises:
+        InfrastructureError: it has no frame.
+    """
     height, width = size
     frames = []
     with tempfile.TemporaryDirectory() as folder:

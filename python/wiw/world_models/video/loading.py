@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a folder of weights to a pipeline on its device, and what to do where it does not fit."""
+"""Load a pipeline from a folder of weights onto its device, and say what to do where it does not fit."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Precision = Literal["float32", "bfloat16", "float16"]
 Offload = Literal["none", "model", "sequential"]
 
 
-def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
-    """The pipeline, ready to be called; `components` are parts of it that are not in the folder.
+def load_pipeline(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
+    """Return the pipeline, ready to be called; `components` are parts of it that are not in the folder.
 
     Raises:
         DependencyError: a tokenizer is kept in a form that takes another package to read.
@@ -32,34 +32,34 @@ def load(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
     import torch
 
     _require_readers(folder)
-    with memory_guard(model), _no_bars():
+    with memory_guard(model), _hide_progress_bars():
         try:
-            pipeline = getattr(diffusers, model.pipeline).from_pretrained(
-                folder, dtype=_dtypes(model), variant=model.variant, local_files_only=True, **components
+            pipeline = getattr(diffusers, model.pipeline_class).from_pretrained(
+                folder, dtype=_choose_dtypes(model), variant=model.variant, local_files_only=True, **components
             )
         except torch.OutOfMemoryError:
             raise
         except (OSError, ValueError, KeyError, RuntimeError, _safetensors_error()) as error:
             raise WeightsError(
-                f"{folder} cannot be loaded as a {model.pipeline}: {type(error).__name__}: {error}; files may be "
+                f"{folder} cannot be loaded as a {model.pipeline_class}: {type(error).__name__}: {error}; files may be "
                 f"missing, damaged, or of another variant than {model.variant}",
                 "unfit",
             ) from error
-        _require_whole(pipeline, folder)
+        _require_all_parameters(pipeline, folder)
         pipeline.set_progress_bar_config(disable=True)
-        _place(pipeline, model)
+        _move_to_device(pipeline, model)
     return pipeline
 
 
 def _require_readers(folder: Path) -> None:
-    """Raises DependencyError where a tokenizer is sentencepiece's model alone and what reads that is not installed."""
+    """Raise DependencyError where a tokenizer is sentencepiece's model alone and what reads that is not installed."""
     models = [*folder.glob("*/spiece.model"), *folder.glob("*/tokenizer.model")]
     if any(not model.with_name("tokenizer.json").is_file() for model in models):
         devices.require(Requirements(("sentencepiece", "google.protobuf"), "diffusers"))
 
 
-def _require_whole(pipeline: Any, folder: Path) -> None:
-    """Raises WeightsError where a network's files lack parameters, which diffusers leaves without values."""
+def _require_all_parameters(pipeline: Any, folder: Path) -> None:
+    """Raise WeightsError where a network's files lack parameters, which diffusers leaves without values."""
     import torch
 
     lacking = [
@@ -76,31 +76,31 @@ def _require_whole(pipeline: Any, folder: Path) -> None:
 
 
 @contextmanager
-def _no_bars() -> Iterator[None]:
-    """Holds back the libraries' progress bars: a run has its own, and theirs leave locks behind in worker processes."""
+def _hide_progress_bars() -> Iterator[None]:
+    """Hold back the libraries' progress bars: a run has its own, and theirs leave locks behind in worker processes."""
     from diffusers.utils import logging as of_diffusers
     from transformers.utils import logging as of_transformers
 
-    shown = [library for library in (of_diffusers, of_transformers) if library.is_progress_bar_enabled()]
-    for library in shown:
+    with_bars = [library for library in (of_diffusers, of_transformers) if library.is_progress_bar_enabled()]
+    for library in with_bars:
         library.disable_progress_bar()
     try:
         yield
     finally:
-        for library in shown:
+        for library in with_bars:
             library.enable_progress_bar()
 
 
-def _dtypes(model: VideoModel) -> dict[str, Any]:
-    """Precision of each network."""
+def _choose_dtypes(model: VideoModel) -> dict[str, Any]:
+    """Return the precision of each network."""
     import torch
 
     assert model.precision is not None
-    parts = model.parts if model.precision == model.half else {}
+    parts = model.network_precisions if model.precision == model.half_precision else {}
     return {name: getattr(torch, kind) for name, kind in {"default": model.precision, **parts}.items()}
 
 
-def _place(pipeline: Any, model: VideoModel) -> None:
+def _move_to_device(pipeline: Any, model: VideoModel) -> None:
     if model.offload == "none":
         pipeline.to(model.device)
     elif model.device == "cpu":
@@ -112,22 +112,22 @@ def _place(pipeline: Any, model: VideoModel) -> None:
 
 
 def memory_guard(model: VideoModel) -> AbstractContextManager[None]:
-    """Turns torch's error of a full GPU into one that says which options need less."""
-    return devices.memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_cures(model)))
+    """Turn torch's error of a full GPU into one that says which options need less."""
+    return devices.memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_list_remedies(model)))
 
 
-def _cures(model: VideoModel) -> list[str]:
-    """Options that need less memory than what the model has, the mildest first."""
+def _list_remedies(model: VideoModel) -> list[str]:
+    """List the options that need less memory than the present ones, the mildest first."""
     height, width = model.size
-    cures = [f"batch=1 (now {model.batch})"] if model.batch > 1 else []
-    cures += [f"precision='{model.half}' (now float32)"] if model.precision == "float32" else []
-    cures += ["offload='model'"] if model.offload == "none" else []
-    cures += ["offload='sequential' (slow)"] if model.offload != "sequential" else []
-    return [*cures, f"a smaller size than {height}x{width}", f"fewer frames than {model.frames}"]
+    remedies = [f"batch=1 (now {model.batch})"] if model.batch > 1 else []
+    remedies += [f"precision='{model.half_precision}' (now float32)"] if model.precision == "float32" else []
+    remedies += ["offload='model'"] if model.offload == "none" else []
+    remedies += ["offload='sequential' (slow)"] if model.offload != "sequential" else []
+    return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {model.frames}"]
 
 
 def versions() -> dict[str, str]:
-    """Of the libraries that frames depend on."""
+    """Return the versions of the libraries that frames depend on."""
     return {name: importlib.metadata.version(name) for name in ("torch", "diffusers", "transformers")}
 
 

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from hashlib import blake2b
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,20 +15,27 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError, ContractError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
-from wiw.world_models.base import WorldModel, accepts
-from wiw.world_models.clips import shown
-from wiw.world_models.fingerprint import code_digest
+from wiw.world_models.base import Requirements, WorldModel, accepts
+from wiw.world_models.clips import frames_after_actions
 from wiw.world_models.video import loading
 from wiw.world_models.video.loading import Offload, Precision
-from wiw.world_models.video.weights import fetch, require_kind
+from wiw.world_models.video.weights import fetch_weights, require_kind
 
 Clips = NDArray[np.float32]
 """float32 [rows, frames, H, W, 3] from 0 to 1."""
+PACKAGES = ("torch", "diffusers", "transformers", "accelerate")
+"""What every pipeline needs."""
+T = TypeVar("T", bound="VideoModel")
+
+
+def declare_requirements(hub: str, packages: Sequence[str] = (), options: Sequence[str] = ()) -> Requirements:
+    """Declare what a pipeline needs: its weights on the hub, packages beyond the usual, options without a default."""
+    return Requirements((*PACKAGES, *packages), "diffusers", hub, gpu=True, options=tuple(options))
 
 
 @dataclass(kw_only=True, eq=False)
 class VideoModel(WorldModel):
-    """Base of the world models that run a pipeline of `diffusers` as it is.
+    """Run a pipeline of `diffusers` as it is: the base of these world models.
 
     A subclass names the pipeline and says in `arguments` how an observation and a plan are put to it. Each row has a
     generator of its own, seeded with the row's seed, so that its frames do not depend on the rows beside it. The clip
@@ -58,28 +64,29 @@ class VideoModel(WorldModel):
     """
 
     accepts = accepts(control="text", view="perspective", cacheable=True)
-    pipeline: ClassVar[str]
-    """Class in `diffusers`."""
-    kin: ClassVar[tuple[str, ...]] = ()
-    """Other classes whose folders hold the same networks."""
-    marks: ClassVar[Mapping[str, bool]] = {}
-    """Settings in the folder's index that tell its generation: whether they are set."""
-    guided_by: ClassVar[str] = "guidance_scale"
+    version = "1"
+    pipeline_class: ClassVar[str]
+    """Name in `diffusers`."""
+    compatible_pipelines: ClassVar[tuple[str, ...]] = ()
+    """Other pipeline classes whose folders hold the same networks."""
+    index_flags: ClassVar[Mapping[str, bool]] = {}
+    """Settings in the folder's index that distinguish generations of a model: whether they are set."""
+    guidance_argument: ClassVar[str] = "guidance_scale"
     """The pipeline's name of `guidance`."""
-    half: ClassVar[Precision] = "bfloat16"
+    half_precision: ClassVar[Precision] = "bfloat16"
     """Precision on a GPU unless the user says otherwise."""
-    parts: ClassVar[Mapping[str, Precision]] = {}
-    """Networks that run in another precision than `half`."""
+    network_precisions: ClassVar[Mapping[str, Precision]] = {}
+    """Networks that run in another precision where the others run in `half_precision`."""
     multiple: ClassVar[int] = 16
     """What height and width are multiples of."""
     stride: ClassVar[int] = 1
     """Frames that the autoencoder makes one of: clips have a multiple of it, and one more."""
-    most_rows: ClassVar[int] = 1
+    max_batch: ClassVar[int] = 1
     """Rows that one call of the pipeline can take."""
-    every_frame: ClassVar[bool] = False
-    """Whether frame k of a clip follows action k, however long the plan: for models that know nothing of it."""
+    frame_per_action: ClassVar[bool] = False
+    """Whether frame k of a clip follows action k, however long the plan: for models that do not read it."""
     immaterial: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
-    """Options that frames do not depend on: where the weights lie, which tell themselves, and how they are run."""
+    """Options that frames do not depend on: where the weights lie, which have a digest, and how they are run."""
 
     weights: str
     revision: str | None = None
@@ -93,72 +100,96 @@ class VideoModel(WorldModel):
     frames: int
     batch: int = 1
 
+    @classmethod
+    def with_networks(cls: type[T], load: Callable[[T], Mapping[str, Any]], **options: Any) -> T:
+        """Make the model with the networks that `load(model)` returns, by place, instead of those in its folder.
+
+        `load` finds the model's device and precision resolved. Neither `describe` nor a pickle has these networks: the
+        caller answers for their identity.
+        """
+        model = cls.__new__(cls)
+        model.components = lambda: {**cls.components(model), **load(model)}  # type: ignore[method-assign]
+        cls.__init__(model, **options)
+        return model
+
     def __post_init__(self) -> None:
-        self._check()
+        self._check_options()
         self.weights = str(self.weights)
-        self.size = (_rounded(self.size[0], self.multiple), _rounded(self.size[1], self.multiple))
+        self.size = (_round(self.size[0], self.multiple), _round(self.size[1], self.multiple))
         self.frames = 1 + -(-(self.frames - 1) // self.stride) * self.stride
         self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
         devices.require(self.requires)
         self.device = devices.device(self.device)
-        self.precision = self.precision or ("float32" if self.device == "cpu" else self.half)
+        self.precision = self.precision or ("float32" if self.device == "cpu" else self.half_precision)
         components = self.components()
-        self._weights = fetch(self.weights, self.pipeline, self.revision, self.variant, components)
-        require_kind(self._weights.folder, (self.pipeline, *self.kin), self.marks)
-        self._pipeline = loading.load(self, self._weights.folder, components)
+        self._weights = fetch_weights(self.weights, self.pipeline_class, self.revision, self.variant, components)
+        require_kind(self._weights.folder, (self.pipeline_class, *self.compatible_pipelines), self.index_flags)
+        self.pipeline: Any = loading.load_pipeline(self, self._weights.folder, components)
 
     @abstractmethod
     def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
-        """What a call of the pipeline is given for these rows, beyond size, frames, steps, guidance and generators.
+        """Return what one call of the pipeline takes for these rows beyond size, frames, steps, guidance, generators.
 
-        `images` are of PIL, one a row.
+        `images` are of PIL, one per row.
         """
         raise NotImplementedError
 
     def components(self) -> dict[str, Any]:
-        """Parts of the pipeline that are not in its folder."""
+        """Return parts of the pipeline, by their place, that are not in its folder."""
         return {}
 
     def generate(self, images: Sequence[Any], controls: Sequence[Control], generators: Sequence[Any]) -> Clips:
-        """Clips of these rows from one call of the pipeline."""
+        """Return the clips of these rows from one call of the pipeline."""
         height, width = self.size
         common = {
             "height": height,
             "width": width,
             "num_frames": self.frames,
             "num_inference_steps": self.steps,
-            self.guided_by: self.guidance,
+            self.guidance_argument: self.guidance,
             "generator": generators[0] if len(generators) == 1 else list(generators),
             "output_type": "np",
         }
-        return np.asarray(self._pipeline(**{**common, **self.arguments(images, controls)}).frames)
+        return np.asarray(self.pipeline(**{**common, **self.arguments(images, controls)}).frames)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """One clip a row, `batch` rows at a time; padding repeats the last frame of the plan.
+        """Return one clip per row, `batch` rows at a time; padding repeats the last frame of the plan.
 
         Raises:
             DeviceMemoryError: the GPU's memory is full.
             ContractError: the networks gave NaN or another number of frames.
         """
         frames = np.empty((len(controls), self.frames, *observations.image.shape[1:]), np.uint8)
-        for first in range(0, len(controls), self.batch):
-            rows = slice(first, first + self.batch)
-            with loading.memory_guard(self):
-                clips = self._clips(observations.image[rows], controls[rows], seeds[rows])
+        for rows in self.batches(len(controls)):
+            clips = self.make_clips(observations.image[rows], controls[rows], seeds[rows])
             for frame, clip, control in zip(frames[rows], clips, controls[rows], strict=True):
-                chosen = slice(None) if self.every_frame else shown(control.length, self.frames, self.frames)
-                frame[:] = np.rint(clip[chosen] * 255)
+                indices: Any = slice(None)
+                if not self.frame_per_action:
+                    indices = frames_after_actions(control.length, self.frames, self.frames)
+                frame[:] = np.rint(clip[indices] * 255)
         frames[:, 0] = observations.image
         return frames
 
-    def _clips(self, images: NDArray[np.uint8], controls: Sequence[Control], seeds: NDArray[np.uint64]) -> Clips:
+    def batches(self, rows: int) -> Iterator[slice]:
+        """Yield the slices of so many rows that the pipeline takes in one call each."""
+        for first in range(0, rows, self.batch):
+            yield slice(first, first + self.batch)
+
+    def make_clips(self, images: NDArray[np.uint8], controls: Sequence[Control], seeds: NDArray[np.uint64]) -> Clips:
+        """Return one clip per row, each from a generator of its own, from one call of the pipeline.
+
+        Raises:
+            DeviceMemoryError: the GPU's memory is full.
+            ContractError: the networks gave NaN or another number of frames.
+        """
         import torch
         from PIL import Image
 
         generators = [torch.Generator("cpu").manual_seed(int(seed)) for seed in seeds]
-        clips = self.generate([Image.fromarray(image) for image in images], controls, generators)
+        with loading.memory_guard(self):
+            clips = self.generate([Image.fromarray(image) for image in images], controls, generators)
         if not np.isfinite(clips).all():
             raise ContractError(
                 f"{type(self).__name__}: the pipeline gave NaN in {self.precision}; use another precision", "nan"
@@ -169,21 +200,24 @@ class VideoModel(WorldModel):
         return clips
 
     def describe(self) -> dict[str, Any]:
-        """Options, and what identifies the weights: the hub's commit or a digest of the folder."""
-        return {**super().describe(), "pipeline": self.pipeline, **self._weights.identity, **loading.versions()}
+        """Return the options, and what identifies the weights: the hub's commit or a digest of the folder."""
+        return {**super().describe(), "pipeline": self.pipeline_class, **self._weights.identity, **loading.versions()}
 
-    def fingerprint(self) -> str:
-        """Digest of code, options, weights and versions; where the weights lie and how they are kept does not count."""
-        said = {name: value for name, value in self.describe().items() if name not in self.immaterial}
-        said["device"] = str(self.device).partition(":")[0]
-        return blake2b(f"{code_digest(type(self))}{sorted(said.items())}".encode(), digest_size=20).hexdigest()
+    def identity(self) -> dict[str, Any]:
+        """Return options, weights and versions; which GPU it is does not count."""
+        return {**super().identity(), "device": str(self.device).partition(":")[0]}
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the model, those that were left open as resolved."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def __reduce__(self) -> Any:
-        """As options: another process loads the weights itself."""
-        return partial(type(self), **{field.name: getattr(self, field.name) for field in fields(self)}), ()
+        """Pickle the options: another process loads the weights itself."""
+        return partial(type(self), **self.options), ()
 
-    def _check(self) -> None:
-        """Raises ArgumentError for options out of range."""
+    def _check_options(self) -> None:
+        """Raise ArgumentError for options out of range."""
         name = type(self).__name__
         sides = self.size if isinstance(self.size, list | tuple) else ()
         if len(sides) != 2 or not all(isinstance(side, int) and side > 0 for side in sides):
@@ -192,13 +226,15 @@ class VideoModel(WorldModel):
             value = getattr(self, option)
             if not isinstance(value, int) or value < least:
                 raise ArgumentError(f"{name}: expected {option}, a whole number of at least {least}, got {value!r}")
-        if self.batch > self.most_rows:
-            raise ArgumentError(f"{name}: {self.pipeline} takes {self.most_rows} at a time, got batch={self.batch}")
+        if self.batch > self.max_batch:
+            raise ArgumentError(
+                f"{name}: {self.pipeline_class} takes {self.max_batch} at a time, got batch={self.batch}"
+            )
         for option, kinds in (("precision", Precision), ("offload", Offload)):
             allowed = get_args(kinds)
             if getattr(self, option) not in (None, *allowed):
                 raise ArgumentError(f"{name}: expected {option} {', '.join(allowed)}, got '{getattr(self, option)}'")
 
 
-def _rounded(pixels: int, multiple: int) -> int:
+def _round(pixels: int, multiple: int) -> int:
     return max(1, round(pixels / multiple)) * multiple

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a pipeline's weights come from, what identifies them, and what to do where they cannot be had."""
+"""Find a pipeline's weights, identify them, and say what to do where they cannot be had."""
 
 from __future__ import annotations
 
@@ -11,9 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.networks import explained, is_path
+from wiw.networks import explain_hub_error as explained
+from wiw.networks import is_path
 
-__all__ = ["SAMPLES", "SAMPLE_BYTES", "Weights", "digest", "explained", "fetch", "is_path", "require_kind"]
+__all__ = [
+    "SAMPLES",
+    "SAMPLE_BYTES",
+    "Weights",
+    "digest_folder",
+    "explained",
+    "fetch_weights",
+    "is_path",
+    "require_kind",
+]
 
 SAMPLES, SAMPLE_BYTES = 16, 1 << 16
 """Of each file of weights this much is read to identify it: training changes all of a network."""
@@ -28,10 +38,10 @@ class Weights:
     """What tells the weights from others: "commit" on the hub, or "digest" of a folder of the user's own."""
 
 
-def fetch(
+def fetch_weights(
     name: str, pipeline: str, revision: str | None, variant: str | None, components: Mapping[str, Any]
 ) -> Weights:
-    """Finds the folder of a pipeline, from the hub where it is not on this machine yet.
+    """Find the folder of a pipeline, from the hub where it is not on this machine yet.
 
     `components` are parts that the folder need not have.
 
@@ -43,7 +53,7 @@ def fetch(
     if folder.is_dir():
         if revision is not None:
             raise ArgumentError(f"revision: '{revision}' names a state of a hub repository, but {folder} is a folder")
-        return Weights(folder, {"digest": digest(folder)})
+        return Weights(folder, {"digest": digest_folder(folder)})
     if is_path(name):
         raise WeightsError(f"no folder {folder.resolve()}; give the folder of a pipeline, or its name on the hub")
     snapshot = _download(name, pipeline, revision, variant, components)
@@ -61,25 +71,28 @@ def _download(
         raise explained(error, name, revision) from error
 
 
-def require_kind(folder: Path, pipelines: Sequence[str], marks: Mapping[str, bool]) -> None:
-    """Raises WeightsError unless the folder holds one of these pipelines, with these settings set or not set."""
+def require_kind(folder: Path, pipelines: Sequence[str], flags: Mapping[str, bool]) -> None:
+    """Raise WeightsError unless the folder holds one of these pipelines, with these settings set or not set."""
     index = folder / "model_index.json"
     if not index.is_file():
         raise WeightsError(
             f"{folder} has no model_index.json: expected a folder in the layout of diffusers, as save_pretrained writes"
         )
     try:
-        said = json.loads(index.read_text(encoding="utf-8"))
+        content = json.loads(index.read_text(encoding="utf-8"))
     except ValueError as error:
         raise WeightsError(f"{index} is damaged ({error}); fetch the weights again", "unfit") from error
-    found = {name: said.get(name) for name in ("_class_name", *marks)}
-    if found["_class_name"] not in pipelines or any(bool(found[name]) != mark for name, mark in marks.items()):
-        wanted = {"_class_name": " or ".join(pipelines), **{name: mark or None for name, mark in marks.items()}}
+    found = {name: content.get(name) for name in ("_class_name", *flags)}
+    if found["_class_name"] not in pipelines or any(bool(found[name]) != flag for name, flag in flags.items()):
+        wanted = {"_class_name": " or ".join(pipelines), **{name: flag or None for name, flag in flags.items()}}
         raise WeightsError(f"{folder} holds another model: expected {wanted}, found {found}", "unfit")
 
 
-def digest(folder: Path) -> str:
-    """Hex digest of a pipeline's files: small ones by content, weights by name, size and `SAMPLES` pieces of them."""
+def digest_folder(folder: Path) -> str:
+    """Return a hex digest of a pipeline's files.
+
+    Small ones count by content, weights by name, size and `SAMPLES` pieces of them.
+    """
     total = blake2b(digest_size=20)
     for path in sorted(p for p in folder.rglob("*") if p.is_file() and p.suffix in SUFFIXES):
         size = path.stat().st_size

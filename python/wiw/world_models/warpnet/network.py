@@ -39,14 +39,14 @@ class Prediction:
 
 
 def blend(warped: Tensor, painted: Tensor, mask: Tensor) -> Tensor:
-    """`painted` over `warped`."""
+    """Blend `painted` over `warped`."""
     return warped + mask * (painted - warped)
 
 
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
 def rays(height: int, width: int) -> Tensor:
-    """[3, H, W]: unit vectors of a panorama's pixels; +x right, +y up, -z ahead."""
+    """Return unit vectors [3, H, W] of a panorama's pixels; +x right, +y up, -z ahead."""
     latitude = torch.pi * (0.5 - (torch.arange(height) + 0.5) / height)[:, None]
     longitude = 2 * torch.pi * ((torch.arange(width) + 0.5) / width - 0.5)[None]
     x, z = latitude.cos() * longitude.sin(), -latitude.cos() * longitude.cos()
@@ -56,7 +56,7 @@ def rays(height: int, width: int) -> Tensor:
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
 def plain_room(height: int, width: int) -> Tensor:
-    """[1, H, W]: log-distances in a round room 2.6 m high and 5 m wide, seen from its middle, 1 m above the floor."""
+    """Return log-distances [1, H, W] from the middle of a round room 2.6 m high and 5 m wide, 1 m above its floor."""
     up = rays(height, width)[1:2]
     level = (1 - up * up).sqrt()
     floor_or_ceiling = torch.where(up < 0, 1.0, 1.6) / up.abs()
@@ -64,7 +64,7 @@ def plain_room(height: int, width: int) -> Tensor:
 
 
 def warp(source: Tensor, log_distance: Tensor, ahead: Tensor) -> Tensor:
-    """Colours [B, C, H, W] from `ahead` [B] metres further ahead, where things will be exp(log_distance) away.
+    """Return colours [B, C, H, W] from `ahead` [B] metres further ahead, where things will be exp(log_distance) away.
 
     Each pixel's point is carried back into the source's frame and its colour taken there, bilinearly.
     """
@@ -76,21 +76,21 @@ def warp(source: Tensor, log_distance: Tensor, ahead: Tensor) -> Tensor:
     u = longitude * ((1 / torch.pi) * columns / (columns + 2))  # one more column on each side
     v = latitude * (-2 / torch.pi)
     return functional.grid_sample(
-        wrapped(source, 1), torch.stack([u, v], dim=-1), padding_mode="border", align_corners=False
+        wrap_columns(source, 1), torch.stack([u, v], dim=-1), padding_mode="border", align_corners=False
     )
 
 
-def wrapped(panorama: Tensor, columns: int) -> Tensor:
-    """With so many columns of the other end on each side."""
+def wrap_columns(panorama: Tensor, columns: int) -> Tensor:
+    """Add so many columns of the other end on each side."""
     return torch.cat([panorama[..., -columns:], panorama, panorama[..., :columns]], dim=-1)
 
 
-def enlarged(panorama: Tensor, height: int, width: int) -> Tensor:
-    """Bilinear, across the seam too."""
+def enlarge_panorama(panorama: Tensor, height: int, width: int) -> Tensor:
+    """Enlarge a panorama bilinearly, across the seam too."""
     common = gcd(panorama.shape[-1], width)
     margin = panorama.shape[-1] // common
     large = (height, width + 2 * (width // common))
-    wide = functional.interpolate(wrapped(panorama, margin), large, mode="bilinear", align_corners=False)
+    wide = functional.interpolate(wrap_columns(panorama, margin), large, mode="bilinear", align_corners=False)
     return wide[..., width // common : width // common + width]
 
 
@@ -119,7 +119,7 @@ class Network(nn.Module):
         return self.height, 2 * self.height
 
     def forward(self, source: Tensor, ahead: Tensor) -> Prediction:
-        """From `ahead` [B] metres further ahead."""
+        """Predict the view from `ahead` [B] metres further ahead."""
         place = rays(*self.size).expand(len(source), -1, -1, -1)
         where = torch.cat([place, ahead[:, None, None, None].expand(-1, 1, *self.size)], dim=1)
         log_distance = plain_room(*self.size) + self.distance(torch.cat([source, where], dim=1)).float()
@@ -142,7 +142,7 @@ class UNet(nn.Module):
         self.last = nn.Conv2d(fine, 4 * outputs, 1)
 
     def forward(self, image: Tensor) -> Tensor:
-        """[B, outputs, H, W] of [B, inputs, H, W]."""
+        """Return [B, outputs, H, W] of [B, inputs, H, W]."""
         fine = self.fine(functional.pixel_unshuffle(image, 2))
         middle = self.middle(fine)
         coarse = self.coarse(middle)
@@ -160,8 +160,8 @@ class Block(nn.Module):
         self.norm = nn.GroupNorm(4, outputs)
 
     def forward(self, image: Tensor) -> Tensor:
-        """[B, outputs, H / stride, W / stride]."""
-        return functional.silu(self.norm(self.convolution(wrapped(image, 1))))
+        """Return [B, outputs, H / stride, W / stride]."""
+        return functional.silu(self.norm(self.convolution(wrap_columns(image, 1))))
 
 
 def _log(metres: float) -> float:

@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <filesystem>
+#include <optional>
+#include <vector>
+
+#include "wiw/scene/import/json.hpp"
+#include "wiw/scene/import/mesh_format.hpp"
+
+namespace wiw {
+
+/// What a glTF file says of itself, and where a GLB's binary chunk lies if it has one.
+struct GltfDocument {
+  Json root;
+  std::optional<std::size_t> body;  // bytes
+  std::size_t body_offset = 0;
+};
+
+/// Throws FileError for chunks that do not fit the file's length and for JSON that is none.
+GltfDocument read_gltf_document(const std::filesystem::path& path, MeshFormat format);
+
+/// A GLB file of these two chunks.
+std::vector<std::uint8_t> glb_bytes(const Json& root, const std::vector<std::uint8_t>& body);
+
+}  // namespace wiw

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fields of episode files: each reader returns a field's value, or raises a ValueError that names the field."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def text(value: Any, name: str) -> str:
+    """Return a string."""
+    if not isinstance(value, str):
+        raise ValueError(f"{name}: expected text, got {value!r:.80}")
+    return value
+
+
+def name_of(value: Any, name: str) -> str:
+    """Return a string, also of an integer that stands for one."""
+    return str(value) if isinstance(value, int) and not isinstance(value, bool) else text(value, name)
+
+
+def number(value: Any, name: str) -> float:
+    """Return a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"{name}: expected a finite number, got {value!r:.80}")
+    return float(value)
+
+
+def integer(value: Any, name: str) -> int:
+    """Return an integer of at least 0."""
+    if number(value, name) != int(value) or value < 0:
+        raise ValueError(f"{name}: expected an integer of at least 0, got {value!r:.80}")
+    return int(value)
+
+
+def point(value: Any, name: str) -> tuple[float, float, float]:
+    """Return [x, y, z] of finite numbers as a tuple."""
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError(f"{name} must be [x, y, z] in metres, got {value!r:.80}")
+    x, y, z = (number(each, name) for each in value)
+    return x, y, z

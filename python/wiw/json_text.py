@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""JSON that others wrote: whatever is wrong with it is a `ValueError` that says what."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from typing import Any
+
+MOST_LEVELS = 32
+"""Of lists and objects in one another; values are walked through recursively later."""
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+def parse_json(text: bytes | str) -> Any:
+    """Return the value of a JSON text whose strings can all be written as UTF-8.
+
+    Raises:
+        ValueError: the text is not JSON, holds half a surrogate pair, or has more than `MOST_LEVELS` lists and objects
+            in one another.
+    """
+    if isinstance(text, bytes):
+        text = text.decode(json.detect_encoding(text))
+    try:
+        value = json.loads(text)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+        deep = _is_deep(value)
+    except RecursionError:
+        deep = True
+    if deep:
+        raise ValueError(f"expected at most {MOST_LEVELS} lists and objects in one another, and there are more")
+    return value
+
+
+def _is_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(MOST_LEVELS):
+        level = [inner for outer in level for inner in _items(outer)]
+    return any(isinstance(inner, dict | list) for inner in level)
+
+
+def _items(value: Any) -> Iterable[Any]:
+    if isinstance(value, dict):
+        return value.values()
+    return value if isinstance(value, list) else ()

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the values of a run store look like, so that one that somebody has edited is an error that names the place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from wiw.errors import StoreError
+from wiw.json_text import parse_json
+
+NUMBER = (int, float, type(None))
+"""A number, or null for one that is not finite."""
+TEXT, FLAG = (str,), (bool,)
+WHOLE = (int,)
+NONE = (type(None),)
+NUMBERS = {str: (*NUMBER, bool)}
+"""Names to numbers."""
+
+
+class Either:
+    """One of several shapes.
+
+    A shape is a tuple of types, [shape of each item], {str: shape of each value}, {name: shape, ...} with the names
+    that must be there, or this.
+    """
+
+    def __init__(self, *shapes: Any) -> None:
+        self.shapes = shapes
+
+
+CONFIG: Any = {
+    "task": {},
+    "seed": WHOLE,
+    "episodes": WHOLE,
+    "arms": [{"name": TEXT, "agent": {}}],
+}
+INFO: Any = {
+    "task": Either(NONE, {}),
+    "agents": {str: Either(NONE, {})},
+    "pictures": [WHOLE],
+    "live": WHOLE,
+    "workers": WHOLE,
+    "limits": {},
+}
+ACTIONS = [Either(WHOLE, [NUMBER])]
+COLUMNS: Mapping[str, Any] = {
+    "config": CONFIG,
+    "info": INFO,
+    "episode.info": {},
+    "metrics": NUMBERS,
+    "world_to_pixel": [[NUMBER]],
+    "actions": ACTIONS,
+    "executed": ACTIONS,
+    "scores": [NUMBER],
+    "answer": {"label": TEXT, "confidence": NUMBER, "probabilities": NUMBERS},
+    "fidelity": {
+        "scores": [NUMBER],
+        "rank": NUMBER,
+        "regret": NUMBER,
+        "best": (bool, type(None)),
+        "psnr": Either(NUMBER, [Either(NUMBER, [NUMBER])]),
+        "ssim": Either(NUMBER, [Either(NUMBER, [NUMBER])]),
+    },
+    "exchanges": [{"purpose": TEXT, "model": TEXT, "said": [{}], "result": {}, "problem": TEXT, "instead": TEXT}],
+    "proposals": [{"actions": ACTIONS, "prior": NUMBER, "note": TEXT}],
+    "real_frames": [[FLAG]],
+    "path": [[NUMBER]],
+    "refused": [TEXT],
+    "seconds": NUMBERS,
+    "calls": NUMBERS,
+    "spent": NUMBERS,
+}
+"""By column of the store."""
+
+
+def parse_column(column: str, text: Any, where: str) -> Any:
+    """Return the value of a column that holds JSON.
+
+    Raises:
+        StoreError: it is not JSON, or of another shape; names `where`.
+    """
+    try:
+        if not isinstance(text, str):
+            raise ValueError(f"expected text, got {type(text).__name__}")
+        value = parse_json(text)
+        _check(value, COLUMNS[column], "")
+    except ValueError as error:
+        name = column.rpartition(".")[2]
+        raise StoreError(f"{where}: {name}: {error}; the run store was edited: bring back a copy of it") from error
+    return value
+
+
+def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]], where: str) -> None:
+    """Hold a row to the declared types of its columns, which SQLite does not.
+
+    Raises:
+        StoreError: a value is of another type; names `where` and the column.
+    """
+    for name, value in row.items():
+        if name in declared and not isinstance(value, declared[name]):
+            raise StoreError(
+                f"{where}: {name}: expected {declared[name][0].__name__}, got {type(value).__name__}; the run store "
+                "was edited: bring back a copy of it"
+            )
+
+
+def check_decision(row: Mapping[str, Any], where: str) -> None:
+    """Hold the columns of a decision to each other: one score and one list of frames for each proposal.
+
+    Raises:
+        StoreError: they do not fit; names `where`.
+    """
+    count = len(row["proposals"])
+    fits = all(row[name] is None or len(row[name]) == count for name in ("scores", "real_frames"))
+    chosen = row["chosen"] is None or 0 <= row["chosen"] < count
+    poses = [action for action in (*row["actions"], *row["executed"]) if isinstance(action, list)]
+    fits = fits and len(row["actions"]) > 0 and len(poses) in (0, len(row["actions"]) + len(row["executed"]))
+    fits = fits and all(len(pose) == 7 for pose in poses)
+    if not fits or not chosen or not row["path"] or any(len(place) != 3 for place in row["path"]):
+        raise StoreError(
+            f"{where}: expected actions of one kind, a score and frames for each of {count} proposals, one of them "
+            "chosen, and a path of [x, y, z]; the run store was edited: bring back a copy of it"
+        )
+
+
+def _check(value: Any, shape: Any, place: str) -> None:
+    if isinstance(shape, Either):
+        _check_either(value, shape, place)
+    elif isinstance(shape, tuple):
+        if not isinstance(value, shape) or (isinstance(value, bool) and bool not in shape):
+            raise ValueError(f"{place or 'value'}: expected {_named(shape)}, got {type(value).__name__}")
+    elif isinstance(shape, list):
+        _require(value, list, place)
+        for index, item in enumerate(value):
+            _check(item, shape[0], f"{place}[{index}]")
+    else:
+        _require(value, dict, place)
+        if str in shape:
+            for name, item in value.items():
+                _check(item, shape[str], f"{place}.{name}".lstrip("."))
+            return
+        for name, inner in shape.items():
+            if name not in value:
+                raise ValueError(f"{place or 'value'}: '{name}' is missing")
+            _check(value[name], inner, f"{place}.{name}".lstrip("."))
+
+
+def _check_either(value: Any, either: Either, place: str) -> None:
+    errors = []
+    for shape in either.shapes:
+        try:
+            return _check(value, shape, place)
+        except ValueError as error:
+            errors.append(str(error))
+    raise ValueError(" or ".join(errors))
+
+
+def _require(value: Any, kind: type, place: str) -> None:
+    if not isinstance(value, kind):
+        raise ValueError(f"{place or 'value'}: expected {kind.__name__}, got {type(value).__name__}")
+
+
+def _named(types: Sequence[type]) -> str:
+    return " or ".join("null" if kind is type(None) else kind.__name__ for kind in types)

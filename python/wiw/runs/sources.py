@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The user's own source files that a run depends on, so that one run never mixes two versions of a model or policy."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import sysconfig
+from collections.abc import Iterator, Mapping
+from functools import partial
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import wiw
+from wiw.errors import StoreError
+from wiw.world_models.function import Function
+
+LIBRARIES = (
+    Path(wiw.__file__).resolve().parent,
+    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+)
+"""Folders of code whose versions are known otherwise."""
+
+
+def source_digests(part: Any) -> dict[str, str]:
+    """Return digests by path of the files that define a class or function, or the class of an instance.
+
+    With them go the classes that it derives from and the files beside them that they import, in functions too.
+    Installed packages are left out. Of a class in a script that is run itself, the class alone counts; of one in a
+    notebook there is no file.
+    """
+    while isinstance(part, partial):
+        part = part.func
+    part = part.function if isinstance(part, Function) else part
+    thing = part if inspect.isclass(part) or inspect.isroutine(part) else type(part)
+    found: dict[str, str] = {}
+    for each in thing.__mro__ if inspect.isclass(thing) else (thing,):
+        file = _source_file(each)
+        if file is None:
+            continue
+        if each.__module__ == "__main__":
+            found |= _script_digest(file, each)
+        else:
+            found |= {str(path): _digest(path.read_bytes()) for path in _with_imports(file)}
+    return found
+
+
+def require_sources(run: Path, begun_with: Mapping[str, str] | None, now: Mapping[str, str]) -> None:
+    """Hold a run to the source files that it was begun with; a run that does not say which is left alone.
+
+    Raises:
+        StoreError: a file has changed, come or gone.
+    """
+    changed = [] if begun_with is None else [path for path in begun_with if begun_with[path] != now.get(path)]
+    changed += [] if begun_with is None else [path for path in now if path not in begun_with]
+    if changed:
+        raise StoreError(
+            f"{run}: source files have changed since the run was begun: {', '.join(sorted(changed))}. Results of two "
+            "versions must not be mixed: begin a new run in another folder, or put the files back as they were"
+        )
+
+
+def require_unchanged(begun_with: Mapping[str, str]) -> None:
+    """Hold a run that is going on to its source files: an agent that is built later reads them again.
+
+    Raises:
+        StoreError: a file has changed or gone.
+    """
+    files = {path: Path(path) for path in begun_with if SCRIPT not in path}
+    now = {path: _digest(file.read_bytes()) for path, file in files.items() if file.is_file()}
+    require_sources(Path("this run"), {path: begun_with[path] for path in files}, now)
+
+
+SCRIPT = "::"
+"""Between the path of a script and the name of its class."""
+
+
+def _script_digest(file: Path, thing: Any) -> dict[str, str]:
+    try:
+        return {f"{file}{SCRIPT}{thing.__qualname__}": _digest(inspect.getsource(thing).encode())}
+    except (OSError, TypeError):
+        return {}
+
+
+def _digest(content: bytes) -> str:
+    return blake2b(content, digest_size=16).hexdigest()
+
+
+def _source_file(thing: Any) -> Path | None:
+    """The file of the user's that defines a class or function."""
+    try:
+        name = inspect.getsourcefile(thing)
+    except (OSError, TypeError):
+        return None
+    path = None if name is None else Path(name).resolve()
+    return path if path is not None and path.is_file() and not _is_library(path) else None
+
+
+def _is_library(path: Path) -> bool:
+    return any(path.is_relative_to(folder) for folder in LIBRARIES)
+
+
+def _with_imports(file: Path) -> set[Path]:
+    """A file and those of the user's that it imports, and they."""
+    found, waiting = set[Path](), [file]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found.add(path)
+            waiting += _imports(path)
+    return found
+
+
+def _imports(file: Path) -> Iterator[Path]:
+    """The files of the user's that a file imports."""
+    try:
+        tree = ast.parse(file.read_bytes())
+    except (SyntaxError, ValueError):  # no Python, such as an extension's source
+        return
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield from _modules(_roots(file), alias.name)
+        elif isinstance(node, ast.ImportFrom):
+            roots = [file.parents[node.level - 1]] if node.level else _roots(file)
+            for alias in node.names:
+                yield from _modules(roots, ".".join(filter(None, (node.module, alias.name))))
+
+
+def _roots(file: Path) -> list[Path]:
+    """Folders from which a file imports: its own, as of a script, and that of its outermost package."""
+    package = file.parent
+    while (package / "__init__.py").is_file():
+        package = package.parent
+    return list(dict.fromkeys([file.parent, package]))
+
+
+def _modules(roots: list[Path], name: str) -> Iterator[Path]:
+    """The files that importing a dotted name runs: packages on the way, the module; the last may be no module."""
+    parts = name.split(".")
+    for root in roots:
+        for count in range(1, len(parts) + 1):
+            place = root.joinpath(*parts[:count])
+            for path in (place.with_suffix(".py"), place / "__init__.py"):
+                if path.is_file() and not _is_library(path.resolve()):
+                    yield path.resolve()

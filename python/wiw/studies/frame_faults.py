@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is wrong with imagined frames beside what an agent would truly see: channels, orientation, values that wrap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import TURN_LEFT, TURN_RIGHT
+from wiw.world_models.pictures import ALTERED, CHANNELS, OTHER, Picture, correlation, exchanged
+
+BETTER = 0.15
+"""By how much an altered picture has to fit better, in correlation."""
+JUMP = 160
+"""Levels of 255 between neighbouring pixels that only edges between black and white have."""
+
+Frames = NDArray[np.uint8]
+
+
+def altered(truth: Sequence[Frames], found: Sequence[Frames]) -> str:
+    """Return what was done to all frames [K, H, W, 3] of some rollouts, in words; nothing where they are as they are.
+
+    `truth` are frames of the same moments, of any size.
+    """
+    pairs = _pairs(truth, found)
+    if sum(exchanged(true, frame) for true, frame in pairs) > len(pairs) / 2:
+        return CHANNELS
+    alike = np.mean([correlation(true, frame) for true, frame in pairs])
+    fits = {
+        name: np.mean([correlation(alter(true), frame) for true, frame in pairs]) for name, alter in ALTERED.items()
+    }
+    best = max(fits, key=lambda name: fits[name])
+    return f"frames are {best}" if fits[best] > max(OTHER, alike + BETTER) else ""
+
+
+def mean_correlation(truth: Sequence[Frames], found: Sequence[Frames]) -> float:
+    """Return the mean correlation of frames with those of the same moments."""
+    return float(np.mean([correlation(true, frame) for true, frame in _pairs(truth, found)]))
+
+
+def share_of_jumps(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]) -> float:
+    """Return the share of horizontal neighbours in images [..., H, W, 3] that are nearly black and nearly white."""
+    jumps = [np.abs(np.diff(image.astype(np.int16), axis=-2)) > JUMP for image in images]
+    return float(np.mean([each.mean() for each in jumps]))
+
+
+def exchange_turns(plan: NDArray[Any]) -> NDArray[Any]:
+    """Return a plan of primitives with every turn to the other side."""
+    exchange = {int(TURN_LEFT): int(TURN_RIGHT), int(TURN_RIGHT): int(TURN_LEFT)}
+    return np.array([exchange.get(int(one), int(one)) for one in plan], plan.dtype)
+
+
+def _pairs(truth: Sequence[Frames], found: Sequence[Frames]) -> list[tuple[Picture, Picture]]:
+    """Return frames of the same moments at the size of the true ones."""
+    return [
+        (true.astype(np.float32), _resized(frame, true.shape[:2]).astype(np.float32))
+        for trues, frames in zip(truth, found, strict=True)
+        for true, frame in zip(trues, frames, strict=True)
+    ]
+
+
+def _resized(image: Frames, size: tuple[int, ...]) -> Frames:
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ceiling: a world model that is the world."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.types import Conditioning, Control, Space
+from wiw.world_models.base import WorldModel, accepts
+
+
+class Oracle(WorldModel):
+    """Carry the plan out in a fork of the simulator and return what it truly sees there.
+
+    No model can do better with the same policy, so its score is the ceiling. It alone is handed the simulator.
+    """
+
+    accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
+
+    def for_space(self, space: Space) -> WorldModel:
+        """Return the oracle of a manipulator's world where plans are poses."""
+        return self if space == "discrete" else ArmOracle()
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Return true panoramas; frames that another row answers and frames of padding are left unwritten."""
+        assert observations.simulators is not None
+        image = observations.image
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
+        frames[:, 0] = image
+        jobs: dict[int, list[tuple[int, int, NDArray[np.float64]]]] = defaultdict(list)
+        renderers = {}
+        for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
+            poses = simulator.camera_poses_after(control.actions[: control.length])
+            renderers[id(simulator.renderer)] = simulator.renderer
+            jobs[id(simulator.renderer)] += [(row, 1 + k, poses[k]) for k in range(control.shared, control.length)]
+        for name, views in jobs.items():
+            if views:
+                rows, steps, poses = zip(*views, strict=True)
+                pictures = np.empty((len(views), *image.shape[1:]), np.uint8)
+                renderers[name].panorama(np.stack(poses), image.shape[1:3], pictures, None, None)
+                frames[list(rows), list(steps)] = pictures
+        return frames
+
+
+class ArmOracle(Oracle):
+    """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
+
+    accepts = accepts(control="action", space="pose7", view="perspective", needs=("simulator",), best_batch=64)
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Return the true front views after each pose."""
+        assert observations.simulators is not None
+        image = observations.image
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *image.shape[1:]), np.uint8)
+        frames[:, 0] = image
+        for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
+            assert control.ids is not None
+            frames[row, 1:] = simulator.fork().render_fronts_after(control.ids[1:], image.shape[1:3])
+        return frames

@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a model's frames are pictures of the place that it was shown: upright, in RGB, on the scale of uint8.
+
+Everything is judged on a sample of the pixels, by correlations, so that a frame 0 that a video model has encoded and
+decoded again passes, whatever the model's quality, and what was done to a whole picture does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ContractError
+from wiw.types import Control
+
+COLUMNS = 64
+"""Of a sample, about."""
+FLAT = 2.0
+"""Standard deviation, in levels of 255, up to which a picture has no structure to compare."""
+CLOSE = 16.0
+"""Mean difference, in levels of 255, up to which two pictures are alike whatever their structure."""
+ALIKE, OTHER = 0.9, 0.5
+"""Correlations from which pictures show the same, and up to which they do not."""
+DARK = 16.0
+"""Mean level up to which an observation may be followed by black."""
+ALTERED: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
+    "mirrored": lambda picture: picture[:, ::-1],
+    "upside down": lambda picture: picture[::-1],
+    "turned by 180 degrees": lambda picture: picture[::-1, ::-1],
+    "inverted": lambda picture: 255 - picture,
+}
+"""What is done to pictures by mistake."""
+CHANNELS = "red and blue are exchanged (BGR): give RGB, as frames[..., ::-1] of what OpenCV gives"
+SCALE = (
+    "no value is above 1: floats from 0 to 1 were cast to uint8 as they are; give "
+    "np.rint(np.clip(frames, 0, 1) * 255).astype(np.uint8)"
+)
+
+Picture = NDArray[np.float32]
+
+
+def sample(images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return about `COLUMNS` columns of images [..., H, W, 3] and rows as far apart, as a view."""
+    step = max(1, images.shape[-2] // COLUMNS)
+    return images[..., step // 2 :: step, step // 2 :: step, :]
+
+
+def check_pictures(
+    name: str, observations: NDArray[np.uint8], frames: NDArray[np.uint8], controls: Sequence[Control]
+) -> None:
+    """Hold an answer to showing what was observed; `observations` are samples of the images that were handed over.
+
+    Looked at are frame 0, and the frames that are each row's own.
+
+    Raises:
+        ContractError: frame 0 is another picture ("frame 0"), red and blue are exchanged ("channels"), or floats were
+            cast without their scale ("scale").
+    """
+    for observed, row, control in zip(observations, sample(frames), controls, strict=True):
+        own = row[1 + control.shared : 1 + control.length]
+        if observed.std() <= FLAT:
+            continue
+        if observed.mean() > DARK and max(own.max(initial=0), row[0].max()) <= 1:
+            raise ContractError(f"{name}.rollout: {SCALE}", "scale")
+        expected = observed.astype(np.float32)
+        exact = np.array_equal(row[0], observed)
+        if not exact and (fault := first_frame_fault(expected, row[0].astype(np.float32))):
+            raise ContractError(
+                f"{name}.rollout: frame 0 is not the observation: {fault}. Frame k is what follows action k; "
+                "put the observation in front: frames[:, 0] = observations.image",
+                "channels" if fault == CHANNELS else "frame 0",
+            )
+        if len(own) == 0:
+            continue
+        if observed.mean() > DARK and own.max() <= 1:
+            raise ContractError(f"{name}.rollout: after frame 0, {SCALE}", "scale")
+        if exchanged(expected, own[0].astype(np.float32)):
+            raise ContractError(f"{name}.rollout: after frame 0, {CHANNELS}", "channels")
+
+
+def first_frame_fault(observed: Picture, found: Picture) -> str:
+    """Return what is wrong with a frame 0, in words; nothing where it is the observation, if only by and large."""
+    if exchanged(observed, found):
+        return CHANNELS
+    alike = correlation(observed, found)
+    if alike >= ALIKE or np.abs(observed - found).mean() <= CLOSE:
+        return ""
+    for name, alter in ALTERED.items():
+        if correlation(alter(observed), found) >= max(ALIKE, alike + 0.05):
+            return f"it is {name}"
+    return "" if alike >= OTHER else f"it is another picture (their correlation is {alike:.2f} of 1)"
+
+
+def exchanged(one: Picture, other: Picture) -> bool:
+    """Return whether two pictures show the same with red and blue exchanged."""
+    colors = [picture[..., 0] - picture[..., 2] for picture in (one, other)]
+    return correlation(one, other) >= OTHER and _related(*colors) <= -OTHER
+
+
+def correlation(one: Picture, other: Picture) -> float:
+    """Return the correlation of the brightness of two pictures [..., H, W, 3]; 0 where one has no structure."""
+    return _related(one.mean(-1), other.mean(-1))
+
+
+def _related(one: Picture, other: Picture) -> float:
+    if min(one.std(), other.std()) <= FLAT:
+        return 0.0
+    return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runway Gen-4, a paid service."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.types import Conditioning, Control
+from wiw.world_models import devices
+from wiw.world_models.base import Requirements, WorldModel, accepts
+from wiw.world_models.clips import frames_after_actions
+from wiw.world_models.runway_gen4.tasks import Tasks
+from wiw.world_models.runway_gen4.videos import encode_data_uri, fetch_video
+
+LONGEST_PROMPT = 1000
+"""UTF-16 code units that the service takes."""
+SIDE = 960
+"""Of the service's clips, in pixels."""
+
+
+@dataclass(kw_only=True, eq=False)
+class RunwayGen4(WorldModel):
+    """Runway Gen-4: the front view and the plan in words become a clip, on Runway's servers, for money.
+
+    The key is read from the environment, RUNWAYML_API_SECRET. All rows of a call are begun at once and waited for
+    together. A row that the service has confirmed is never begun again: a repeated question goes on waiting for it.
+
+    Args:
+        model: "gen4_turbo", or "gen4.5".
+        duration: seconds of a clip, 2 to 10; each costs credits.
+        size: (height, width) of input and output, square and at most 960x960, which the service makes of it.
+        frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
+        batch: rows that are begun at once.
+        budget: credits after which nothing more is begun; None is without end.
+        poll: seconds between two looks at the tasks.
+        patience: seconds after which a task that has not ended counts as lost.
+        url: of the service; RUNWAYML_BASE_URL if not given, else Runway's own.
+
+    Raises:
+        DependencyError: `runwayml` is not installed.
+        ArgumentError: no key in the environment, or an option out of range.
+    """
+
+    accepts = accepts(control="text", view="perspective", frames=25)
+    version = "1"
+    immaterial = ("batch", "budget", "poll")
+    requires = Requirements(("runwayml",), "runway", variables=("RUNWAYML_API_SECRET",))
+
+    model: Literal["gen4_turbo", "gen4.5"] = "gen4_turbo"
+    duration: int = 5
+    size: tuple[int, int] = (480, 480)
+    frames: int = 25
+    batch: int = 4
+    budget: float | None = None
+    poll: float = 5.0
+    patience: float = 600.0
+    url: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.model not in ("gen4_turbo", "gen4.5") or self.duration not in range(2, 11):
+            raise ArgumentError(
+                f"RunwayGen4: expected model gen4_turbo or gen4.5 and a duration of 2 to 10 whole seconds, got "
+                f"{self.model!r} and {self.duration!r}"
+            )
+        if self.batch < 1 or self.poll < 0 or not self.patience > 0:
+            raise ArgumentError(
+                f"RunwayGen4: expected a batch of at least 1, poll of at least 0 s and patience above 0 s, got "
+                f"{self.batch}, {self.poll} and {self.patience}"
+            )
+        if not isinstance(self.frames, int) or self.frames < 2:
+            raise ArgumentError(f"RunwayGen4: expected frames, a whole number of at least 2, got {self.frames!r}")
+        sides = tuple(self.size) if isinstance(self.size, list | tuple) else ()
+        if len(sides) != 2 or sides[0] != sides[1] or sides[0] not in range(1, SIDE + 1):
+            raise ArgumentError(
+                f"RunwayGen4: clips are square, {SIDE}x{SIDE}: expected size (side, side) of at most that, got "
+                f"{self.size!r}"
+            )
+        self.size = (int(sides[0]), int(sides[1]))
+        self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
+        devices.require(self.requires)
+        self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)
+
+    @property
+    def credits(self) -> int:  # type: ignore[override]
+        """What the service has charged so far."""
+        return self._tasks.credits
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Return one clip per row, evenly sampled; padding repeats the last frame of the plan.
+
+        Raises:
+            InfrastructureError: the service refused, failed or took too long, or the budget is spent.
+        """
+        orders = [
+            self._make_order(image, control, int(seed))
+            for image, control, seed in zip(observations.image, controls, seeds, strict=True)
+        ]
+        frames = np.empty((len(controls), self.frames, *observations.image.shape[1:]), np.uint8)
+        for row, (url, control) in enumerate(zip(self._tasks.outputs(orders), controls, strict=True)):
+            clip = fetch_video(url, self.size)
+            frames[row] = clip[frames_after_actions(control.length, len(clip), self.frames)]
+        frames[:, 0] = observations.image
+        return frames
+
+    def _make_order(self, image: NDArray[np.uint8], control: Control, seed: int) -> dict[str, Any]:
+        """Return what the service is asked for one row."""
+        if len(control.text.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
+            raise ArgumentError(
+                f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, and {control.length} "
+                f"actions take {len(control.text)}; lower frames (now {self.frames})"
+            )
+        return {
+            "model": self.model,
+            "prompt_image": encode_data_uri(image),
+            "prompt_text": control.text,
+            "ratio": f"{SIDE}:{SIDE}",
+            "duration": self.duration,
+            "seed": seed % 2**32,
+        }
+
+    def __reduce__(self) -> Any:
+        """Pickle the options: another process opens its own connection."""
+        return partial(type(self), **{field.name: getattr(self, field.name) for field in fields(self)}), ()

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth reprojection: how far geometry alone goes, with no learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.reproject import warp
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import WorldModel, accepts
+
+
+class Warp(WorldModel):
+    """Move the RGB-D panorama's depth mesh to the new pose and fill what was hidden from its background.
+
+    Depth is the simulator's, as the paper grants every depth-aware model. The reference between floor and ceiling: a
+    video generator that scores less has not learnt what one depth image already tells.
+    """
+
+    accepts = accepts(control="trajectory", view="panorama", needs=("depth",), causal=True, best_batch=64)
+    version = "1"
+
+    def rollout(
+        self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+    ) -> NDArray[np.uint8]:
+        """Return reprojected panoramas; frames that another row answers and frames of padding are left unwritten."""
+        assert observations.depth is not None
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
+        frames[:, 0] = observations.image
+        for row, control in enumerate(controls):
+            wanted = slice(control.shared, control.length)
+            if wanted.start < wanted.stop:
+                frames[row, 1 + control.shared : 1 + control.length] = warp(
+                    observations.image[row : row + 1],
+                    observations.depth[row : row + 1],
+                    control.viewpoints[None, wanted],
+                )[0]
+        return frames

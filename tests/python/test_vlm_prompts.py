@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A user's prompt templates: whatever they do ends soon, in a prompt or in an error that names the file."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+
+import pytest
+
+from wiw.errors import PromptError
+from wiw.policies.vlm.prompts import ARM_SLOTS, FOLDER, SLOTS, Prompts, tasks
+
+LOOP = "{% for a in range(99999) %}"
+
+
+def own_prompt(folder: Path, source: str) -> Path:
+    file = folder / "imagenav/planner.j2"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(source)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ("{{ 'x' * 10 ** 9 }}", "MemoryError"),
+        ("{{ ('x' * 10 ** 9) | length }}", "MemoryError"),
+        ("{{ '%1000000000d' | format(1) }}", "MemoryError"),
+        ("{{ 9 ** (9 ** 9) }}", "at most 2 s to fill"),
+        (LOOP * 3 + "{% endfor %}" * 3, "at most 2 s to fill"),
+        (LOOP + "{{ 'walk ' * 9 }}{% endfor %}", "at most 1048576 characters"),
+        ("{% macro again() %}{{ again() }}{% endmacro %}{{ again() }}", "(RecursionError|recursion)"),
+        ("{{ " + "(" * 5000 + ")" * 5000 + " }}", "(RecursionError|recursion)"),
+        ("{% raw %}", "a raw block does not end"),
+        ("Walk!{% raw %}", "a raw block does not end"),
+        ("Walk!{#", "(a comment block does not end|Missing end of comment)"),
+    ],
+)
+def test_a_template_that_takes_too_much_or_does_not_end_is_refused(tmp_path: Path, source: str, said: str) -> None:
+    own_prompt(tmp_path, source)
+    with pytest.raises(PromptError, match=rf"(?s)imagenav/planner\.j2: .*{said}"):
+        Prompts(tmp_path)
+
+
+def test_a_template_may_be_too_much_for_one_situation_and_not_for_the_next(tmp_path: Path) -> None:
+    own_prompt(tmp_path, "{{ 'x' * plan_num }}{% for a in range(plan_num) %}" + LOOP + "{% endfor %}{% endfor %}")
+    own = Prompts(tmp_path)
+    assert own.text("imagenav", "planner", **{**SLOTS, "plan_num": 2}) == "xx"
+    for plan_num, said in ((2000, "at most 2 s"), (2 << 20, "at most 1048576 characters")):
+        with pytest.raises(PromptError, match=said):
+            own.text("imagenav", "planner", **{**SLOTS, "plan_num": plan_num})
+    again = pickle.loads(pickle.dumps(own))
+    assert own.text("imagenav", "planner", **SLOTS) == again.text("imagenav", "planner", **SLOTS) == "x"
+    assert own.digest == again.digest
+
+
+def test_raw_and_comment_blocks_that_end_are_fine(tmp_path: Path) -> None:
+    own_prompt(tmp_path, "{# a note #}{% raw %}{{ braces }}{% endraw %} {{ plan_num }}")
+    assert Prompts(tmp_path).text("imagenav", "planner", **SLOTS) == "{{ braces }} 1"
+
+
+@pytest.mark.parametrize("task", tasks())
+def test_shipped_templates_say_the_same_as_a_users(tmp_path: Path, task: str) -> None:
+    slots = ARM_SLOTS if task == "manipulation" else SLOTS
+    (tmp_path / task).mkdir()
+    for file in (FOLDER / task).glob("*.j2"):
+        (tmp_path / task / file.name).write_text(file.read_text())
+    own, shipped = Prompts(tmp_path), Prompts()
+    for file in (FOLDER / task).glob("*.j2"):
+        text = own.text(task, file.stem, **slots)
+        assert text == shipped.text(task, file.stem, **slots) and text
+    assert own.digest == shipped.digest
