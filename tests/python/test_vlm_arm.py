@@ -201,7 +201,7 @@ def test_slips_of_syntax_are_mended() -> None:
 def test_marks_are_on_their_objects_and_hide_little_of_them(kind: str, size: int) -> None:
     task = Manipulation(kind, seed=2)
     for index in range(4):
-        table = task.table(task.episode(index))
+        table = task.set_table(task.episode(index))
         seen = table.bench.render_view("front", (size, size), ("color", "instance"))
         observation = wiw.types.ArmObservation(
             seen["color"], table.bench.pose, places=table.bench.get_poses(table.objects)

@@ -62,7 +62,7 @@ class Demonstrations(Sequence[Demonstration]):
         require_pyarrow()
         self.folder = Path(folder)
         self.config = read_manifest(self.folder)
-        """What was asked for when it was collected."""
+        """Options of the collection."""
         paths = [path for task in self._asked(tasks) for path in shard_paths(self.folder, self.config, task)]
         self._shards = [Shard(path) for path in paths if not partial or path.exists()]
         self._ends = list(accumulate(len(shard) for shard in self._shards))
