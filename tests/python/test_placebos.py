@@ -159,7 +159,7 @@ def test_wrappers_of_a_model_compose_in_any_order(order) -> None:
 
     agent, model, decisions = decide(order)
     _, expected, others = decide(WRAPPERS)
-    assert agent.model.base is model and model.log == expected.log and {colour for colour, _ in model.log} == {200}
+    assert agent.model.unwrapped is model and model.log == expected.log and {colour for colour, _ in model.log} == {200}
     for one, other in zip(decisions, others, strict=True):
         np.testing.assert_array_equal(one.scores, other.scores)
         assert one.calls == other.calls and (one.rollouts is None) == (other.rollouts is None)
@@ -190,7 +190,7 @@ def test_what_placebo_arms_are_of() -> None:
     assert AgentRecipe.from_json(made["placebo-shuffled"].to_json()) == made["placebo-shuffled"]
     assert arm_recipes(AgentRecipe("matcher"), ["placebo-swapped"])["placebo-swapped"].model == "warp"
     built = arm_recipes(wiw.Agent("matcher", "copy"), ["placebo-shuffled"])["placebo-shuffled"].build(NOWHERE)
-    assert built.describe()["placebo"] == "shuffled" and type(built.model.base).__name__ == "Copy"
+    assert built.describe()["placebo"] == "shuffled" and type(built.model.unwrapped).__name__ == "Copy"
     assert absolute("placebo-shuffled:a.py:Mine").startswith("placebo-shuffled:/")
     for wrong in ("placebo-odd", "placebo-shuffled:none"):
         with pytest.raises(ArgumentError, match="placebo-shuffled"):

@@ -176,7 +176,7 @@ def test_models_that_need_no_semantics_are_left_alone(two_rooms: str) -> None:
 def test_labels_reach_the_model_through_any_wrappers(two_rooms: str, reader: str, wrap: Any) -> None:
     agent, one = wiw.Agent("heuristic", wrap(wiw.world_model(reader)), reviser="matcher"), begin(two_rooms)
     assert decide(agent, one)[0].calls["rows"] > 0
-    assert set(np.unique(type(agent.model.base).seen[-1])) <= set(np.unique(one.semantic()))
+    assert set(np.unique(type(agent.model.unwrapped).seen[-1])) <= set(np.unique(one.semantic()))
 
 
 def test_labels_that_a_swapped_placebo_brings_along_stay(two_rooms: str, reader: str) -> None:
@@ -192,7 +192,7 @@ def test_labels_that_a_swapped_placebo_brings_along_stay(two_rooms: str, reader:
         "heuristic", SwappedPlacebo(Labelled(wiw.world_model(reader), "simulator"), Elsewhere()), reviser="matcher"
     )
     decide(agent, begin(two_rooms))
-    assert set(np.unique(type(agent.model.base).seen[-1])) == {7}
+    assert set(np.unique(type(agent.model.unwrapped).seen[-1])) == {7}
 
 
 class Stripes(Semantics):
@@ -211,7 +211,7 @@ def test_a_source_of_your_own_is_asked_for_all_episodes_at_once(two_rooms: str, 
     assert agent.describe()["semantics"] == {"name": "Stripes"}
     one, other = begin(two_rooms), begin(two_rooms, 1)
     agent.decide_batch([query(one), query(other, 1)])
-    shown = type(agent.model.base).seen[-1]
+    shown = type(agent.model.unwrapped).seen[-1]
     assert set(np.unique(shown)) == set(range(16)) and all(len(np.unique(row[0])) == 16 for row in shown)
     blind = replace(query(one), observation=replace(one.observation, depth=None))
     with pytest.raises(ArgumentError, match="needs observations with depth"):
@@ -231,7 +231,7 @@ def test_rednet_labels_what_the_model_is_given(two_rooms: str, reader: str, tmp_
     agent = AgentRecipe.from_json(recipe.to_json()).build(context)
     assert agent.describe()["semantics"] == {"name": "RedNet", "weights": "tiny.pth", "face": 32, "metres": [0.0, 10.0]}
     agent.decide_batch([query(begin(two_rooms))])
-    shown = type(agent.model.base).seen[-1]
+    shown = type(agent.model.unwrapped).seen[-1]
     assert shown.min() >= 1 and shown.max() <= 40 and len(np.unique(shown)) > 1
 
 

@@ -63,7 +63,7 @@ class Policy(ABC):
     """Tokens that the policy's language model has read and written so far; 0 without one."""
 
     @property
-    def base(self) -> Policy:
+    def unwrapped(self) -> Policy:
         """The policy itself, behind everything that wraps it."""
         return self
 
@@ -120,7 +120,8 @@ class Policy(ABC):
         )
         if not isinstance(found, Sequence) or len(found) != len(places):
             raise ContractError(
-                f"{type(self.base).__name__}.score: expected scores for each of {len(places)} episodes, got {found!r}"
+                f"{type(self.unwrapped).__name__}.score: expected scores for each of {len(places)} episodes, got "
+                f"{found!r}"
             )
         for place, score in zip(places, found, strict=True):
             scores[place] = score
