@@ -13,16 +13,17 @@ from history_models import Recalling, digest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
 from wiw.loop.agent import Query
-from wiw.loop.attempts import Attempts
-from wiw.loop.beam import moved
+from wiw.experiments.placebos import SwappedPlacebo
+from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.history import EpisodeHistories, Frame, relative_poses, stack_histories
 from wiw.loop.imagine import imagine
-from wiw.loop.rollout_cache import Remembered, RolloutCache
+from wiw.loop.rollout_cache import Cached, RolloutCache
 from wiw.loop.scheduler import run_episodes
+from wiw.loop.search import move
 from wiw.policies.base import FrameSpec
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.serving.background import served
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import ArmObservation, Goal, History, Key, Observation, Proposal
@@ -213,7 +214,7 @@ def test_histories_do_not_depend_on_what_else_is_live(task: ImageNav, frames: in
 def test_nor_on_workers_or_the_wire(two_rooms: str, tmp_path: Path) -> None:
     here = f"{Path(__file__).with_name('history_models.py')}:Recalling"
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = AgentRecipe("heuristic", here, revision="matcher")
+    agent = AgentRecipe("heuristic", here, reviser="matcher")
     with served(Recalling) as server:
         arms = [here, f"remote:{server.address}"]
         one = wiw.evaluate(task, agent, 3, out=tmp_path / "1", live=3, arms=arms, cache="off", progress=False)
@@ -399,7 +400,7 @@ def test_one_frame_is_frame_0(task: ImageNav) -> None:
 
 def test_poses_are_where_odometry_was() -> None:
     start, actions = np.array([1.0, -2.0, 3.0]), [FORWARD, TURN_LEFT, FORWARD, TURN_LEFT, FORWARD]
-    odometry = np.array([start, *(moved(start, np.array(actions[: k + 1], np.int8)) for k in range(5))])
+    odometry = np.array([start, *(move(start, np.array(actions[: k + 1], np.int8)) for k in range(5))])
     found = relative_poses(odometry)
     assert not found[-1].any()
     np.testing.assert_allclose(found[0, :2], -rotate(to_trajectory(actions)[-1, :2], -2 * TURN), atol=1e-9)
@@ -448,7 +449,7 @@ def test_the_cache_tells_histories_apart_but_not_batches(tmp_path: Path) -> None
     def asked(history, rows=1):
         before = len(model._calls)
         seen = replace(observations, image=np.repeat(observations.image, rows, 0), history=history)
-        Remembered(Attempts(model), RolloutCache(tmp_path))(seen, controls * rows, np.zeros(rows, np.uint64))
+        Cached(Attempted(model), RolloutCache(tmp_path)).rollout(seen, controls * rows, np.zeros(rows, np.uint64))
         return sum(len(call[1]) for call in model._calls[before:])
 
     assert asked(given) == 1 and asked(given) == 0
