@@ -62,17 +62,17 @@ def test_what_goes_over_the_wire_is_what_was_asked(dialect: str) -> None:
         client = connect(server.url, dialect=dialect)
         assert client.model == "mock"
         replies = client.ask(REQUESTS)
-        asked = server.client.asked
+        asked = server.client.calls
         direct = MockClient()
         direct.ask(REQUESTS)
-        twins = {parts_of(call): call for call in direct.asked}
+        twins = {parts_of(call): call for call in direct.calls}
         for call in (call for call in asked if parts_of(call) in twins):
             twin = twins[parts_of(call)]
             assert call.schema == twin.schema and call.temperature in (twin.temperature, 1.0)
             assert call.labels == (() if dialect == "openai" else twin.labels)
             if call.logprobs:
                 assert (call.seed, call.max_tokens, call.logprobs) == (twin.seed, twin.max_tokens, twin.logprobs)
-        assert {parts_of(call) for call in direct.asked[:3]} <= {parts_of(call) for call in asked}
+        assert {parts_of(call) for call in direct.calls[:3]} <= {parts_of(call) for call in asked}
         assert all(reply.problem is None for reply in replies)
         assert [reply.by for reply in replies] == ["logprobs", "", "", "logprobs"]
         assert client.spent["vlm_calls"] == len(asked) and client.spent["vlm_retries"] == 0
@@ -348,7 +348,7 @@ def test_no_web_page_is_answered() -> None:
         del page["Origin"]
         with urlopen(HttpRequest(f"{server.url}/chat/completions", body, page), timeout=10) as said:
             assert said.status == 200
-    assert len(script.asked) == 1
+    assert len(script.calls) == 1
 
 
 def test_ports_that_are_none() -> None:

@@ -52,8 +52,8 @@ def _everything() -> Any:
             table.add_row(f"  {name}", escape(presets.about(task, name)))
     table.add_row()
     table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
-    for name in vlms.names():
-        table.add_row(f"  {name}", escape(vlms.about(name)))
+    for name in vlms.list_names():
+        table.add_row(f"  {name}", escape(vlms.describe(name)))
     return table
 
 

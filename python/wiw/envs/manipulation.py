@@ -188,10 +188,10 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         table, poses, executed, refused = self.table, checked(plan), [], []
         path = [table.bench.pose[:3]]
         for pose in poses[: self.task.actions - self._taken]:
-            move = table.bench.go(pose)
+            move = table.bench.move_to(pose)
             executed.append(pose)
             path.append(table.bench.pose[:3])
-            refused += [] if move.why == "free" else [move.why]
+            refused += [] if move.reason == "free" else [move.reason]
             if table.succeeded():
                 break
         self._decisions += 1
@@ -251,7 +251,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         bench = self.table.bench
         self._front = self.sensors.pictures(bench)
         depth = self._front["depth"] if self.sensors.depth else None
-        places: dict[str, Pose] = bench.places(self.table.objects)
+        places: dict[str, Pose] = bench.get_poses(self.table.objects)
         self._observation = ArmObservation(self._front["color"], bench.pose, depth, places)
         return self._observation
 

@@ -27,7 +27,7 @@ from wiw.envs.trip import (
 )
 from wiw.errors import ArgumentError
 from wiw.perception.semantics import TrueSemantics
-from wiw.perception.simulator import categories_of
+from wiw.perception.simulator import read_categories
 from wiw.types import Answer, Episode, Goal, Key, Observation, Truth
 
 
@@ -169,9 +169,9 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int]):
 
         For agents that are granted the simulator's semantics, as others are granted depth.
         """
-        source = TrueSemantics(categories_of(self.trip.world.scene))
+        source = TrueSemantics(read_categories(self.trip.world.scene))
         ids = self._core.observe(["panorama_ids"])["panorama_ids"]
-        return source.panoramas(self.observation.panorama[None], ids=ids[None])[0]
+        return source.label_panoramas(self.observation.panorama[None], ids=ids[None])[0]
 
     # -- privileged ----------------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.perception.boxes import Mask, box_of, largest_part, scaled
+from wiw.perception.boxes import Mask, find_box, keep_largest_part, scale_box
 from wiw.types import Box, Target
 
 IDS = ["panorama_ids", "front_ids"]
@@ -43,5 +43,7 @@ class Pointing:
         return self.lost == "stop" and target is not None and target.panorama_box is None and target.front_box is None
 
     def _box(self, mask: Mask, wraps: bool) -> Box | None:
-        box = box_of(largest_part(mask, wraps) if self.part == "largest" and mask.any() else mask, wraps)
-        return box if box is None or self.scale == 1 else scaled(box, self.scale, (mask.shape[0], mask.shape[1]), wraps)
+        box = find_box(keep_largest_part(mask, wraps) if self.part == "largest" and mask.any() else mask, wraps)
+        return (
+            box if box is None or self.scale == 1 else scale_box(box, self.scale, (mask.shape[0], mask.shape[1]), wraps)
+        )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.render import Output
-from wiw.tabletop.cloud import points_of
+from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.workbench import CAMERAS, Workbench
 
 ROOM, ARM = 0, 255
@@ -77,7 +77,7 @@ class Sensors:
 
     def pictures(self, bench: Workbench, camera: str = "front") -> dict[str, NDArray[Any]]:
         """What one camera gives: those of "color", "depth" and "instance" that are asked for."""
-        return bench.picture(camera, (self.size, self.size), self.outputs)
+        return bench.render_view(camera, (self.size, self.size), self.outputs)
 
     def read(
         self, bench: Workbench, objects: Sequence[str], front: dict[str, NDArray[Any]] | None = None
@@ -92,7 +92,11 @@ class Sensors:
         drawn = {name: self.pictures(bench, name) for name in self.names if front is None or name != "front"}
         if front is not None:
             drawn = {"front": front, **drawn}
-        values: dict[str, Any] = {"pose": bench.pose, "joints": bench.joints, "held": np.int64(bench.held is not None)}
+        values: dict[str, Any] = {
+            "pose": bench.pose,
+            "joints": bench.joints,
+            "held": np.int64(bench.held_object is not None),
+        }
         for name, images in drawn.items():
             values[name] = images["color"]
             if self.depth:
@@ -101,7 +105,7 @@ class Sensors:
                 values[_key(name, "ids")] = _numbers(bench, objects)[images["instance"]]
         if self.cloud:
             clouds = [
-                points_of(images["depth"], CAMERAS[name].hfov_deg, bench.camera_pose(name)).reshape(-1, 3)
+                unproject_depth(images["depth"], CAMERAS[name].hfov_deg, bench.get_camera_pose(name)).reshape(-1, 3)
                 for name, images in drawn.items()
             ]
             values["points"] = np.concatenate(clouds)
@@ -116,4 +120,4 @@ def _key(camera: str, what: str) -> str:
 def _numbers(bench: Workbench, objects: Sequence[str]) -> NDArray[np.uint8]:
     """By instance id, the number that observations have for it."""
     known = {"arm": ARM, **{name: number for number, name in enumerate(objects, start=1)}}
-    return np.array([ROOM, *(known.get(name, ROOM) for name in bench.names)], np.uint8)
+    return np.array([ROOM, *(known.get(name, ROOM) for name in bench.instance_names)], np.uint8)

@@ -33,7 +33,7 @@ class TableGuide:
         """The furthest that a plan gets, by the task's `progress` after each of its poses."""
         probe, found = self.bench.fork(), []
         for pose in poses:
-            probe.go(pose)
+            probe.move_to(pose)
             found.append(self.task.progress(self.table, probe))
         return max(found)
 

@@ -79,6 +79,6 @@ def _frames(bench: Workbench, poses: Sequence[Sequence[float]]) -> Iterator[NDAr
         step = (bench.seconds - begin) / max(1, len(way) - 1)
         for k in range(len(way)):
             if begin + k * step >= due:
-                yield way[k].picture("front", SIDE)["color"]
+                yield way[k].render_view("front", SIDE)["color"]
                 due += period
-    yield bench.picture("front", SIDE)["color"]
+    yield bench.render_view("front", SIDE)["color"]

@@ -150,7 +150,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
 
 
 def _given(recipe: AgentRecipe) -> dict[str, Any]:
-    return {name: value for name, value in recipe.to_json().items() if value not in (None, {})}
+    return {name: value for name, value in (recipe.to_json() or {}).items() if value not in (None, {})}
 
 
 def _expected(base: RunStore) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Questions to a vision-language model and what came of them; every client answers through `Client.ask`."""
+"""Requests to a vision-language model and their replies; every client answers through `Client.ask`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from wiw.vlm.cache import ReplyCache
 
 FORMAT_VERSION = 1
-"""Of questions as they are put; part of their names, so that what was kept under another wording is not taken."""
+"""Version of the question format; part of a question's name, so that answers to another wording are not reused."""
 Kind = Literal["empty", "refusal", "truncated", "malformed", "schema", "huge", "no_option"]
 Part = str | NDArray[np.uint8]
 
@@ -37,16 +37,16 @@ class Message:
 
 
 def user(*content: Part) -> Message:
-    """What the user says."""
+    """Return a message of the user."""
     return Message("user", content)
 
 
 @dataclass(frozen=True)
 class Request:
-    """One question: multiple choice where it has choices, JSON where it has a schema, free text else.
+    """One question: multiple choice where it has choices, JSON where it has a schema, otherwise free text.
 
     Raises:
-        ArgumentError: choices and a schema, fewer than two choices, or the same twice.
+        ArgumentError: choices and a schema, fewer than two choices, or the same choice twice.
     """
 
     messages: tuple[Message, ...]
@@ -55,9 +55,9 @@ class Request:
     temperature: float = 0.0
     seed: int = 0
     max_tokens: int = 1024
-    """Of an answer that is no choice."""
+    """Most tokens of an answer that is not a choice."""
     tries: int = 3
-    """Times that it is put before an unusable answer is taken for the outcome."""
+    """Times that it is asked before an unusable answer counts as the outcome."""
 
     def __post_init__(self) -> None:
         if self.choices and self.schema is not None:
@@ -70,36 +70,36 @@ class Request:
 
 @dataclass(frozen=True)
 class Call:
-    """One completion as it is asked of a model; `Client.name_of` names it by its content."""
+    """One completion requested of a model; `Client.name_of` names it by its content."""
 
     messages: tuple[Message, ...]
     temperature: float
     seed: int
     max_tokens: int
     labels: tuple[str, ...] = ()
-    """What the first token should be one of."""
+    """Expected first tokens."""
     logprobs: int = 0
-    """Likeliest first tokens to list with their log-probabilities."""
+    """Number of likeliest first tokens to list with their log-probabilities."""
     schema: Mapping[str, Any] | None = None
-    """JSON schema that the answer should fit."""
+    """JSON schema that the answer should match."""
 
 
 @dataclass(frozen=True)
 class Completion:
-    """What a model gave."""
+    """A model's answer to a call."""
 
     text: str
     finish: str = "stop"
     """"stop", "length", "refusal", "huge", or the server's own word."""
     logprobs: tuple[tuple[str, float], ...] | None = None
-    """Likeliest first tokens; None where the server tells none."""
+    """Likeliest first tokens; None where the server returns none."""
     prompt_tokens: int = 0
     completion_tokens: int = 0
     retries: int = 0
-    """Times that it was asked for in vain."""
+    """Number of failed attempts before it."""
 
     def to_json(self) -> dict[str, Any]:
-        """For caches and records; `from_json` is the way back."""
+        """Return a JSON-able form for caches and records; `from_json` is the inverse."""
         return {
             "text": self.text,
             "finish": self.finish,
@@ -110,7 +110,7 @@ class Completion:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> Completion:
-        """A completion that was written down."""
+        """Restore a completion from its JSON form."""
         pairs = values["logprobs"]
         logprobs = None if pairs is None else tuple((str(token), float(value)) for token, value in pairs)
         tokens = int(values["prompt_tokens"]), int(values["completion_tokens"])
@@ -124,7 +124,7 @@ class Problem:
     kind: Kind
     detail: str
     raw: str
-    """What the model said, cut off."""
+    """The model's text, truncated."""
 
     def __str__(self) -> str:
         return f"{self.kind}: {self.detail}"
@@ -135,14 +135,14 @@ class Said:
     """One completion of a conversation, for the record."""
 
     call: str
-    """Name of what was asked."""
+    """Name of the call."""
     completion: Completion
     used: bool
 
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a request: a usable answer, or a `problem`."""
+    """The outcome of a request: a usable answer, or a `problem`."""
 
     text: str = ""
     value: Any = None
@@ -150,30 +150,29 @@ class Reply:
     probabilities: NDArray[np.float64] | None = None
     """float64 [choices], sum 1, where the request has choices."""
     mass: float | None = None
-    """Probability that the model gave to the choices before they were made to sum to 1; the share of votes that were
-    for one of them."""
+    """Probability that the model gave to the choices before normalisation; or the share of votes for one of them."""
     by: str = ""
-    """"logprobs", or "votes" where the server tells no log-probabilities."""
+    """"logprobs", or "votes" where the server returns no log-probabilities."""
     repaired: bool = False
-    """Whether slips of JSON's syntax were mended."""
+    """Whether JSON syntax errors were repaired."""
     problem: Problem | None = None
     said: tuple[Said, ...] = field(default=(), repr=False)
 
     @property
     def doubtful(self) -> bool:
-        """Whether most of the probability went to something else than the choices."""
+        """Whether most of the probability went to something other than the choices."""
         return self.mass is not None and self.mass < 0.5
 
 
 class Client(ABC):
-    """A model that is asked a batch of requests at a time.
+    """A model that answers batches of requests.
 
     Args:
-        cache: keeps what was answered, so that no question is paid for twice; None keeps nothing.
+        cache: stores answers, so that no question is paid for twice; None stores nothing.
         prices: US dollars per million tokens; a model that is not in the table has an unknown price.
-        top_logprobs: first tokens that the server lists at most; as many choices are asked at once, more in rounds.
-            0 for a server that refuses to list any: choices are voted on.
-        votes: samples that are counted where a server tells no log-probabilities.
+        top_logprobs: most first tokens that the server lists; as many choices are asked at once, more in rounds. 0 for
+            a server that refuses to list any: choices are voted on.
+        votes: samples to count where a server returns no log-probabilities.
     """
 
     def __init__(
@@ -196,27 +195,27 @@ class Client(ABC):
     @property
     @abstractmethod
     def model(self) -> str:
-        """The name under which the model is asked for."""
+        """The name under which the model is requested."""
 
     @property
     def manner(self) -> str:
-        """What answers depend on beside the model's name and the call; those that are kept are named by it, too."""
+        """What answers depend on beside the model's name and the call; part of the names of cached answers."""
         return ""
 
     @abstractmethod
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
-        """One completion a call, in their order.
+        """Return one completion per call, in order.
 
         Raises:
-            VlmError: the model cannot be reached, or did not answer in spite of retries.
+            VlmError: the model cannot be reached, or did not answer after retries.
         """
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity: what answers depend on beside the questions."""
+        """Return a JSON-able identity: what answers depend on beside the questions."""
         return {"model": self.model, "top_logprobs": self.top_logprobs, "votes": self.votes}
 
     def ask(self, requests: Sequence[Request]) -> list[Reply]:
-        """Puts all requests at once, and again what has to be put again, until each has its reply.
+        """Ask all requests at once, and repeat those that need it, until each has its reply.
 
         Raises:
             VlmError: see `complete`; nothing is answered then. An unusable answer is no error: it is in the reply.
@@ -230,13 +229,13 @@ class Client(ABC):
                 names = [self.name_of(call) for call in calls]
                 answers = iter(zip(names, self._complete(calls, names), strict=True))
                 for talk in waiting:
-                    talk.hear([next(answers) for _ in talk.calls])
+                    talk.receive([next(answers) for _ in talk.calls])
         finally:
             self._keep([talk.reply for talk in talks])
         return [talk.reply for talk in talks]
 
     def name_of(self, call: Call) -> str:
-        """Digest of the model and of everything in a call; images by their pixels."""
+        """Return a digest of the model and of everything in a call; images by their pixels."""
         digest = blake2b(digest_size=16)
         head = [FORMAT_VERSION, self.model, call.temperature, call.seed, call.max_tokens, call.labels, call.logprobs]
         digest.update(json.dumps([*head, call.schema], sort_keys=True).encode())
@@ -264,12 +263,12 @@ class Client(ABC):
         tokens = completion.prompt_tokens, completion.completion_tokens
         self.spent.update(vlm_calls=1, vlm_retries=completion.retries, vlm_tokens=sum(tokens))
         self.spent.update(vlm_input_tokens=tokens[0], vlm_output_tokens=tokens[1])
-        usd = self.prices.of(self.model, *tokens)
+        usd = self.prices.compute_cost(self.model, *tokens)
         if usd is not None:
             self.spent["vlm_usd"] += usd  # type: ignore[assignment]  # money comes in fractions
 
     def _keep(self, replies: Sequence[Reply]) -> None:
-        """Keeps what was of use; what was not is asked for anew the next time."""
+        """Cache the answers that were used; unusable ones are requested again next time."""
         if self.cache is not None:
             said = [each for reply in replies for each in reply.said if each.used]
             self.cache.put({self._kept_as(each.call): each.completion for each in said})

@@ -15,9 +15,9 @@ from wiw.envs.manipulation import ManipulationEnv
 from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.errors import ArgumentError
 from wiw.render import resolve_backend
-from wiw.tabletop.kind import Kind, Setup, key_of
-from wiw.tabletop.kinds import KINDS
-from wiw.tabletop.robot import Robot, own_panda, robot_of
+from wiw.tabletop.base import TableSetup, TabletopTask, derive_key
+from wiw.tabletop.robot import Robot, load_panda, load_robot
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
 from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Goal, Wording, checked_seed
@@ -52,7 +52,7 @@ class Manipulation:
     """Push buttons, slide a block, put a ring on a peg, stack cups; told in words, done by gripper poses.
 
     Args:
-        tasks: "all", or names of `KINDS`; episodes take them in turn.
+        tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
         seed: of the episodes and of the run.
         preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
         backend: renderer, "auto", "cpu" or "gpu".
@@ -85,7 +85,7 @@ class Manipulation:
                 "tables are set by `tasks` and `seed`"
             )
         self.tasks, self.seed, self.backend = _named(tasks), checked_seed(seed), backend
-        self.robot = own_panda() if robot is None else robot_of(robot, robot_tcp)
+        self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
         self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
 
     @staticmethod
@@ -150,33 +150,33 @@ class Manipulation:
         if index < 0:
             raise ArgumentError(f"episode: expected a number of 0 or more, got {index}")
         name = self.tasks[index % len(self.tasks)]
-        seed = key_of(self.seed, index, 0) % 2**31
-        variation = index // len(self.tasks) % KINDS[name].variations
+        seed = derive_key(self.seed, index, 0) % 2**31
+        variation = index // len(self.tasks) % TABLETOP_TASKS[name].variations
         here = (0.0, 0.0, 0.0)
         info = {"task": name, "seed": seed, "variation": variation}
-        info["instruction"] = KINDS[name].setup(seed, variation).instruction
+        info["instruction"] = TABLETOP_TASKS[name].create_setup(seed, variation).instruction
         return Episode(f"{index:04d}", f"{name}/{seed}", here, 0.0, here, 0.0, float("nan"), info)
 
     def table(self, episode: Episode) -> Table:
         """An episode's table, at rest."""
-        kind = KINDS[episode.info["task"]]
+        kind = TABLETOP_TASKS[episode.info["task"]]
         return Table(
-            kind, kind.setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend, self.robot
+            kind, kind.create_setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend, self.robot
         )
 
     def progress(self, table: Table, bench: Workbench) -> float:
         """0 where what is asked for is done, else less by each pose that an expert would need."""
-        if table.kind.succeeded(bench, table.setup):
+        if table.kind.is_success(bench, table.setup):
             return 0.0
         return float(-len(self.expert(table, bench)) or HOPELESS)
 
     def expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
         """float64 [K, 7]: what is left to do, as a bench stands; nothing where nothing helps."""
         kind, setup = table.kind, table.setup
-        places = bench.places(setup.objects)
-        front = bench.picture(arm=False)["color"]
-        left = kind.left(ArmObservation(front, bench.pose, places=places), setup.target)
-        return np.empty((0, 7)) if left is None else kind.expert(places, left, bench.pose)
+        places = bench.get_poses(setup.objects)
+        front = bench.render_view(arm=False)["color"]
+        left = kind.find_remaining_target(ArmObservation(front, bench.pose, places=places), setup.target)
+        return np.empty((0, 7)) if left is None else kind.plan_expert(places, left, bench.pose)
 
 
 def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
@@ -185,10 +185,10 @@ def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
         ArgumentError: none, one twice, or one that is not known.
     """
-    names = tuple(KINDS) if tasks == "all" else tuple(tasks.split(",") if isinstance(tasks, str) else tasks)
+    names = tuple(TABLETOP_TASKS) if tasks == "all" else tuple(tasks.split(",") if isinstance(tasks, str) else tasks)
     names = tuple(name.strip() for name in names)
-    if not names or len(set(names)) < len(names) or not set(names) <= set(KINDS):
-        known = ", ".join(KINDS)
+    if not names or len(set(names)) < len(names) or not set(names) <= set(TABLETOP_TASKS):
+        known = ", ".join(TABLETOP_TASKS)
         raise ArgumentError(
             f"manipulation: expected tasks as all, or different ones of {known}, got {', '.join(names)}"
         )
@@ -200,16 +200,16 @@ class Table:
 
     def __init__(
         self,
-        kind: Kind,
-        setup: Setup,
+        kind: TabletopTask,
+        setup: TableSetup,
         backend: Literal["auto", "cpu", "gpu"] = "auto",
         robot: Robot | None = None,
     ) -> None:
         self.kind, self.setup = kind, setup
-        self.bench = setup.bench(backend, robot)
+        self.bench = setup.build_workbench(backend, robot)
         self.goal = Goal(Manipulation.name, text=setup.instruction)
         self.objects = setup.objects
 
     def succeeded(self) -> bool:
         """Whether what is asked for is done."""
-        return self.kind.succeeded(self.bench, self.setup)
+        return self.kind.is_success(self.bench, self.setup)
