@@ -13,16 +13,17 @@ from history_models import Recalling, digest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
-from wiw.loop.agent import Query
 from wiw.experiments.placebos import SwappedPlacebo
 from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.history import EpisodeHistories, Frame, relative_poses, stack_histories
-from wiw.loop.imagine import imagine
+from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.memory import Query
+from wiw.loop.plan_space import plan_space
 from wiw.loop.rollout_cache import Cached, RolloutCache
 from wiw.loop.scheduler import run_episodes
 from wiw.loop.search import move
-from wiw.policies.base import FrameSpec
+from wiw.policies.base import FrameSpec, Situation
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.serving.background import served
 from wiw.tasks.imagenav import ImageNav
@@ -281,13 +282,19 @@ def test_a_decision_that_is_asked_for_again_is_no_other_moment(task: ImageNav) -
 
 
 def test_the_swapped_placebo_is_shown_a_first_moment() -> None:
+    class Bright:
+        """Every other episode begins in a bright place."""
+
+        def of(self, key):
+            panorama = np.full((576, 1024, 3), 200, np.uint8)
+            return ModelInput(Observation(panorama, panorama[:480, :480], np.zeros(3)))
+
     model = Watching()
-    agent = wiw.Agent(Walking(), model, candidates=3, horizon=4, placebo="swapped")
+    agent = wiw.Agent(Walking(), SwappedPlacebo(model, Bright()), candidates=3, horizon=4)
     for decision in range(2):
-        own, other = (np.full((576, 1024, 3), fill, np.uint8) for fill in (40, 200))
-        stranger = Query(Observation(other, other[:480, :480], np.zeros(3)), Goal("x"), Key(0, 9))
+        own = np.full((576, 1024, 3), 40, np.uint8)
         seen = Observation(own, own[:480, :480], np.zeros(3))
-        agent.decide_batch([Query(seen, Goal("x"), Key(0, 0, decision), stranger=stranger)])
+        agent.decide_batch([Query(seen, Goal("x"), Key(0, 0, decision))])
     history = model._calls[-1][0].history
     assert history.count.tolist() == [1, 2, 2] and (history.images == 200).all()
 
@@ -316,14 +323,17 @@ class Chunked(wiw.WorldModel):
 
 def imagined(model, plans, past=()):
     """Asks about an agent that has observed `past` (x, grey) and now stands at 0 and sees black."""
-    histories, executed = EpisodeHistories(model.accepts), []
+    histories, executed = EpisodeHistories(model.accepts), ()
     for decision, (x, grey) in enumerate((*past, (0.0, 0))):
         panorama = np.full((576, 1024, 3), grey, np.uint8)
         observation = Observation(panorama, panorama[:480, :480], np.array([x, 0.0, 0.0]))
-        (query,) = histories.add([Query(observation, Goal("x"), Key(0, 0, decision))], [executed])
-        executed = [*executed, int(FORWARD)]
-    proposals = [[Proposal(plan) for plan in plans]]
-    imagine(Attempts(model), [query], proposals, [range(len(plans))], FrameSpec("front", SIZE), Clock())
+        key = Key(0, 0, decision)
+        (history,) = histories.add([Situation(observation, Goal("x"), key, None, executed)])
+        executed = (*executed, int(FORWARD))
+    proposals, space = [[Proposal(plan) for plan in plans]], plan_space("discrete")
+    shown, seeds = [ModelInput(observation, history=history)], [range(len(plans))]
+    frames = FrameSpec("front", SIZE)
+    space.imagine(Attempted(model), Request(space, [key], [observation], shown, proposals, seeds, frames, Clock()))
     return model._calls
 
 
@@ -462,13 +472,12 @@ def test_gripper_poses_are_absolute_and_their_actions_poses() -> None:
     declared = {"space": "pose7", "needs": ("history",), "history": 3}
     histories = EpisodeHistories(wiw.accepts("action", "perspective", SIZE, **declared))
     poses = np.array([[0.1, 0, 1, 0, 0, 0, 1], [0.2, 0, 1, 0, 0, 0, 1], [0.3, 0, 1, 0, 0, 0, 0]])
-    carried, query = [poses[:1].repeat(2, 0), poses[1:2]], None
-    executed = []
+    carried, history, executed = [poses[:1].repeat(2, 0), poses[1:2]], (), ()
     for decision, pose in enumerate(poses[:3]):
         seen = ArmObservation(np.full((480, 480, 3), decision, np.uint8), pose)
-        (query,) = histories.add([Query(seen, Goal("x"), Key(0, 0, decision))], [executed])
-        executed = [*executed, *(carried[decision].tolist() if decision < 2 else [])]
-    found = stack_histories([query.history, query.history[1:]], 3)
+        (history,) = histories.add([Situation(seen, Goal("x"), Key(0, 0, decision), None, executed)])
+        executed = (*executed, *(carried[decision].tolist() if decision < 2 else ()))
+    found = stack_histories([history, history[1:]], 3)
     np.testing.assert_array_equal(found.poses, [poses, poses[[1, 1, 2]]])
     assert found.lengths.tolist() == [[2, 1], [0, 1]] and found.actions.shape == (2, 2, 2, 7)
     np.testing.assert_array_equal(found.actions[0], [carried[0], poses[[1, 1]]])  # padded with the last pose
