@@ -63,11 +63,8 @@ def test_a_call_that_fails_is_made_again(failures: int) -> None:
     model = Scripted(*[ConnectionError("gone")] * failures, GOOD)
     asked = Attempted(model, 5.0)
     np.testing.assert_array_equal(asked.rollout(OBSERVATIONS, CONTROLS, SEEDS), GOOD)
-    assert (model.calls, asked.spent.get("retries", 0), asked.spent["rows"]) == (
-        failures + 1,
-        failures,
-        2 * (failures + 1),
-    )
+    spent = asked.spent
+    assert (model.calls, spent.get("retries", 0), spent["rows"]) == (failures + 1, failures, 2 * (failures + 1))
 
 
 @pytest.mark.parametrize(

@@ -262,7 +262,7 @@ def test_an_episode_that_is_run_again_after_an_error_remembers_nothing(task: Ima
     def found(model, live):
         return run(task, wiw.Agent(Brightest(), model, candidates=1, horizon=4), live=live)
 
-    assert found(Small(), 3) == found(Recalling(), 1) and Small.refused == 3
+    assert found(Attempted(Small()), 3) == found(Recalling(), 1) and Small.refused == 3
 
 
 def test_a_decision_that_is_asked_for_again_is_no_other_moment(task: ImageNav) -> None:
