@@ -27,7 +27,7 @@ from wiw.policies.vlm.prompt_images import VIEW
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import served
 from wiw.serving.vlm_server import VlmServer
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 NAMES = wiw.registry.list_world_models()

@@ -16,19 +16,18 @@ pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm import VLM
 from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
 from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
-from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Goal, Key, Proposal
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 ABOVE, BELOW = [50, 50, 30, 0, 60, 60, 1], [50, 50, 25, 0, 60, 60, 0]
@@ -202,7 +201,7 @@ def test_slips_of_syntax_are_mended() -> None:
 def test_marks_are_on_their_objects_and_hide_little_of_them(kind: str, size: int) -> None:
     task = Manipulation(kind, seed=2)
     for index in range(4):
-        table = task.table(task.episode(index))
+        table = task.set_table(task.episode(index))
         seen = table.bench.render_view("front", (size, size), ("color", "instance"))
         observation = wiw.types.ArmObservation(
             seen["color"], table.bench.pose, places=table.bench.get_poses(table.objects)
@@ -310,7 +309,7 @@ def test_one_name_for_primitives_and_poses() -> None:
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None:
     """With drawn answers, over HTTP with faults; what was said is enough to run it again."""
     faults = Misbehaviour({"429": 0.1, "malformed": 0.2, "refusal": 0.1, "truncated": 0.1}, seed=0, retry_after=0.01)
-    with VlmServer(MockClient(), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
         options = {"vlm": server.url, "dialect": "vllm", "tries": 1, "cache": "off"}
         recipe = AgentRecipe("vlm", "copy", candidates=2, policy_options={"vlm": options})
         log = evaluate("manipulation", recipe, 1, 0, tmp_path / "run", progress=False, tasks="slide_block", actions=6)
@@ -326,7 +325,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None
 
 
 def test_a_server_that_is_too_slow_is_infrastructure(tmp_path: Path) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
         log = evaluate(Manipulation(), wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False)
         (episode,) = log.episodes

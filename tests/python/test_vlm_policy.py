@@ -16,6 +16,7 @@ pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
@@ -23,11 +24,10 @@ from wiw.loop.agent import Query
 from wiw.policies.vlm import VLM, presets, prompt_images
 from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.types import Rollout
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 FORWARD, LEFT, RIGHT = 1, 2, 3
@@ -295,7 +295,7 @@ def test_presets_name_a_model_and_how_it_is_served() -> None:
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_rooms: str) -> None:
     """Both tasks, with the scripted model, over HTTP with faults; what was said is enough to run them again."""
     faults = Misbehaviour({"429": 0.1, "500": 0.05, "malformed": 0.05, "refusal": 0.05}, seed=1, retry_after=0.01)
-    with VlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
         file = a_file(tmp_path, two_rooms)
         preset = tmp_path / "short.yaml"
         preset.write_text("decisions: 4\n")
@@ -325,7 +325,7 @@ def test_recipes_that_name_no_server_are_replayed_too() -> None:
 
 
 def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
         log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
