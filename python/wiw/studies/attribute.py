@@ -154,9 +154,9 @@ def _given(recipe: AgentRecipe) -> dict[str, Any]:
 
 
 def _expected(base: RunStore) -> dict[str, Any]:
-    """What swapped agents must say of themselves, so that one of other weights than the run's is refused."""
+    """Return what swapped agents must say of themselves, so that one of other weights than the run's is refused."""
     return {
-        swapped(arm, swap): {**agent, "ground_truth": list(SWAPS[swap])}
+        swapped(arm, stage): {**agent, part: {**agent[part], "ground_truth": stage}}
         for arm, agent in base.info.get("built", {}).items()
-        for swap in ("scoring", "proposals")
+        for part, stage in (("revision", "scoring"), ("policy", "proposals"))
     }
