@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,11 @@ from typing import Any
 import numpy as np
 
 from wiw._core import core
+from wiw.loop.agent import Agent
+from wiw.loop.base import BaseAgent
 from wiw.policies.base import Policy
+from wiw.runs.compose import Limits, RunContext
+from wiw.runs.recipes import agent_recipe
 from wiw.types import Answer, Decision, Episode, Goal, Observation, Proposal, Rollout, Truth
 
 FORWARD, LEFT = 1, 2
@@ -111,7 +114,7 @@ class LineTask:
 
 
 @dataclass
-class LineAgent:
+class LineAgent(BaseAgent):
     """Goes forward with probability `drive`; `kill` names episodes that kill their process at decision 1."""
 
     drive: float = 0.7
@@ -126,12 +129,6 @@ class LineAgent:
 
     def decide_batch(self, queries: Any) -> list[Decision]:
         return [self._decide(query) for query in queries]
-
-    def forget(self, key: Any) -> None:
-        pass
-
-    def meter(self) -> Counter[str]:
-        return Counter()
 
     def _decide(self, query: Any) -> Decision:
         key = query.key
@@ -164,6 +161,11 @@ class LineAgent:
                 return
             Path(self.marker).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def agent_for(task: Any, agent: Any, **limits: Any) -> Agent:
+    """The agent with everything that a run of the task adds: its numbers, its reviser, limits."""
+    return agent_recipe(agent).build(RunContext(task), Limits(**limits))
 
 
 def line_task(scenes: str = "", seed: int = 0, preset: str = "paper", backend: str = "auto", **rules: Any) -> LineTask:

@@ -15,7 +15,7 @@ from fakes import LineAgent, LineTask
 import wiw
 import wiw.tasks.navigation
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
-from wiw.runs.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, absolute, arm_recipes
 from wiw.runs.store import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
@@ -224,7 +224,7 @@ def test_recipes_survive_json():
     assert AgentRecipe(**agent.to_json()) == agent and agent.arm == "warp"
     task = TaskRecipe("imagenav", {"scenes": "apartments:val", "seed": 3, "backend": "cpu"})
     assert TaskRecipe(**task.to_json()) == task
-    assert Ready(LineTask()).to_json() is None
+    assert TaskInMemory(LineTask()).to_json() is None
     assert agent.with_model("none").arm == "none" and AgentRecipe("m", "/x/y.py:Mine").arm == "Mine"
     assert absolute("a.py:Mine") == f"{Path.cwd() / 'a.py'}:Mine" and absolute("pkg.mod:Mine") == "pkg.mod:Mine"
 
@@ -261,7 +261,7 @@ def models(folder, steps=5):
 def test_models_are_built_once_and_described_by_plain_values(tmp_path, two_rooms, workers):
     first, second = models(tmp_path)
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
-    agent = AgentRecipe("heuristic", first, revision="geometric")
+    agent = AgentRecipe("heuristic", first, reviser="geometric")
     log = run_arms(
         task,
         {"first": agent, "second": agent.with_model(second)},
