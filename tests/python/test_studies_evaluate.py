@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, agent_for
 
 import wiw
 import wiw.tasks.navigation
@@ -135,10 +135,9 @@ def test_an_arm_may_have_a_policy_of_its_own():
         "heuristic": AgentRecipe("heuristic", horizon=7),
         "climber+Mine": AgentRecipe("climber", "x/a+b.py:Mine", horizon=7),
     }
-    ready = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])["heuristic+copy"].build(
-        {}
-    )
-    assert type(ready.policy).__name__ == "Heuristic" and ready.candidates == 4 and ready.model is not None
+    arms = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])
+    ready = agent_for(LineTask(), arms["heuristic+copy"])
+    assert type(ready.policy).__name__ == "Heuristic" and ready.config.candidates == 4 and ready.model is not None
 
 
 def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
@@ -150,10 +149,10 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
 
     agent, mine = wiw.Agent("matcher", candidates=4), Mine()
     made = arm_recipes(agent, {"off": None, "this": mine, "that": Mine, "floor": "copy", "h": "heuristic+none"})
-    built = {name: recipe.build({}) for name, recipe in made.items()}
-    assert built["this"].model is mine and built["off"].model is None and built["h"].model is None
-    assert [type(built[name].model).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
-    assert type(built["h"].policy).__name__ == "Heuristic" and {each.candidates for each in built.values()} == {4}
+    built = {name: agent_for(LineTask(), recipe) for name, recipe in made.items()}
+    assert built["this"].model.base is mine and built["off"].model is None and built["h"].model is None
+    assert [type(built[name].model.base).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
+    assert type(built["h"].policy).__name__ == "Heuristic" and {each.config.candidates for each in built.values()} == {4}
     assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
     with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
         arm_recipes(agent, [mine, Mine])
@@ -186,7 +185,7 @@ def test_evaluate_takes_one_agent(tmp_path):
 SCRIPT = """
 import sys
 import wiw
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, agent_for
 from wiw.studies.evaluate import run_arms
 if __name__ == "__main__":
     out, workers, delay = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
