@@ -247,7 +247,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
             ask(client)
         assert caught.value.kind == kind
         with pytest.raises(RolloutError) as caught:
-            Attempted(client, 20.0)(seen(4), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 20.0).rollout(seen(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind
 
 
@@ -261,7 +261,7 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
             ask(client, 4)
         assert caught.value.kind == "deadline" and time.monotonic() - begin < 5
         with pytest.raises(RolloutError) as caught:
-            Attempted(client, 0.5)(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 0.5).rollout(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == "deadline"
         wait_for(lambda: len(server.queue) == 0)
         gate.set()

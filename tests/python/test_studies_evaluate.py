@@ -15,6 +15,7 @@ from fakes import LineAgent, LineTask, agent_for
 import wiw
 import wiw.tasks.navigation
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
+from wiw.loop.attempts import Attempted
 from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, absolute, arm_recipes
 from wiw.runs.store import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
@@ -156,8 +157,17 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
     assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
     with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
         arm_recipes(agent, [mine, Mine])
-    with pytest.raises(ArgumentError, match=r"by name or path\.py:Class.*evaluate a wiw\.Agent"):
-        arm_recipes(AgentRecipe("matcher"), [mine])
+    in_memory = arm_recipes(AgentRecipe("matcher"), [mine])["mine"]
+    assert in_memory.model is mine and in_memory.to_json() is None, "a later process could not make it again"
+
+
+def test_an_agents_own_arm_is_named_by_the_class_of_its_model_behind_all_wrappers(tmp_path):
+    (tmp_path / "mine.py").write_text(MODEL)
+    name = f"{tmp_path}/mine.py:Heavy"
+    assert list(arm_recipes(AgentRecipe("matcher", name), None)) == ["Heavy"]
+    assert list(arm_recipes(wiw.Agent("matcher", name), None)) == ["heavy"]
+    assert list(arm_recipes(wiw.Agent("matcher", Attempted(wiw.world_model("copy"))), None)) == ["copy"]
+    assert list(arm_recipes(wiw.Agent("matcher"), None)) == list(arm_recipes(LineAgent(), None)) == ["none"]
 
 
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
