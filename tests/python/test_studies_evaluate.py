@@ -162,7 +162,7 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
 
 
 def test_an_agents_own_arm_is_named_by_the_class_of_its_model_behind_all_wrappers(tmp_path):
-    (tmp_path / "mine.py").write_text(MODEL)
+    (tmp_path / "mine.py").write_text(MODEL.format(name="Heavy", steps=5))
     name = f"{tmp_path}/mine.py:Heavy"
     assert list(arm_recipes(AgentRecipe("matcher", name), None)) == ["Heavy"]
     assert list(arm_recipes(wiw.Agent("matcher", name), None)) == ["heavy"]
