@@ -58,9 +58,9 @@ def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def one_torch_thread() -> Iterator[None]:
     """Threads that wait for each other spin: on a busy machine two are slower than one."""
-    from wiw.networks import one_thread
+    from wiw.networks import single_thread
 
-    with one_thread():
+    with single_thread():
         yield
 
 

@@ -13,13 +13,17 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from wiw.gymnasium_ids import register_environments
+
 __version__ = "0.1.0"
 
 __all__ = [
     "Accepts",
     "Agent",
+    "Env",
     "Headline",
     "Policy",
+    "Task",
     "WorldModel",
     "accepts",
     "action",
@@ -54,8 +58,10 @@ __all__ = [
 _HOME = {
     "Accepts": "wiw.world_models.base",
     "Agent": "wiw.loop.agent",
+    "Env": "wiw.envs.base",
     "Headline": "wiw.metrics.headlines",
     "Policy": "wiw.policies.base",
+    "Task": "wiw.tasks.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
     "attribute": "wiw.studies.attribute",
@@ -88,6 +94,8 @@ def __dir__() -> list[str]:
     return sorted(__all__)
 
 
+register_environments()
+
 if TYPE_CHECKING:
     from wiw import (
         action,
@@ -105,6 +113,7 @@ if TYPE_CHECKING:
         types,
     )
     from wiw.analysis.power import power
+    from wiw.envs.base import Env
     from wiw.loop.agent import Agent
     from wiw.metrics.headlines import Headline
     from wiw.policies.base import Policy
@@ -116,6 +125,7 @@ if TYPE_CHECKING:
     from wiw.studies.model_check import check_model
     from wiw.studies.run_log import load_run
     from wiw.studies.scale import scale
+    from wiw.tasks.base import Task
     from wiw.training.collect import collect
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from wiw.errors import ArgumentError
 
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
-PRIMITIVES, GRIPPER_POSES = "discrete", "pose7"
-"""What plans can be made of (`wiw.loop.plan_space`): primitives, or poses of a gripper (x, y, z, roll, pitch, yaw,
-gripper)."""
+PRIMITIVES: Final = "discrete"
+"""Plans are ids of `wiw.action`, int8 [K]."""
+GRIPPER_POSES: Final = "pose7"
+"""Plans are poses of a gripper (x, y, z, roll, pitch, yaw, gripper), float64 [K, 7]."""
 
 
 @dataclass(frozen=True)

@@ -404,7 +404,7 @@ def test_each_task_names_the_policy_that_runs_it():
 
     found = [default_policy(name) for name in ("imagenav", "ar", "manipulation")]
     assert found == ["matcher", "recogniser", "scripted"]
-    named = [name for name in TASKS.names() if hasattr(TASKS.find(name), "default_policy")]
+    named = [name for name in TASKS.names() if TASKS.find(name).default_policy]
     assert {default_policy(name) for name in named} <= set(POLICIES.names())
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")

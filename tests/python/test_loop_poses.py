@@ -43,7 +43,7 @@ class Fork:
     def fork(self) -> Fork:
         return Fork(self.pose, self.target)
 
-    def fronts_after(self, poses: Any, size: Any) -> Any:
+    def render_fronts_after(self, poses: Any, size: Any) -> Any:
         assert size == (480, 480)
         return np.stack([np.kron(picture(pose, self.target), np.ones((10, 10, 1), np.uint8)) for pose in poses])
 

@@ -17,8 +17,8 @@ import pytest
 from browser import COMMAND, WHY, Browser
 from PIL import Image, ImageSequence
 from pressing_policy import Pressing
-from test_evaluation_report import Page
 from test_export import contents_of
+from test_report import Page
 
 import wiw
 from wiw.errors import ArgumentError
@@ -113,10 +113,13 @@ def test_films_show_what_truly_happened(log: Any, html: str) -> None:
 
 
 def test_arms_that_did_the_same_are_filmed_once(log: Any) -> None:
-    films = [log.store.film("none", 0), film(Manipulation().table(log.store.episodes()[0]).bench, [pose(*HERE)] * 2)]
+    films = [
+        log.store.film("none", 0),
+        film(Manipulation().set_table(log.store.episodes()[0]).bench, [pose(*HERE)] * 2),
+    ]
     assert films[0] != films[1] and len(films[1]) < len(films[0])
     with pytest.raises(ArgumentError, match="finite pose"):
-        film(Manipulation().table(log.store.episodes()[0]).bench, [[np.nan] * 7])
+        film(Manipulation().set_table(log.store.episodes()[0]).bench, [[np.nan] * 7])
 
 
 def test_failures_that_are_run_again_are_not_filmed() -> None:

@@ -20,7 +20,7 @@ from wiw.loop.attempts import Attempts
 from wiw.loop.clock import Clock
 from wiw.loop.imagine import imagine
 from wiw.loop.labels import labelled, semantics_source
-from wiw.perception.semantics import CATEGORIES, OTHER, Semantics
+from wiw.perception.semantics import CATEGORIES, OTHER_CATEGORY, Semantics
 from wiw.policies.base import FrameSpec
 from wiw.runs.recipes import AgentRecipe
 from wiw.tasks.imagenav import ImageNav
@@ -87,7 +87,7 @@ class Half(Front):
 def test_the_simulator_names_things_as_the_scene_does(two_rooms: str) -> None:
     labels = query(two_rooms).semantic
     assert labels is not None and labels.shape == (576, 1024) and labels.dtype == np.uint32
-    names = {"floor": 2, "wall_n": OTHER}  # "wall_n" is no category
+    names = {"floor": 2, "wall_n": OTHER_CATEGORY}  # "wall_n" is no category
     assert labels[560, 512] == names["floor"] and set(np.unique(labels)) <= set(range(len(CATEGORIES)))
 
 
@@ -135,7 +135,7 @@ class Stripes(Semantics):
 
     needs = ("depth",)
 
-    def panoramas(self, images, depth=None, ids=None):
+    def label_panoramas(self, images, depth=None, ids=None):
         assert depth is not None and depth.shape == images.shape[:3]
         return np.broadcast_to(np.arange(images.shape[2], dtype=np.uint32) // 64, images.shape[:3]).copy()
 

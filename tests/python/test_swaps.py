@@ -14,7 +14,7 @@ import wiw
 from recognition_file import a_file
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.datasets import ar
-from wiw.datasets.visibility import seen, visible_share
+from wiw.datasets.visibility import measure_sizes, visible_share
 from wiw.errors import ArgumentError
 from wiw.loop.agent import Query
 from wiw.tasks.ar import AR
@@ -40,11 +40,11 @@ def decided(agent: wiw.Agent, env: Any) -> Any:
 def test_true_plans_lead_to_the_goal_almost_as_fast_as_can_be(two_rooms: str, index: int) -> None:
     env = started(ImageNav(scenes=two_rooms, backend="cpu"), index)
     steps = 0
-    while not env.trip.ended:
+    while not env.state.ended:
         segment = env.run(env.guide().plan(5)[:3])
         steps += len(segment.executed)
-        assert steps <= 1.2 * env.trip.episode.info["ideal_primitives"] + 3
-    assert env.trip.success
+        assert steps <= 1.2 * env.state.episode.info["ideal_primitives"] + 3
+    assert env.state.success
 
 
 def test_asking_a_guide_moves_nothing(two_rooms: str) -> None:
@@ -53,26 +53,26 @@ def test_asking_a_guide_moves_nothing(two_rooms: str) -> None:
     first = guide.worth(AHEAD), guide.plan(9).tolist()
     assert (guide.worth(AHEAD), guide.plan(9).tolist()) == first and len(first[1]) == 9
     np.testing.assert_array_equal(env.truth().position, before.position)
-    assert env.truth().yaw == before.yaw and env.trip.actions == 0
+    assert env.truth().yaw == before.yaw and env.state.actions == 0
 
 
 def test_worth_is_primitives_to_go_and_best_within_reach(two_rooms: str) -> None:
     env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    guide, start = env.guide(), env.trip.geodesic_to_goal()
+    guide, start = env.guide(), env.state.geodesic_to_goal()
     plan = guide.plan(20)
     worths = [guide.worth(plan[:k]) for k in range(1, 21)]
     assert worths == sorted(worths) and -worths[0] >= start / 0.2 - 1
     on_the_way = guide.worth(plan)
     assert guide.worth([*plan, *[TURN_LEFT] * 8]) >= on_the_way  # where it goes afterwards takes nothing away
     env.run(plan)
-    while not env.trip.ended:
+    while not env.state.ended:
         env.run(env.guide().plan(5)[:3])
     assert env.guide().worth([TURN_LEFT]) == 0
 
 
 def test_a_goal_that_cannot_be_walked_to_is_judged_in_a_straight_line(two_rooms: str) -> None:
     env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    env.trip.goal_position = np.array([40.0, 0.0, 0.0])
+    env.state.goal_position = np.array([40.0, 0.0, 0.0])
     worths = [env.guide().worth(plan) for plan in FAN]
     assert np.isfinite(worths).all() and len(env.guide().plan(5)) == 5
 
@@ -80,17 +80,17 @@ def test_a_goal_that_cannot_be_walked_to_is_judged_in_a_straight_line(two_rooms:
 def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path) -> None:
     task = AR(episode_file=a_file(tmp_path, two_rooms, start=(-1.2, 0.0, 1.2), yaw=np.pi / 2), backend="cpu")
     env = started(task)
-    trip, target = env.trip, int(env.trip.episode.info["target"])
+    state, target = env.state, int(env.state.episode.info["target"])
     place = env.fork().position
-    size, share = seen(trip.world, place[None])[0, target], visible_share(trip.world, place, target)
-    clarity = ar.clarity(trip.world, place, target)
+    size, share = measure_sizes(state.world, place[None])[0, target], visible_share(state.world, place, target)
+    clarity = ar.measure_clarity(state.world, place, target)
     assert clarity == pytest.approx(share * min(1, size / ar.EpisodeRules().enough)) and 0 < clarity < 1
-    best = task.destination(trip)
-    assert ar.clarity(trip.world, best, target) > 1.5 * clarity
+    best = task.find_destination(state)
+    assert ar.measure_clarity(state.world, best, target) > 1.5 * clarity
     while np.linalg.norm(env.truth().position - best) > 0.25:
         env.run(env.guide().plan(4)[:1], unsure(task))
-        assert env.trip.actions <= 9
-    assert ar.clarity(trip.world, np.array([3.0, 0.0, 0.0]), target) == 0  # from the other room
+        assert env.state.actions <= 9
+    assert ar.measure_clarity(state.world, np.array([3.0, 0.0, 0.0]), target) == 0  # from the other room
 
 
 def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None:

@@ -48,12 +48,12 @@ def _everything() -> Any:
         table.add_row()
     for task in TASKS.built_in:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
-        for name in presets.names(task):
-            table.add_row(f"  {name}", escape(presets.about(task, name)))
+        for name in presets.list_presets(task):
+            table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
     table.add_row()
     table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
-    for name in vlms.names():
-        table.add_row(f"  {name}", escape(vlms.about(name)))
+    for name in vlms.list_names():
+        table.add_row(f"  {name}", escape(vlms.describe(name)))
     return table
 
 

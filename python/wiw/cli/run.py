@@ -46,7 +46,7 @@ def run(
     width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
     robot: Annotated[Path | None, arg(metavar="URDF")] = None,
-    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
     live: Count = 4,
@@ -93,7 +93,8 @@ def run(
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
         scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
-        episodes: How many; if not given, 20, for manipulation what the preset says: 50 of each task.
+        episodes: How many; if not given, all of --episode-file, else 20, for manipulation what the preset says: 50 of
+            each task.
         seed: All randomness is a function of it.
         workers: Processes; results do not depend on it.
         out: Folder of the run; runs/TASK-TIME if not given.
@@ -103,7 +104,8 @@ def run(
         width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         robot: For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given.
-        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
+            given. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.

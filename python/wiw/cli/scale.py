@@ -35,7 +35,7 @@ def scale(
     workers: Count = 1,
     out: Annotated[Path | None, arg(metavar="DIR")] = None,
     horizon: Annotated[int | None, arg(metavar="L")] = None,
-    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
     live: Count = 4,
@@ -74,7 +74,8 @@ def scale(
         workers: Processes; results do not depend on it.
         out: Folder of the run; runs/scale-TIME if not given.
         horizon: Primitives or poses in a plan; the task's own number if not given.
-        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
+            given. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as per_scene=2; may
             be given again.
         backend: Renderer; auto if not given.

@@ -14,7 +14,6 @@ from wiw._core import core
 from wiw.errors import ArgumentError
 from wiw.loop.imagination import Imagination, ImaginerWrapper, NothingImagined, Request
 from wiw.loop.model_imaginer import as_imaginer
-from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.policies.base import FrameSpec
 from wiw.types import Key, Rollout
 
@@ -22,7 +21,7 @@ _CONSULT = 0x636F6E73
 """Keeps the draw whether to consult apart from all others of the decision."""
 
 
-class Gated(ImaginerWrapper, Privileged):
+class Gated(ImaginerWrapper):
     """A world model that is consulted for a share of all decisions; for the others the proposer's preference decides.
 
     Drawn by the decision's key: what a smaller share consults, a larger one does too.
@@ -40,11 +39,6 @@ class Gated(ImaginerWrapper, Privileged):
         if not 0 <= fraction <= 1:
             raise ArgumentError(f"expected an imagine_fraction from 0 to 1, got {fraction}")
         self.fraction = fraction
-
-    def grant(self, environments: LiveEnvironments) -> None:
-        """Pass the environments on."""
-        if isinstance(self.inner, Privileged):
-            self.inner.grant(environments)
 
     def consults(self, key: Key) -> bool:
         """Return whether the model is consulted for this decision."""
@@ -84,8 +78,14 @@ class PartlyImagined(Imagination):
 
 def select(request: Request, places: Sequence[int]) -> Request:
     """Return the request of some of its episodes."""
-    names = ("keys", "observations", "inputs", "plans", "origins")
-    return replace(request, **{name: [getattr(request, name)[place] for place in places] for name in names})
+    return replace(
+        request,
+        keys=[request.keys[place] for place in places],
+        observations=[request.observations[place] for place in places],
+        inputs=[request.inputs[place] for place in places],
+        plans=[request.plans[place] for place in places],
+        origins=[request.origins[place] for place in places],
+    )
 
 
 def is_consulted(key: Key, fraction: float) -> bool:

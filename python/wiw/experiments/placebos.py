@@ -21,7 +21,6 @@ from wiw.errors import ArgumentError
 from wiw.loop.imagination import Imagination, ImaginerWrapper, ModelInput, Request
 from wiw.loop.imagine import make_model_spec
 from wiw.loop.model_imaginer import as_imaginer
-from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.types import Key, Proposal
 
 PLACEBOS = ("shuffled", "swapped")
@@ -31,7 +30,7 @@ _PURPOSE = 0x706C6163
 """Keeps these draws apart from all others of the decision."""
 
 
-class Placebo(ImaginerWrapper, Privileged):
+class Placebo(ImaginerWrapper):
     """A world model that is asked as much, for something else than the plans.
 
     Args:
@@ -42,11 +41,6 @@ class Placebo(ImaginerWrapper, Privileged):
 
     def __init__(self, model: Any) -> None:
         super().__init__(as_imaginer(model))
-
-    def grant(self, environments: LiveEnvironments) -> None:
-        """Pass the environments on."""
-        if isinstance(self.inner, Privileged):
-            self.inner.grant(environments)
 
     def describe(self) -> dict[str, Any]:
         """Describe the model and the kind of placebo."""

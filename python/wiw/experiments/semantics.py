@@ -13,7 +13,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.imagination import Imagination, ImaginerWrapper, ModelInput, Request
 from wiw.loop.imagine import stack_depths
 from wiw.loop.model_imaginer import as_imaginer
-from wiw.loop.privileged import LiveEnvironments, Privileged
+from wiw.loop.privileged import LiveEnvironments
 from wiw.perception.semantics import Semantics
 from wiw.registry import SEMANTICS
 
@@ -36,7 +36,7 @@ def find_source(semantics: Any) -> Semantics | str:
     return source
 
 
-class Labelled(ImaginerWrapper, Privileged):
+class Labelled(ImaginerWrapper):
     """A world model that is told what each pixel of the panorama is.
 
     Args:
@@ -52,8 +52,7 @@ class Labelled(ImaginerWrapper, Privileged):
     def grant(self, environments: LiveEnvironments) -> None:
         """Take the environments, whose own semantics the source "simulator" gives, and pass them on."""
         self._environments = environments
-        if isinstance(self.inner, Privileged):
-            self.inner.grant(environments)
+        super().grant(environments)
 
     @property
     def needs(self) -> frozenset[str]:
@@ -84,4 +83,4 @@ class Labelled(ImaginerWrapper, Privileged):
 def _label(source: Semantics, inputs: Any) -> NDArray[np.uint32]:
     own: list[ModelInput] = list(inputs)
     depth = stack_depths(own) if "depth" in source.needs else None
-    return source.panoramas(np.stack([shown.observation.panorama for shown in own]), depth)
+    return source.label_panoramas(np.stack([shown.observation.panorama for shown in own]), depth)

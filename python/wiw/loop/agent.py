@@ -135,5 +135,5 @@ class Agent(BaseAgent):
         }
 
     def __repr__(self) -> str:
-        model = "none" if self.model is None else type(self.model.base).__name__
-        return f"Agent({type(self.policy.base).__name__}, {model}, {self.config})"
+        model = "none" if self.model is None else type(self.model.unwrapped).__name__
+        return f"Agent({type(self.policy.unwrapped).__name__}, {model}, {self.config})"

@@ -66,9 +66,9 @@ class Attempted(WorldModel):
         return self.model.accepts
 
     @property
-    def base(self) -> WorldModel:
+    def unwrapped(self) -> WorldModel:
         """The model behind everything that wraps it."""
-        return self.model.base
+        return self.model.unwrapped
 
     @property
     def spent(self) -> Mapping[str, float]:
@@ -129,7 +129,7 @@ class Attempted(WorldModel):
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
         kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
-        name = type(self.model.base).__name__
+        name = type(self.model.unwrapped).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
     def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:

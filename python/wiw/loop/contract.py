@@ -44,7 +44,7 @@ def check_kind(model: WorldModel, space: str, words: str) -> None:
     accepts = model.accepts
     if accepts.control not in ("image", "text") and accepts.space != space:  # those know no actions
         raise ArgumentError(
-            f"{type(model.base).__name__} takes space='{accepts.space}', but this agent plans in {words}"
+            f"{type(model.unwrapped).__name__} takes space='{accepts.space}', but this agent plans in {words}"
         )
 
 
@@ -54,11 +54,11 @@ def check_needs(model: WorldModel) -> None:
     Raises:
         ArgumentError: another model asks for it.
     """
-    if "simulator" in model.accepts.needs and not isinstance(model.base, Oracle):
+    if "simulator" in model.accepts.needs and not isinstance(model.unwrapped, Oracle):
         raise ArgumentError(
-            f"{type(model.base).__name__} needs the simulator, which is handed to the oracle alone: it knows where the "
-            "agent truly is. Declare what the model sees of the world instead (needs=('depth',)), or derive it from "
-            "wiw's Oracle"
+            f"{type(model.unwrapped).__name__} needs the simulator, which is handed to the oracle alone: it knows "
+            "where the agent truly is. Declare what the model sees of the world instead (needs=('depth',)), or derive "
+            "it from wiw's Oracle"
         )
 
 
@@ -68,7 +68,7 @@ def check_proposals(policy: Policy, space: PlanChecker, proposals: Any, episodes
     Raises:
         ContractError: another count, length or action.
     """
-    name = f"{type(policy.base).__name__}.propose"
+    name = f"{type(policy.unwrapped).__name__}.propose"
     if not isinstance(proposals, Sequence) or len(proposals) != episodes:
         raise ContractError(f"{name}: expected a list of proposals for each of {episodes} episodes, got {proposals!r}")
     for plans in proposals:
@@ -86,7 +86,7 @@ def check_scores(policy: Policy, scores: Any, proposals: Sequence[Sequence[Propo
     Raises:
         ContractError: another count, or NaN.
     """
-    name = f"{type(policy.base).__name__}.score"
+    name = f"{type(policy.unwrapped).__name__}.score"
     if not isinstance(scores, Sequence) or len(scores) != len(proposals):
         raise ContractError(f"{name}: expected scores for each of {len(proposals)} episodes, got {scores!r}")
     found = [np.asarray(row, np.float64) for row in scores]
@@ -102,10 +102,11 @@ def check_answerer(policy: Policy, goal: Goal) -> None:
     Raises:
         ContractError: it has not written `answer`.
     """
-    if goal.choices and type(policy.base).answer is Policy.answer:
+    if goal.choices and type(policy.unwrapped).answer is Policy.answer:
         raise ContractError(
-            f"{type(policy.base).__name__} gives no answer, but task '{goal.task}' asks for one of {len(goal.choices)} "
-            "choices at every decision; write its `answer`, or give the agent a policy that answers (reviser=)"
+            f"{type(policy.unwrapped).__name__} gives no answer, but task '{goal.task}' asks for one of "
+            f"{len(goal.choices)} choices at every decision; write its `answer`, or give the agent a policy that "
+            "answers (reviser=)"
         )
 
 
@@ -115,7 +116,7 @@ def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation])
     Raises:
         ContractError: other choices, or numbers that are no distribution.
     """
-    name = f"{type(policy.base).__name__}.answer"
+    name = f"{type(policy.unwrapped).__name__}.answer"
     if not isinstance(answers, Sequence) or len(answers) != len(situations):
         raise ContractError(f"{name}: expected one answer for each of {len(situations)} episodes, got {answers!r}")
     for answer, situation in zip(answers, situations, strict=True):

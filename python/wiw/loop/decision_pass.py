@@ -45,7 +45,7 @@ class Components:
     def count_spent(self) -> Counter[str]:
         """Return what model and policies have been asked for so far."""
         counts = Counter[str](self.policy.spent)
-        if self.reviser.base is not self.policy.base:
+        if self.reviser.unwrapped is not self.policy.unwrapped:
             counts.update(self.reviser.spent)
         counts.update(self.imaginer.spent)
         return counts
@@ -78,7 +78,7 @@ class DecisionPass:
         most, horizon = config.pool or 1, config.horizon or 1
         with self._ledger.clock("propose"):
             policy.observe(self._proposing)
-            if reviser.base is not policy.base:
+            if reviser.unwrapped is not policy.unwrapped:
                 reviser.observe(self._revising)
             plans = policy.propose(self._proposing, most, horizon)
             check_proposals(policy, self._parts.space, plans, len(self._queries), most, horizon)
@@ -170,9 +170,9 @@ class DecisionPass:
     ) -> tuple[NDArray[Any], int | None]:
         reviser, config = self._parts.reviser, self._parts.config
         actions, chosen = reviser.revise(self._revising[episode], plans, scores)
-        source = f"{type(reviser.base).__name__}.revise"
+        source = f"{type(reviser.unwrapped).__name__}.revise"
         return self._parts.space.check_plan(source, actions, config.longest), chosen
 
     def _policies(self) -> list[Policy]:
         policy, reviser = self._parts.policy, self._parts.reviser
-        return [policy] if reviser.base is policy.base else [policy, reviser]
+        return [policy] if reviser.unwrapped is policy.unwrapped else [policy, reviser]

@@ -35,7 +35,7 @@ class GripperPoses(PlanSpace):
 
     def check_model(self, model: WorldModel, longest: int) -> None:
         """See `PlanSpace.check_model`: the model must show what happens in a front view, from a fixed camera."""
-        accepts, name = model.accepts, type(model.base).__name__
+        accepts, name = model.accepts, type(model.unwrapped).__name__
         check_kind(model, GRIPPER_POSES, self.words)
         if accepts.control not in ("image", "text", "action"):
             raise ArgumentError(f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none")

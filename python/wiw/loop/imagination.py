@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from wiw.loop.clock import Clock
 from wiw.loop.history import Frame
+from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.policies.base import FrameSpec
 from wiw.types import Key, Proposal, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel
@@ -140,11 +141,16 @@ class NoModel(Imaginer):
         return NothingImagined(len(request.keys))
 
 
-class ImaginerWrapper(Imaginer):
+class ImaginerWrapper(Imaginer, Privileged):
     """Base of what changes the requests of another imaginer."""
 
     def __init__(self, inner: Imaginer) -> None:
         self.inner = inner
+
+    def grant(self, environments: LiveEnvironments) -> None:
+        """Pass the environments on."""
+        if isinstance(self.inner, Privileged):
+            self.inner.grant(environments)
 
     @property
     def model(self) -> WorldModel | None:

@@ -164,7 +164,7 @@ def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.ui
     """Return the answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
     if any(np.may_share_memory(found, answer) for answer in before):
         raise ContractError(
-            f"{type(model.base).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
+            f"{type(model.unwrapped).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
             "that; return a new array from every call",
             "memory",
         )

@@ -89,7 +89,7 @@ class EpisodeMemories:
         if query.key.decision == 0 or name not in self._by_episode:
             check_answerer(self._reviser, query.goal)
             proposer = reviser = self._policy.begin(query.goal, query.key)
-            if self._reviser.base is not self._policy.base:
+            if self._reviser.unwrapped is not self._policy.unwrapped:
                 reviser = self._reviser.begin(query.goal, query.key)
             self._by_episode[name] = EpisodeMemory(proposer, reviser)
         return self._by_episode[name]

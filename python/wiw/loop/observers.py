@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from wiw.loop.clock import Clock
 from wiw.loop.imagination import Imagination
 from wiw.loop.memory import Query
+from wiw.loop.plan_space import PlanSpace
 from wiw.policies.base import Policy, Situation
 from wiw.types import Decision, Proposal
 
@@ -19,7 +20,7 @@ class Futures:
     """What the reviser is about to score."""
 
     reviser: Policy
-    space: str
+    space: PlanSpace
     queries: Sequence[Query]
     situations: Sequence[Situation]
     """As the reviser knows them; their memories must not be changed."""

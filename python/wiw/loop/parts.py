@@ -60,12 +60,12 @@ class Parts:
             reviser = POLICIES.make(policy.default_revision, **space_option(POLICIES, policy.default_revision, space))
         else:
             raise ArgumentError(
-                f"Agent: policy {type(policy.base).__name__} only proposes; give `reviser=` a policy that scores"
+                f"Agent: policy {type(policy.unwrapped).__name__} only proposes; give `reviser=` a policy that scores"
             )
         if reviser.space != space:
             raise ArgumentError(
-                f"Agent: {type(policy.base).__name__} plans in {plan_space(space).words}, but the reviser "
-                f"{type(reviser.base).__name__} in {plan_space(reviser.space).words}"
+                f"Agent: {type(policy.unwrapped).__name__} plans in {plan_space(space).words}, but the reviser "
+                f"{type(reviser.unwrapped).__name__} in {plan_space(reviser.space).words}"
             )
         return reviser
 
@@ -73,15 +73,17 @@ class Parts:
 def _space_of(policy: Any) -> str:
     """Return what a policy plans in; one of several spaces, made by name, plans in primitives."""
     found = POLICIES.find(policy) if isinstance(policy, str) else policy
-    return found.space if isinstance(found, Policy) or inspect.isclass(found) else PRIMITIVES
+    if isinstance(found, Policy) or (inspect.isclass(found) and issubclass(found, Policy)):
+        return found.space
+    return PRIMITIVES
 
 
 def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
-            f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.base).__name__} makes "
-            f"them of {plan_space(made.space).words}"
+            f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
+            f"makes them of {plan_space(made.space).words}"
         )
     return made
 

@@ -36,7 +36,7 @@ class Primitives(PlanSpace):
 
     def check_model(self, model: WorldModel, longest: int) -> None:
         """See `PlanSpace.check_model`; a model that needs more than an image cannot go on from an imagined frame."""
-        accepts, name = model.accepts, type(model.base).__name__
+        accepts, name = model.accepts, type(model.unwrapped).__name__
         check_kind(model, PRIMITIVES, self.words)
         check_needs(model)
         lacking = [need for need in accepts.needs if need != "history"]  # imagined frames make a history
@@ -55,12 +55,12 @@ class Primitives(PlanSpace):
         """See `PlanSpace.check_search`: the model must show panoramas, and the policy must do without depth there."""
         if model.accepts.view != "panorama":
             raise ArgumentError(
-                f"Agent: depth={depth} proposes from imagined panoramas, but {type(model.base).__name__} imagines the "
-                "front view alone; use depth=1, or a panorama model"
+                f"Agent: depth={depth} proposes from imagined panoramas, but {type(model.unwrapped).__name__} imagines "
+                "the front view alone; use depth=1, or a panorama model"
             )
         if not policy.can_extend:
             raise ArgumentError(
                 f"Agent: with depth={depth} plans are proposed from imagined places, which have no depth, but "
-                f"{type(policy.base).__name__} needs it; write its `extend`, or propose with another policy and give "
-                "this one as reviser="
+                f"{type(policy.unwrapped).__name__} needs it; write its `extend`, or propose with another policy and "
+                "give this one as reviser="
             )

@@ -174,9 +174,9 @@ class Cached(WorldModel):
         return self.model.accepts
 
     @property
-    def base(self) -> WorldModel:
+    def unwrapped(self) -> WorldModel:
         """The model behind everything that wraps it."""
-        return self.model.base
+        return self.model.unwrapped
 
     @property
     def spent(self) -> Mapping[str, float]:
@@ -226,7 +226,7 @@ def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: flo
     if cache == "off" or "simulator" in accepts.needs or (cache == "auto" and not accepts.cacheable):
         return model
     if not model.fingerprint():
-        _warn_unversioned(type(model.base).__name__)
+        _warn_unversioned(type(model.unwrapped).__name__)
         return model
     return Cached(model, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
 

@@ -59,7 +59,7 @@ class Trial:
         seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
         decision = replace(decision, seconds=seconds)
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
-        facts = outcome.executed, before, self.env.truth(), outcome.path, getattr(outcome, "refused", ())
+        facts = outcome.executed, before, self.env.truth(), outcome.path, outcome.refused
         end = self.observation if self.done else None
         record = DecisionRecord(self.index, self.decisions, decision, *facts, end)
         self.decisions += 1

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy is: it proposes plans, scores imagined futures, and turns scores into a decision."""
+"""The interface of policies: propose plans, score imagined futures, and turn scores into a decision."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout
 
 @dataclass(frozen=True)
 class FrameSpec:
-    """How a policy wants imagined frames shown: the paper's 384x384 views, or the whole panorama at a size of its own.
+    """The view and size of imagined frames that a policy asks for: the paper's 384x384 views, or panoramas of any size.
 
     A perspective world model can only give its front view, whatever is asked for.
     """
@@ -30,7 +30,7 @@ class FrameSpec:
 
 @dataclass(frozen=True)
 class Situation:
-    """One live episode at the moment of a decision, as a policy may know it."""
+    """One live episode at the moment of a decision, as far as a policy may know it."""
 
     observation: Any
     """`Observation`, or `ArmObservation` for a policy that plans in poses."""
@@ -39,10 +39,11 @@ class Situation:
     memory: Any
     """What `Policy.begin` returned for this episode; the policy may change it."""
     executed: tuple[Any, ...] = ()
-    """Primitives, or poses, of all decisions since the episode began."""
+    """Primitives, or poses, executed since the episode began."""
     imagines: bool = True
-    """Whether a world model is asked about the plans proposed now. Where none is, no more than one plan is of use to a
-    policy that takes its first."""
+    """Whether a world model will imagine the plans proposed now. Without one, a policy that takes its first plan needs
+    to propose only one.
+    """
 
 
 class Policy(ABC):
@@ -57,35 +58,37 @@ class Policy(ABC):
     """"depth" where observations must carry it."""
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
-    """Name of the reviser that stands in where this policy only proposes."""
+    """Name of the reviser to use where this policy only proposes."""
     tokens: int = 0
     """Tokens that the policy's language model has read and written so far; 0 without one."""
 
     @property
-    def base(self) -> Policy:
+    def unwrapped(self) -> Policy:
         """The policy itself, behind everything that wraps it."""
         return self
 
     def begin(self, goal: Goal, key: Key) -> Any:
-        """Memory for a new episode; None for a policy that keeps none."""
+        """Return the memory of a new episode; None for a policy without memory."""
         return None
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Called once a decision, before `propose`, also on a policy that only revises. Default: nothing to keep."""
+        """Update the memory; called once per decision, before `propose`, also on a policy that only revises. Default:
+        nothing.
+        """
         return
 
     @abstractmethod
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """At most `candidates` plans of at most `horizon` actions for each episode, best first."""
+        """Return at most `candidates` plans of at most `horizon` actions for each episode, best first."""
         raise NotImplementedError
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Continuations of imagined plans, one list a situation; asked for where the beam search goes deeper.
+        """Return continuations of imagined plans, one list per situation; called where the beam search goes deeper.
 
-        Each situation stands at the end of a kept plan: its images are imagined, its odometry is what the plan leads to
-        when no step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default:
-        proposes as if the agent had come there, with a copy of its memory that has observed the place. A policy that
-        observes depth has to write its own.
+        Each situation stands at the end of a plan: its images are imagined, its odometry is where the plan leads if no
+        step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default: propose as
+        if the agent were there, with a copy of its memory that has observed the place. A policy that observes depth
+        must override this.
         """
         there = [replace(situation, memory=deepcopy(situation.memory)) for situation in situations]
         self.observe(there)
@@ -97,7 +100,7 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """One score a candidate for each episode, higher is better. One call for all live episodes."""
+        """Return one score per candidate for each episode, higher is better; one call for all live episodes."""
         raise NotImplementedError(f"{type(self).__name__} only proposes; give the agent a revision policy")
 
     def score_or_prefer(
@@ -117,7 +120,8 @@ class Policy(ABC):
         )
         if not isinstance(found, Sequence) or len(found) != len(places):
             raise ContractError(
-                f"{type(self.base).__name__}.score: expected scores for each of {len(places)} episodes, got {found!r}"
+                f"{type(self.unwrapped).__name__}.score: expected scores for each of {len(places)} episodes, got "
+                f"{found!r}"
             )
         for place, score in zip(places, found, strict=True):
             scores[place] = score
@@ -126,7 +130,9 @@ class Policy(ABC):
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
+        """Return the plan to execute and its index among the proposals, or None for a new plan. Default: the best
+        one.
+        """
         best = int(np.argmax(scores))
         return proposals[best].actions, best
 
@@ -136,19 +142,20 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[Answer | None]:
-        """What each episode's agent believes, where its goal has choices; `rollouts` are None without a world model.
+        """Return what each episode's agent believes, where its goal has choices; `rollouts` are None without a world
+        model.
 
-        Asked of the revising policy once a decision, with what is seen and what was imagined. Default: no answer.
+        Called on the revising policy once per decision, with what is seen and what was imagined. Default: no answer.
         """
         return [None] * len(situations)
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
-        """What a language model was asked for this decision and said, handed over once; nothing without one."""
+        """Return the language model's exchanges of this decision, once; empty without a language model."""
         return ()
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What the policy has used up so far, for the cost ledger (`Decision.spent`)."""
+        """Resources used so far, for the cost ledger (`Decision.spent`)."""
         return {"vlm_tokens": self.tokens}
 
     @property
@@ -162,5 +169,5 @@ class Policy(ABC):
         return type(self).extend is not Policy.extend or "depth" not in self.needs
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity for the run's manifest."""
+        """Return a JSON-able identity for the run's manifest."""
         return {"policy": type(self).__name__}

@@ -24,9 +24,9 @@ class PolicyWrapper(Policy):
         self.default_revision = inner.default_revision
 
     @property
-    def base(self) -> Policy:
+    def unwrapped(self) -> Policy:
         """The policy behind everything that wraps it."""
-        return self.inner.base
+        return self.inner.unwrapped
 
     def begin(self, goal: Goal, key: Key) -> Any:
         """See `Policy.begin`."""

@@ -59,7 +59,7 @@ class Stage:
 
     def pixels(self, points: ArrayLike) -> NDArray[np.float64]:
         """float64 [N, 2] of world points [N, 3]."""
-        return self.camera.pixels_of(points, (SIDE, SIDE))
+        return self.camera.project_points(points, (SIDE, SIDE))
 
     def draw(self, start: Sequence[float], plan: Plan) -> Drawing:
         """A plan from the place where the gripper was."""

@@ -56,13 +56,8 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
         raise
 
 
-def require_of(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
-    """Asks a task that can tell whether all that its episodes need is there, before anything is run, and what it is."""
-    return dict(task.require(episodes)) if hasattr(task, "require") else {}
-
-
 def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
-    """The same for the episodes that a run has left."""
+    """See that the episodes that a run has left are run with what the others were run with."""
     episodes = store.episodes()
     try:
         require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_failed)])
@@ -79,7 +74,7 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
         StoreError: what belongs to a scene has come or gone.
     """
     kept = store.info.get("scenes", {})
-    used = require_of(task, episodes)
+    used = task.require(episodes)
     store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
 
 
@@ -112,10 +107,11 @@ def run_pending(
     try:
         for arm, indices in pending.items():
             store.discard(arm, indices)
-        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
+        built = task.build()
+        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, built.decisions, board))
         _run_jobs(plan, episodes, pending, desk, workers)
-        keep_scene_maps(store, task)
-        keep_films(store, task)
+        keep_scene_maps(store, built)
+        keep_films(store, built)
     finally:
         board.close()
         store.close()
@@ -135,11 +131,6 @@ def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[in
         run_here(plan, jobs, desk)
     else:
         run_in_workers(plan, jobs, desk, workers)
-
-
-def _budget(store: RunStore) -> int:
-    """Most decisions of an episode, as far as the task tells."""
-    return int(store.config["task"].get("decisions", 20))
 
 
 SAME_ERRORS = 5

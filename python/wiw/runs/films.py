@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from PIL import Image
 
 from wiw.runs.store import RunStore
 from wiw.tabletop.workbench import Workbench
+from wiw.tasks.base import Task
 
 SIDE = (320, 320)
 """Pixels."""
@@ -32,10 +32,9 @@ QUALITY = 85
 """Of WebP; below it, where the arm was shines through."""
 
 
-def keep_films(store: RunStore, task: Any) -> None:
-    """Films the first episode of each kind that keeps pictures, in every arm, where the task is one at a table."""
-    built = task.build()
-    if not hasattr(built, "table") or "attributes" in store.config:  # failures that are run again have no page
+def keep_films(store: RunStore, task: Task) -> None:
+    """Film the first episode of each kind that keeps pictures, in every arm, where the task has tables to film."""
+    if "attributes" in store.config:  # failures that are run again have no page
         return
     episodes, known = store.episodes(), dict[tuple[int, str], bytes]()
     for arm, index in _wanted(store):
@@ -43,7 +42,10 @@ def keep_films(store: RunStore, task: Any) -> None:
             executed = [pose for row in store.decisions(arm, index) for pose in row["executed"]]
             name = index, str(executed)
             if name not in known:  # arms that did the same look the same
-                known[name] = film(built.table(episodes[index]).bench, executed)
+                table = task.set_table(episodes[index])
+                if table is None:
+                    continue
+                known[name] = film(table.bench, executed)
             store.write_film(arm, index, known[name])
 
 
@@ -79,6 +81,6 @@ def _frames(bench: Workbench, poses: Sequence[Sequence[float]]) -> Iterator[NDAr
         step = (bench.seconds - begin) / max(1, len(way) - 1)
         for k in range(len(way)):
             if begin + k * step >= due:
-                yield way[k].picture("front", SIDE)["color"]
+                yield way[k].render_view("front", SIDE)["color"]
                 due += period
-    yield bench.picture("front", SIDE)["color"]
+    yield bench.render_view("front", SIDE)["color"]

@@ -6,8 +6,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
@@ -18,6 +19,7 @@ from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 from wiw.runs.compose import Experiment, Limits, RunContext, compose, make_for_space
 from wiw.runs.sources import source_digests
+from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
 from wiw.world_models.base import WorldModel
 
@@ -35,18 +37,17 @@ class TaskRecipe:
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def build(self) -> Any:
-        """The task."""
+    def build(self) -> Task:
+        """Return the task."""
         from wiw.registry import TASKS
 
-        return TASKS.make(self.name, **self.options)
+        return cast(Task, TASKS.make(self.name, **self.options))
 
     def to_json(self) -> dict[str, Any]:
         """For the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
-        from wiw.registry import TASKS
+        from wiw.registry import task_class
 
-        portable = getattr(TASKS.find(self.name), "portable", dict)
-        return {"name": absolute(self.name), "options": portable(self.options)}
+        return {"name": absolute(self.name), "options": task_class(self.name).make_portable(self.options)}
 
     def sources(self) -> dict[str, str]:
         """Digests of the user's own source files, by path."""
@@ -251,10 +252,10 @@ class AgentInMemory:
 
 
 def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskRecipe | TaskInMemory:
-    """Return a recipe of a task by name and options, of a task, or of a gymnasium environment's task.
+    """Return a recipe of a task by name and options, of a task, or of an environment's task.
 
     Raises:
-        ArgumentError: options for a task that is already made.
+        ArgumentError: options for a task that is already made; something else than these.
     """
     if isinstance(task, str):
         from wiw.registry import task_name
@@ -264,8 +265,19 @@ def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskReci
         raise ArgumentError(f"the task is made already and cannot take {', '.join(options)}; give them to wiw.make")
     if isinstance(task, TaskRecipe):
         return task
-    unwrapped = getattr(task, "unwrapped", task)
-    return TaskInMemory(getattr(unwrapped, "task", unwrapped))
+    return TaskInMemory(task if isinstance(task, Task) else _task_of(task))
+
+
+def _task_of(env: Any) -> Task:
+    """Return the task of an environment, whatever gymnasium has wrapped around it."""
+    import gymnasium
+
+    from wiw.envs import ManipulationVectorEnv, VectorEnv
+
+    bare = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
+    if isinstance(bare, Env | VectorEnv | ManipulationVectorEnv) and isinstance(bare.task, Task):
+        return bare.task
+    raise ArgumentError(f"expected a task (wiw.Task), the name of one, or an environment of wiw.make, got {env!r}")
 
 
 def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:

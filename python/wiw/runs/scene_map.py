@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wiw.runs.store import RunStore
+from wiw.tasks.base import Task
 
 HFOV_DEG = 15.0
 """So narrow that walls lean outward by little: 0.3 m at the edge of a 15 m wide scene."""
@@ -37,19 +38,16 @@ class View:
     """float64 [2, 3]: pixel (u, v) = A [x, z, 1] for points on the floor."""
 
 
-def keep_scene_maps(store: RunStore, task: Any) -> None:
-    """Draws the scenes of the episodes that keep pictures, where the task's scenes can be drawn."""
-    built = task.build()
-    if not hasattr(built, "scenes"):
-        return
-    from wiw.datasets.worlds import world
-
+def keep_scene_maps(store: RunStore, task: Task) -> None:
+    """Draw the scenes of the episodes that keep pictures, where the task has scenes to draw."""
     episodes = store.episodes()
     for index in store.info["pictures"]:
         episode = episodes[index]
         if store.scene_map(episode.scene) is None:
-            place = world(episode.scene, built.backend)
-            image, matrix = draw(place.scene, place.navmesh, episode.start_position[1], built.backend)
+            place = task.open_world(episode)
+            if place is None:
+                continue
+            image, matrix = draw(place.scene, place.navmesh, episode.start_position[1], place.backend)
             store.write_scene_map(episode.scene, _encode(image), matrix)
 
 

@@ -108,10 +108,10 @@ def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[
     require_own_sources(base, task, agents)
     built, episodes = task.build(), base.episodes()
     base.require_task(built.describe())
-    if not hasattr(built, "progress"):
+    if not built.has_guide:
         raise ArgumentError(
             f"attribute: task '{base.config['task'].get('task')}' does not say what a plan is truly worth; derive it "
-            "from wiw.tasks.navigation.NavigationTask, or write its `destination` and `progress`"
+            "from wiw.tasks.navigation.NavigationTask, or write `guide` of its environment and set `has_guide`"
         )
     require_scenes(built, base, [episodes[index] for found in wanted.values() for index in found])
     return task, {
@@ -150,7 +150,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
 
 
 def _given(recipe: AgentRecipe) -> dict[str, Any]:
-    return {name: value for name, value in recipe.to_json().items() if value not in (None, {})}
+    return {name: value for name, value in (recipe.to_json() or {}).items() if value not in (None, {})}
 
 
 def _expected(base: RunStore) -> dict[str, Any]:

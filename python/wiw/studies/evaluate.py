@@ -16,7 +16,6 @@ from wiw.metrics import Lpips
 from wiw.runs.execute import (
     recipes_of,
     require_left,
-    require_of,
     require_own_sources,
     run_pending,
     sources_of,
@@ -26,7 +25,7 @@ from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
 from wiw.runs.store import RunStore, removed_if_empty
 from wiw.studies.run_log import RunLog
-from wiw.types import Wording, checked_seed
+from wiw.types import checked_seed
 
 
 def evaluate(
@@ -61,7 +60,7 @@ def evaluate(
     Args:
         env_or_task: an environment from `wiw.make`, its task, a `TaskRecipe`, or a task's name.
         agent: a `wiw.Agent` or an `AgentRecipe`.
-        episodes: how many; None means as many as the task's preset says, else 20.
+        episodes: how many; None means as many as the task says: all of an episode file, else 20.
         seed: of the run; None means the task's own.
         out: folder of the run; None means `runs/<task>-<time>`.
         workers: processes; more than one needs a task and an agent that can be pickled, or recipes.
@@ -159,8 +158,6 @@ def resume_run(
     return _finish(store, task, agents, workers or store.info["workers"], progress, retry_failed=retry_failed)
 
 
-USUAL = 20
-"""Episodes of a run where neither its caller nor its task says how many."""
 FOR_EVER = 1e12
 """Seconds that stand for no deadline where a number has to be written down."""
 
@@ -231,8 +228,8 @@ class _Options:
 
 
 def _count(task: Any, episodes: int | None) -> int:
-    """How many episodes to run."""
-    return int(getattr(task.build(), "usual", USUAL)) if episodes is None else episodes
+    """Return how many episodes to run."""
+    return int(task.build().default_episodes) if episodes is None else episodes
 
 
 def _at_least(name: str, value: int, least: int) -> None:
@@ -242,7 +239,7 @@ def _at_least(name: str, value: int, least: int) -> None:
 
 def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     built = task.build()
-    seed = int(getattr(built, "seed", 0)) if options.seed is None else options.seed
+    seed = built.seed if options.seed is None else options.seed
     config = {
         "task": built.describe(),
         "seed": seed,
@@ -258,7 +255,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     else:
         started = time.perf_counter()
         episodes = built.episodes(options.episodes)
-        used = require_of(built, episodes)
+        used = built.require(episodes)
         folder = options.out or Path("runs") / f"{built.name}-{datetime.now():%Y%m%d-%H%M%S}"
         info = {
             "platform": describe_platform(),
@@ -267,8 +264,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "sources": sources_of(task, agents),
             "pictures": with_pictures(episodes, options.pictures),
             "scenes": used,
-            "stage": getattr(built, "stage", None),
-            "wording": asdict(getattr(built, "wording", Wording())),
+            "stage": built.stage,
+            "wording": asdict(built.wording),
             "live": options.live,
             "workers": options.workers,
             "limits": options.limits.as_dict(),

@@ -220,7 +220,7 @@ def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view:
 
 def _true_fronts(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
     """Return what stands before the camera of a manipulator."""
-    return np.asarray(simulator.fork().fronts_after(plan, size))
+    return np.asarray(simulator.fork().render_fronts_after(plan, size))
 
 
 def _in_scenes(scenes: str) -> list[tuple[Any, Any, Key]]:

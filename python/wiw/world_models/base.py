@@ -215,7 +215,7 @@ class WorldModel(ABC):
         raise NotImplementedError
 
     @property
-    def base(self) -> WorldModel:
+    def unwrapped(self) -> WorldModel:
         """The model itself, behind everything that wraps it."""
         return self
 
@@ -327,7 +327,7 @@ def ask(
     model: WorldModel, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
 ) -> NDArray[np.uint8]:
     """Return a model's frames, held to the contract: by what wraps the model, or else here."""
-    return (check_rollout if model is model.base else type(model).rollout)(model, observations, controls, seeds)
+    return (check_rollout if model is model.unwrapped else type(model).rollout)(model, observations, controls, seeds)
 
 
 def check_rollout(
@@ -345,11 +345,11 @@ def check_rollout(
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         kind, came = _breach(frames, expected)
         raise ContractError(
-            f"{type(model.base).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
+            f"{type(model.unwrapped).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
             f"width, 3), got {came}",
             kind,
         )
-    check_pictures(type(model.base).__name__, observed, frames, controls)
+    check_pictures(type(model.unwrapped).__name__, observed, frames, controls)
     return frames
 
 

@@ -59,7 +59,7 @@ class ArmOracle(Oracle):
         frames[:, 0] = image
         for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
             assert control.ids is not None
-            frames[row, 1:] = simulator.fork().fronts_after(control.ids[1:], image.shape[1:3])
+            frames[row, 1:] = simulator.fork().render_fronts_after(control.ids[1:], image.shape[1:3])
         return frames
 
 

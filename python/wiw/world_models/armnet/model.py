@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.networks import one_thread
+from wiw.networks import single_thread
 from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import accepts
 from wiw.world_models.trained import Trained
@@ -71,7 +71,7 @@ class ArmNet(Trained):
 
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         frames[:, 0] = observations.image
-        with one_thread():
+        with single_thread():
             for image, control, future in zip(observations.image, controls, frames, strict=True):
                 assert control.ids is not None
                 poses = np.asarray(control.ids[: control.length + 1], np.float64)

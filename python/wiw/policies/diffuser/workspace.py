@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the policy sees: the part of a picture that shows the workspace, and where in the world its pixels are."""
+"""The policy's input: the part of an image that shows the workspace, and the 3D positions of its pixels."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from wiw.errors import ArgumentError
 from wiw.tabletop.workbench import TABLE, Camera
 
 CELL = 8
-"""Pixels of a side of what becomes one token."""
+"""Side in pixels of the cell that becomes one token."""
 WORKSPACE = np.array([[-0.06, -0.34, TABLE - 0.01], [0.40, 0.34, TABLE + 0.12]])
-"""Least and greatest x, y, z of what is looked at, in metres."""
+"""Least and greatest x, y, z of the workspace, in metres."""
 NOWHERE = (0.0, 0.0, -10.0)
-"""Where pixels are put that show nothing of it, in metres."""
+"""Position of pixels that show nothing of the workspace, in metres."""
 
 
-DEEP = 0.1
-"""Metres that heights are told in."""
+HEIGHT_UNIT = 0.1
+"""Unit of heights in metres."""
 
 
 @dataclass(frozen=True)
-class Sight:
-    """A picture's window on the workspace; h and w are multiples of `CELL`."""
+class WorkspaceView:
+    """The part of an image that shows the workspace; h and w are multiples of `CELL`."""
 
     image: NDArray[np.uint8]
     """uint8 [..., h, w, 3]."""
     height: NDArray[np.float16]
-    """float16 [..., h, w]: above the table, in units of `DEEP`; -1 where nothing of the workspace is seen."""
+    """float16 [..., h, w]: above the table, in units of `HEIGHT_UNIT`; -1 where nothing of the workspace is seen."""
     places: NDArray[np.float32]
-    """float32 [..., h / CELL, w / CELL, 3]: where in the world the middles of cells are, in metres, or `NOWHERE`."""
+    """float32 [..., h / CELL, w / CELL, 3]: positions of the cells' centres in metres, or `NOWHERE`."""
 
 
 @dataclass(frozen=True)
-class Lens:
+class PinholeCamera:
     """A pinhole camera that looks along -z with +y up; pixel centres are at + 0.5.
 
     Args:
@@ -49,14 +49,14 @@ class Lens:
     T_world_camera: NDArray[np.float64]
 
     @classmethod
-    def of(cls, camera: Camera, size: tuple[int, int]) -> Lens:
-        """Of a fixed camera of the workbench."""
+    def from_camera(cls, camera: Camera, size: tuple[int, int]) -> PinholeCamera:
+        """Create the model of a fixed camera of the workbench."""
         height, width = size
         focal = width / 2 / np.tan(np.radians(camera.hfov_deg) / 2)
         return cls(np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]), camera.pose)
 
-    def window(self, size: tuple[int, int]) -> tuple[slice, slice]:
-        """Rows and columns around the workspace in a picture [height, width], whole cells.
+    def find_window(self, size: tuple[int, int]) -> tuple[slice, slice]:
+        """Return rows and columns around the workspace in an image [height, width], whole cells.
 
         Raises:
             ArgumentError: it is not in view.
@@ -70,32 +70,32 @@ class Lens:
             raise ArgumentError(f"the workspace is not in view of the camera at {self.T_world_camera[:3, 3].tolist()}")
         return slice(int(least[0]), int(most[0])), slice(int(least[1]), int(most[1]))
 
-    def within(self, rows: slice, columns: slice) -> Lens:
-        """Of a window of its pictures."""
+    def crop(self, rows: slice, columns: slice) -> PinholeCamera:
+        """Return the camera of a window of its images."""
         intrinsics = self.intrinsics.copy()
         intrinsics[:2, 2] -= columns.start, rows.start
-        return Lens(intrinsics, self.T_world_camera)
+        return PinholeCamera(intrinsics, self.T_world_camera)
 
-    def sight(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> Sight:
-        """Of a picture [H, W, 3] and its planar depth [H, W] in metres.
+    def view_workspace(self, image: NDArray[np.uint8], depth: NDArray[np.float32]) -> WorkspaceView:
+        """Return the workspace's part of an image [H, W, 3] with planar depth [H, W] in metres.
 
         Raises:
             ArgumentError: the workspace is not in view.
         """
-        rows, columns = self.window(depth.shape)
-        points = self.within(rows, columns).points(depth[rows, columns])
+        rows, columns = self.find_window(depth.shape)
+        points = self.crop(rows, columns).unproject(depth[rows, columns])
         middles = slice(CELL // 2, None, CELL)
-        height = np.clip((points[..., 2] - TABLE) / DEEP, -1, 2)
-        return Sight(
+        height = np.clip((points[..., 2] - TABLE) / HEIGHT_UNIT, -1, 2)
+        return WorkspaceView(
             np.ascontiguousarray(image[rows, columns]),
             height.astype(np.float16),
             points[middles, middles].astype(np.float32, order="C"),
         )
 
-    def points(self, depth: NDArray[np.float32]) -> NDArray[np.float64]:
-        """float64 [..., h, w, 3]: where in the world pixels of planar depth [..., h, w] are, in metres.
+    def unproject(self, depth: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the 3D positions of pixels with planar depth [..., h, w]: float64 [..., h, w, 3], in metres.
 
-        Those outside the workspace, and those that hit nothing, are `NOWHERE`.
+        Pixels outside the workspace, and those that hit nothing, are `NOWHERE`.
         """
         height, width = depth.shape[-2:]
         columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One demonstration: an expert at its table, and what was seen of it."""
+"""Record one demonstration: an expert at its table, and the front view of it."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from wiw._core import core
 from wiw.datasets.demonstrations import Demonstration, Format, encoded_depth, encoded_image
 from wiw.errors import ArgumentError, InfrastructureError
 from wiw.render import Output
-from wiw.tabletop.kind import Kind, Setup
+from wiw.tabletop.base import TableSetup, TabletopTask
 from wiw.tabletop.workbench import Film, Workbench
 
 Backend = Literal["auto", "cpu", "gpu"]
 POSES = 15
-"""That an expert may go to, as in an episode of the evaluation."""
+"""Most poses of an expert, as in an episode of the evaluation."""
 ATTEMPTS = 20
-"""Tables that are set for one demonstration before its expert is taken to be broken."""
+"""Tables set up for one demonstration before its expert counts as broken."""
 FIRST_SEED = 2**31
-"""Evaluation draws the seeds of its tables below it, so that no table is seen in both."""
+"""Evaluation draws the seeds of its tables below this, so that no table occurs in both."""
 
 
 @dataclass(frozen=True)
 class Collection:
-    """What is collected.
+    """Options of a collection.
 
     Raises:
-        ArgumentError: a number that is too small or too large.
+        ArgumentError: a number is out of range.
     """
 
     episodes: int = 200
-    """Of each task."""
+    """Demonstrations of each task."""
     seed: int = 0
     size: int = 480
-    """Pixels of a side of the front view."""
+    """Height and width of the front view in pixels."""
     frames: int = 150
-    """Of each demonstration."""
+    """Frames of each demonstration."""
     format: Format = "jpeg"
     depth: bool = False
     keep_failed: bool = False
-    """Whether a demonstration that fails is kept as such; else another table takes the place of its own."""
+    """Whether a failed demonstration is kept and marked as failed; otherwise another table replaces it."""
     backend: Backend = "auto"
-    """Renderer; pictures differ a little between them."""
+    """Renderer; images of different ones differ slightly."""
 
     def __post_init__(self) -> None:
         if self.episodes < 1 or self.seed < 0:
@@ -62,55 +62,55 @@ class Collection:
                 raise ArgumentError(f"collect: expected a {name} among {', '.join(get_args(known))}, got {given}")
 
 
-def demonstrated(kind: Kind, episode: int, collection: Collection) -> tuple[Demonstration, int]:
-    """A demonstration by its number, and how many tables its expert failed at.
+def record_demonstration(task: TabletopTask, episode: int, collection: Collection) -> tuple[Demonstration, int]:
+    """Record a demonstration; return it with the number of tables that its expert failed at.
 
     Raises:
         InfrastructureError: it failed at too many.
     """
-    variation = episode % kind.variations
+    variation = episode % task.variations
     for attempt in range(ATTEMPTS):
         seed = table_seed(collection.seed, episode, attempt)
-        setup = kind.setup(seed, variation)
-        played = _Played(kind, setup, setup.bench(collection.backend))
+        setup = task.create_setup(seed, variation)
+        played = _ExpertRun(task, setup, setup.build_workbench(collection.backend))
         if played.success or collection.keep_failed:
-            named = {"task": kind.name, "variation": variation, "seed": seed, "episode": episode}
-            return played.demonstration(collection, named), attempt + (not played.success)
+            named = {"task": task.name, "variation": variation, "seed": seed, "episode": episode}
+            return played.build_demonstration(collection, named), attempt + (not played.success)
     raise InfrastructureError(
-        f"collect: the expert of {kind.name} failed at {ATTEMPTS} tables in a row (demonstration {episode}, seed "
+        f"collect: the expert of {task.name} failed at {ATTEMPTS} tables in a row (demonstration {episode}, seed "
         f"{collection.seed}); tests/benchmark/expert_success.py measures how often it should"
     )
 
 
 def table_seed(seed: int, episode: int, attempt: int) -> int:
-    """The seed of a table, which is never one of evaluation's."""
+    """Return the seed of a table, which evaluation never uses."""
     return FIRST_SEED + int(core.fold_key([seed, episode, attempt])) % FIRST_SEED
 
 
-class _Played:
-    """What an expert did at a table, every physics step of it."""
+class _ExpertRun:
+    """Everything that an expert did at a table, every physics step of it."""
 
-    def __init__(self, kind: Kind, setup: Setup, bench: Workbench) -> None:
+    def __init__(self, task: TabletopTask, setup: TableSetup, bench: Workbench) -> None:
         self._setup, self._start = setup, bench.fork()
         self._actions: list[NDArray[np.float64]] = []
         self._films: list[Film] = []
         self._after: list[Workbench] = []
-        while len(self._actions) < POSES and not kind.succeeded(bench, setup):
-            for pose in kind.expert(bench.places(setup.objects), setup.target)[: POSES - len(self._actions)]:
+        while len(self._actions) < POSES and not task.is_success(bench, setup):
+            for pose in task.plan_expert(bench.get_poses(setup.objects), setup.target)[: POSES - len(self._actions)]:
                 self._actions.append(pose)
                 self._films.append(bench.film(pose)[1])
                 self._after.append(bench.fork())
-                if kind.succeeded(bench, setup):
+                if task.is_success(bench, setup):
                     break
-        self.success = kind.succeeded(bench, setup)
+        self.success = task.is_success(bench, setup)
 
-    def demonstration(self, collection: Collection, named: dict[str, Any]) -> Demonstration:
-        """What was seen, in so many frames; `named`: the demonstration's other fields."""
-        steps, keys, ended = self._sampled(collection.frames)
+    def build_demonstration(self, collection: Collection, named: dict[str, Any]) -> Demonstration:
+        """Render `collection.frames` frames; `named` are the demonstration's other fields."""
+        steps, keys, ended = self._sample_frames(collection.frames)
         outputs: tuple[Output, ...] = ("color", "depth") if collection.depth else ("color",)
         seconds, poses, images, depths = [], [], [], []
-        for moment in self._moments(steps, keys, ended):
-            seen = moment.picture("front", (collection.size, collection.size), outputs)
+        for moment in self._iterate_states(steps, keys, ended):
+            seen = moment.render_view("front", (collection.size, collection.size), outputs)
             seconds.append(moment.seconds - self._start.seconds)
             poses.append(moment.pose)
             images.append(encoded_image(seen["color"], collection.format))
@@ -119,7 +119,7 @@ class _Played:
             **named,
             instruction=self._setup.instruction,
             success=self.success,
-            places=self._start.places(self._setup.objects),
+            places=self._start.get_poses(self._setup.objects),
             seconds=np.array(seconds),
             poses=np.stack(poses),
             actions=np.stack(self._actions)[np.maximum(keys, 1) - 1],
@@ -129,15 +129,17 @@ class _Played:
             encoded_depths=tuple(depths) if collection.depth else None,
         )
 
-    def _sampled(self, frames: int) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.bool_]]:
-        """[frames] each: steps of the action under way, its number, and whether it ends there."""
+    def _sample_frames(self, frames: int) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.bool_]]:
+        """Return for each frame the physics step of its action, the action's number, and whether the action ends
+        there.
+        """
         ends = np.cumsum([0, *(len(film) - 1 for film in self._films)])
-        at, shown = end_frames(ends, frames), np.arange(frames)
+        at, shown = choose_end_frames(ends, frames), np.arange(frames)
         steps = np.rint(np.interp(shown, at, ends)).astype(np.int64)
         keys = np.searchsorted(at, shown).astype(np.int32)
         return steps - ends[np.maximum(keys, 1) - 1], keys, np.isin(shown, at[1:])
 
-    def _moments(
+    def _iterate_states(
         self, steps: NDArray[np.int64], keys: NDArray[np.int32], ended: NDArray[np.bool_]
     ) -> Iterator[Workbench]:
         yield self._start
@@ -145,8 +147,8 @@ class _Played:
             yield self._after[key - 1] if end else self._films[key - 1][step]
 
 
-def end_frames(ends: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
-    """int64 [K + 1]: in which of the frames the steps `ends` [K + 1] are shown: in proportion, one apart at least."""
+def choose_end_frames(ends: NDArray[np.int64], frames: int) -> NDArray[np.int64]:
+    """Return int64 [K + 1]: the frames that show the steps `ends` [K + 1], in proportion and at least one apart."""
     last, order = frames - 1, np.arange(len(ends))
     wanted = np.rint(ends / max(1, ends[-1]) * last).astype(np.int64)
     wanted[-1] = last  # also where nothing has moved
