@@ -42,7 +42,7 @@ def log(two_rooms, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempts, "PAUSES", (0.0, 0.0))
         cache = tmp_path_factory.mktemp("cache")
-        agent = wiw.Agent("heuristic", Counted(), revision="matcher", candidates=3)
+        agent = wiw.Agent("heuristic", Counted(), reviser="matcher", candidates=3)
         agents = {"none": wiw.Agent("heuristic"), "asked": agent, "cached": agent}
         task = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
         options = {"progress": False, "live": 2, "cache": cache}
@@ -88,7 +88,7 @@ class Moody(wiw.WorldModel):
 def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypatch, capsys, live) -> None:
     monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
     model, task = Moody(), wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
-    agent = wiw.Agent("heuristic", model, revision="matcher", candidates=3)
+    agent = wiw.Agent("heuristic", model, reviser="matcher", candidates=3)
 
     def run(**options):
         log = wiw.evaluate(task, agent, 3, out=tmp_path / "run", progress=False, live=live, **options)

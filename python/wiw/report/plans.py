@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How plans and what came of them are told: of primitives, seen all around, or of poses, seen by a fixed camera."""
+"""How plans and what came of them are told: of primitives, seen all around, of poses, seen by a fixed camera, or of a
+plan space of the user's own.
+"""
 
 from __future__ import annotations
 
@@ -39,6 +41,14 @@ class Primitives:
         return cuts.strip(jpeg, frames, album.frame_height, album.quality)
 
 
+class Numbers(Primitives):
+    """Plans of a space of the user's own, shown as the numbers that they are."""
+
+    def text(self, plan: Sequence[Any]) -> str:
+        """A plan as numbers."""
+        return numbers(plan)
+
+
 @dataclass(frozen=True)
 class Poses:
     """Plans of poses of a gripper."""
@@ -74,7 +84,7 @@ def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None)
     shut = False
     for row in decisions:
         if not of_poses(row):
-            found.append(Primitives())
+            found.append(Primitives() if of_primitives(row["actions"]) else Numbers())
             continue
         found.append(Poses(stage, (row["before_x"], row["before_y"], row["before_z"]), shut))
         shut = row["executed"][-1][6] < SHUT if row["executed"] else shut
@@ -82,8 +92,19 @@ def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None)
 
 
 def of_poses(row: Mapping[str, Any]) -> bool:
-    """Whether a decision plans poses of a gripper."""
-    return isinstance(row["actions"][0], list)
+    """Whether a decision plans poses of a gripper, vectors of 7 numbers."""
+    first = row["actions"][0]
+    return isinstance(first, list) and len(first) == 7
+
+
+def of_primitives(plan: Sequence[Any]) -> bool:
+    """Whether a plan is made of primitives, whole numbers."""
+    return isinstance(plan[0], int)
+
+
+def numbers(plan: Sequence[Any]) -> str:
+    """Return the actions of a plan as numbers, those of a vector in brackets: "0.5, -0.25" or "(1, 0), (0, 1)"."""
+    return ", ".join(f"({numbers(action)})" if isinstance(action, list) else f"{action:.3g}" for action in plan)
 
 
 def glyphs(actions: Sequence[int]) -> str:
