@@ -8,7 +8,7 @@ from wiw.analysis.power import simulated_power
 from wiw.analysis.statistics import estimate_difference, holm, mcnemar
 from wiw.cli import main
 from wiw.errors import ArgumentError
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 
 
 def test_mcnemars_power_is_the_exact_sum():

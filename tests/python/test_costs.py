@@ -94,7 +94,7 @@ def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypa
         (line,) = log.costs()
         assert line["spent_calls"] + line["lost_calls"] == pytest.approx(len(model._asked))
         assert line["spent_rows"] + line["lost_rows"] == pytest.approx(sum(model._asked))
-        return line, [row["episode"] for row in log.episodes if row["status"] == "failed"]
+        return line, [row["episode"] for row in log.episodes if row["status"] == "error"]
 
     line, failed = run()
     assert len(failed) == (live == 1)  # more at a time: each is run again by itself

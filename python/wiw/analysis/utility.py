@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an arm stands between the floor and the ceiling of its run: U = (SR - floor) / (ceiling - floor)."""
+"""Utility of a world model between the floor and the ceiling of its run: U = (SR - floor) / (ceiling - floor)."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
 
 @dataclass(frozen=True)
 class Utility:
-    """The share of what a perfect world model would bring over a motionless one that an arm brings."""
+    """An arm's share of the gain that a perfect world model brings over a static one."""
 
     arm: str
     value: float
-    """0: as the floor; 1: as the ceiling; nan where the run cannot tell floor and ceiling apart."""
+    """0: as the floor; 1: as the ceiling; nan where the interval for ceiling - floor includes 0."""
     low: float
     high: float
     n: int
-    """Episodes that arm, floor and ceiling have all finished."""
+    """Episodes scored in arm, floor and ceiling."""
     scenes: int
     reference: bool
-    """Whether the arm stands beside the world models for comparison, rather than being one under test."""
+    """Whether the arm is a reference rather than a world model under test."""
 
     @property
-    def identifiable(self) -> bool:
-        """Whether ceiling - floor is surely not 0 on these episodes: its paired 95 % interval lies above."""
+    def is_defined(self) -> bool:
+        """Whether the paired 95 % interval for ceiling - floor lies above 0."""
         return not math.isnan(self.value)
 
 
 def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], reference: bool = False) -> Utility | None:
-    """An arm's utility, on the episodes that it, the floor and the ceiling have finished; None if there are none.
+    """Return an arm's utility on the episodes scored in it, the floor and the ceiling; None if there are none.
 
     Args:
         arm: its name.
-        done: by arm, finished episodes by index with "scene" and "metrics".
+        done: by arm, scored episodes by index with "scene" and "metrics".
         reference: see `Utility`.
     """
     names = (arm, FLOOR, CEILING)
@@ -61,10 +61,10 @@ def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], refer
 
 
 def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: float = 0.95) -> tuple[float, Interval]:
-    """mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is not identifiable.
+    """Return mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is undefined.
 
     It holds every u for which the mean of gains - u spans is within t standard errors of 0, so it is as good as the t
-    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is identifiable where
+    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is defined where
     that interval of mean(spans) lies above 0.
 
     Args:

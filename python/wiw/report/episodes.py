@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows of the episodes that keep pictures."""
+"""Episodes with pictures, read from the run store for a page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image
 
-from wiw.analysis.blame import blame
+from wiw.analysis.blame import read_blame
 from wiw.report.maps import (
     MapFrame,
     Trail,
@@ -21,7 +21,7 @@ from wiw.report.maps import (
     start_and_goal,
     trail,
 )
-from wiw.report.plans import of_poses, ways_of_telling
+from wiw.report.plans import of_poses, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Step, Story
@@ -34,13 +34,13 @@ def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str
     outcomes = outcomes_by_episode(store, arms)
     episodes, pictures = store.episodes(), dict[str, str]()
     kept = [index for index in store.info["pictures"] if outcomes.get(index)]
-    return [tell(store, index, episodes[index], outcomes[index], pictures, Album()) for index in kept], pictures
+    return [read_story(store, index, episodes[index], outcomes[index], pictures, Album()) for index in kept], pictures
 
 
 def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
-    """How each episode ended, by arm in the order of `arms`; episodes that no arm has ended are left out."""
-    blamed = blame(store)
-    verdicts = blamed.verdicts() if blamed is not None else {}
+    """Return the outcomes by episode, then by arm in the order of `arms`; episodes that no arm has ended are left out."""
+    found_blame = read_blame(store)
+    verdicts = found_blame.verdicts() if found_blame is not None else {}
     by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
     by_arm |= {key: {**by_arm[key], "blame": verdict} for key, verdict in verdicts.items()}
     found: dict[int, dict[str, Mapping[str, Any]]] = {}
@@ -49,7 +49,7 @@ def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[
     return found
 
 
-def tell(
+def read_story(
     store: RunStore,
     index: int,
     episode: Episode,
@@ -57,7 +57,7 @@ def tell(
     pictures: dict[str, str],
     album: Album,
 ) -> Story:
-    """One episode; its scene's map joins `pictures`."""
+    """Return one episode; add its scene's map to `pictures`."""
     decisions = {arm: store.decisions(arm, index) for arm in outcomes}
     rows = [row for own in decisions.values() for row in own]
     poses = any(of_poses(row) for row in rows)
@@ -76,7 +76,7 @@ def tell(
 def _map(
     store: RunStore, episode: Episode, rows: Sequence[Mapping[str, Any]], pictures: dict[str, str], album: Album
 ) -> tuple[MapFrame, str | None]:
-    """Where an episode is drawn, and the id of what is below."""
+    """Return the frame of an episode's map and the id of its picture."""
     kept = store.scene_map(episode.scene)
     if kept is None:
         return frame_of_points(all_points(episode, rows)), None
@@ -87,7 +87,7 @@ def _map(
 
 
 def wording(store: RunStore) -> Wording:
-    """How the run's task speaks of its episodes."""
+    """Return the run's words for its task's outcomes."""
     return Wording(**store.info.get("wording", {}))
 
 
@@ -100,10 +100,10 @@ def _attempt(
     album: Album,
     name: str,
 ) -> Attempt:
-    """One arm's run of an episode; what a gripper's camera saw joins `shots`."""
+    """Return one arm's run of an episode; add the images of a gripper's camera to `shots`."""
     arm, index = outcome["arm"], outcome["episode"]
     stage, steps, end = stage_of(store.info), list[Step](), ""
-    for row, way in zip(decisions, ways_of_telling(decisions, stage), strict=True):
+    for row, way in zip(decisions, plan_views(decisions, stage), strict=True):
         number, images = row["decision"], store.images(arm, index, row["decision"])
         made = step(row, images, way, album, f"{name}-{number}")
         if made.shot and made.seen:

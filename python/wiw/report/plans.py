@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How plans and what came of them are told: of primitives, seen all around, or of poses, seen by a fixed camera."""
+"""How pages show plans and their outcomes: primitives on panoramas, or poses on a fixed camera's images."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ class Poses:
         return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole)
 
 
-def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
-    """For each decision of an episode how it is told."""
+def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
+    """Return for each decision of an episode how it is shown."""
     found: list[Primitives | Poses] = []
     shut = False
     for row in decisions:

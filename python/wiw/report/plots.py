@@ -113,7 +113,7 @@ def blame_by_arm(found: Blame) -> Markup:
     axes.set_yticks(range(len(lines)), [line.arm for line in lines])
     axes.set_ylim(-0.6, len(lines) - 0.4)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("failed episodes")
+    axes.set_xlabel("failures, episodes")
     axes.grid(visible=False, axis="y")
     _legend(axes)
     return _svg(figure, "blame-by-arm")

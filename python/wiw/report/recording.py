@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wiw.report.plans import Poses, Primitives, ways_of_telling
+from wiw.report.plans import Poses, Primitives, plan_views
 from wiw.report.plots import arm_colors
 from wiw.report.stage import stage_of
 from wiw.runs.run import Run
@@ -35,7 +35,7 @@ def record(run: Run, file: Path) -> None:
         ended = f"{outcome['status']} {outcome['metrics']} {outcome['error']}".strip()
         stream.log(f"{place}/outcome", rr.TextDocument(ended), static=True)
         rows = run.store.decisions(arm, index)
-        for row, way in zip(rows, ways_of_telling(rows, stage), strict=True):
+        for row, way in zip(rows, plan_views(rows, stage), strict=True):
             stream.set_time("decision", sequence=row["decision"])
             _decision(rr, stream, place, row, way, colors[arm])
             for name, jpeg in run.store.images(arm, index, row["decision"]).items():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pages tell of episodes, as values that templates fill in."""
+"""Episodes as values that the page templates show."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wiw.types import Episode, Wording
 
 
 class Album:
-    """Where the pictures of a page go: into the page itself, as data URIs."""
+    """Destination of a page's pictures: the page itself, as data URIs."""
 
     panorama_width, frame_height, quality = 760, 104, 68
     front_side, end_side = 300, 150
@@ -36,7 +36,7 @@ class Album:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One plan and what was imagined of it."""
+    """One candidate plan and its imagined future."""
 
     actions: str
     score: float | None
@@ -45,9 +45,9 @@ class Candidate:
     chosen: bool
     note: str
     strip: str | None
-    """What was imagined; as `Album.put` says."""
+    """Imagined future; as `Album.put` returns it."""
     true: str | None
-    """What would really have been seen."""
+    """True future."""
     truth: str
     """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
     truly_best: bool
@@ -68,7 +68,7 @@ class Step:
     number: int
     executed: str
     seen: str | None
-    """What the agent saw; as `Album.put` says."""
+    """Observation; as `Album.put` returns it."""
     candidates: tuple[Candidate, ...]
     rewritten: str
     """The plan, where it is none of the candidates."""
@@ -111,25 +111,25 @@ class Attempt:
     """Id of what was seen at the end among the story's shots; empty where it was not kept."""
 
     @property
-    def reached(self) -> bool:
+    def success(self) -> bool:
         """Whether the episode was a success."""
         return bool(self.outcome["metrics"].get("success"))
 
     @property
     def text(self) -> str:
-        """How it ended, in words."""
-        if self.outcome["status"] == "failed":
-            return "failed for infrastructure"
+        """Outcome in words."""
+        if self.outcome["status"] == "error":
+            return "infrastructure error, excluded from scores"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
-        if self.reached:
+        if self.success:
             return f"{self.words.won} in {count}"
         due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
         if self.choices:
-            label = taken_for(metrics, self.choices)
-            return (f"taken for {label} in {count}" if label else f"not answered in {count}") + due
-        left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
-        return f"{self.words.lost} in {count}{left}{due}"
+            label = final_answer(metrics, self.choices)
+            return (f"answered {label} after {count}" if label else f"no answer after {count}") + due
+        left = f", {metrics['distance_to_goal']:.1f} m from the goal" if "distance_to_goal" in metrics else ""
+        return f"{self.words.lost} after {count}{left}{due}"
 
 
 @dataclass(frozen=True)
@@ -158,13 +158,13 @@ class Story:
         return where(self.episode)
 
     @property
-    def told(self) -> str:
-        """What was asked for in words, where the task does so."""
+    def instruction(self) -> str:
+        """Instruction in words, where the task gives one."""
         return str(self.episode.info.get("instruction", ""))
 
     @property
     def way(self) -> str:
-        """E.g. " · 4.2 m to the goal"; nothing where no arm could measure it."""
+        """E.g. " · 4.2 m to the goal"; empty where no arm could measure it."""
         length = self.episode.geodesic
         return f" · {length:.1f} m {self.words.way}" if np.isfinite(length) else ""
 
@@ -174,8 +174,8 @@ class Story:
         return str(self.episode.info.get("category", ""))
 
 
-def taken_for(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
-    """The final answer, where the task asks for any; empty where none was given."""
+def final_answer(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
+    """Return the final answer, where the task asks for one; empty where none was given."""
     predicted = int(metrics.get("predicted", -1))
     return choices[predicted] if 0 <= predicted < len(choices) else ""
 

@@ -23,12 +23,12 @@ from wiw.analysis.summary import (
     show_estimate,
     show_p,
     show_utility,
-    shown_headlines,
+    list_columns,
 )
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html
 
-COUNTS = (("n", "judged", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
+COUNTS = (("n", "judged", ""), ("errors", "errors", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
 
 
@@ -88,16 +88,16 @@ def _table(title: str) -> Table:
 
 
 def _arms(summary: Summary) -> Table:
-    which = "on the same episodes" if summary.same_episodes else "each on the episodes that it has finished"
+    which = "on the same episodes" if summary.same_episodes else "each on the episodes scored in it"
     table = _table(f"Arms, {which}")
     counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in summary.arms)]
     _add_arm_column(table, [line.name for line in summary.arms])
-    for headline in shown_headlines(summary):
-        table.add_column(column_title(headline), justify="right")
+    for metric in list_columns(summary):
+        table.add_column(column_title(metric), justify="right")
     for name, _, style in counts:
         table.add_column(name, justify="right", style=style)
     for line in summary.arms:
-        cells = [_cell(line, headline.metric) for headline in shown_headlines(summary)]
+        cells = [_cell(line, metric.name) for metric in list_columns(summary)]
         table.add_row(line.name, *cells, *(str(getattr(line, attribute)) for _, attribute, _ in counts))
     return table
 
@@ -118,7 +118,7 @@ def _utilities(summary: Summary) -> Table:
         table.add_column(title, justify="right")
     table.add_column("")
     for found in summary.utilities:
-        style = "" if found.identifiable and not found.reference else "dim"
+        style = "" if found.is_defined and not found.reference else "dim"
         shown = Text(show_utility(found), style=style)
         table.add_row(found.arm, shown, str(found.n), Text("reference" if found.reference else "", style="dim"))
     return table
@@ -142,12 +142,12 @@ def _differences(summary: Summary, group: Group, gap: str) -> Table:
     """`gap` stands between an estimate and its interval."""
     table = _table(group.title)
     _add_arm_column(table, list(group.rows))
-    for headline in shown_headlines(summary):
-        table.add_column(column_title(headline), justify="right")
+    for metric in list_columns(summary):
+        table.add_column(column_title(metric), justify="right")
     for title in ("W/L", "p"):
         table.add_column(title, justify="right", min_width=5)
     for label, row in group.rows.items():
-        found = [row[headline.metric] for headline in shown_headlines(summary)]
+        found = [row[metric.name] for metric in list_columns(summary)]
         score = f"{found[0].wins}/{found[0].losses}"
         table.add_row(label, *(_signed(d.estimate, gap) for d in found), score, show_p(found[0].p_adjusted))
     return table

@@ -39,11 +39,11 @@ def require_of(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
     return dict(task.require(episodes)) if hasattr(task, "require") else {}
 
 
-def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
+def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: bool = False) -> None:
     """The same for the episodes that a run has left."""
     episodes = store.episodes()
     try:
-        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_failed)])
+        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_errors)])
     except Error:
         store.close()
         raise
@@ -166,6 +166,6 @@ class _Desk:
         errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
-                f"the first {SAME_ERRORS} episodes of arm '{arm}' all failed alike, so the run was stopped: "
-                f"{errors[0]}. Mend the cause, then `wiw resume --retry-failed`; the tracebacks are in the run store"
+                f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was stopped: "
+                f"{errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the tracebacks are in the run store"
             )

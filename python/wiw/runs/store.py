@@ -20,11 +20,12 @@ from typing import Any
 
 import wiw
 from wiw.errors import ArgumentError, StoreError
-from wiw.runs.faults import explained, remedy
+from wiw.runs.faults import explain_faults, find_remedy
+from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.types import Episode
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 DECISION_JSON = (
     "actions",
     "executed",
@@ -167,13 +168,14 @@ class RunStore:
         with store._closed_on_error():
             store._require_whole()
             store._require_readable()
+            store._update_schema()
         return store
 
     def _require_whole(self) -> None:
         """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
         if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
-            raise StoreError(f"{self.path}: the file is cut short; {remedy(self.path, 'malformed')}")
+            raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
         application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
@@ -182,11 +184,25 @@ class RunStore:
                 f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
                 f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
             )
-        if version != SCHEMA_VERSION:
+        if not OLDEST_READABLE <= version <= SCHEMA_VERSION:
             raise StoreError(
                 f"{self.path} was written by wiw {self.wiw_version} with schema version {version}; this is wiw "
-                f"{wiw.__version__}, which reads version {SCHEMA_VERSION}: use the one that wrote it, or run anew"
+                f"{wiw.__version__}, which reads versions {OLDEST_READABLE} to {SCHEMA_VERSION}: use the one that "
+                "wrote it, or start a new run"
             )
+
+    def _update_schema(self) -> None:
+        """Bring an older store to the current schema: in the file if it may be written, else for this reader alone."""
+        version = self._rows("PRAGMA user_version")[0]["user_version"]
+        if version == SCHEMA_VERSION:
+            return
+        if self._lock is None:
+            with explain_faults(self.path):
+                show_as_current(self._connection, version)
+            return
+        with self._writing() as connection:
+            migrate(connection, version)
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     # -- what the run is -------------------------------------------------------------------------------------------
 
@@ -277,9 +293,9 @@ class RunStore:
             return row["webp"], json.loads(row["world_to_pixel"])
         return None
 
-    def pending(self, arm: str, retry_failed: bool = False) -> list[int]:
+    def pending(self, arm: str, retry_errors: bool = False) -> list[int]:
         """Indices of the episodes still to be run in an arm."""
-        status = "AND status = 'done'" if retry_failed else ""
+        status = "AND status = 'done'" if retry_errors else ""
         rows = self._rows(
             f"SELECT episode FROM episode WHERE episode NOT IN "
             f"(SELECT episode FROM outcome WHERE arm = ? {status}) ORDER BY episode",
@@ -395,12 +411,12 @@ class RunStore:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        with explained(self.path), self._connection as connection:
+        with explain_faults(self.path), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[dict[str, Any]]:
-        with explained(self.path):
+        with explain_faults(self.path):
             return [dict(row) for row in self._connection.execute(query, values)]
 
     def _value(self, column: str) -> Any:
@@ -413,7 +429,7 @@ class RunStore:
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
     """A connection; one that may write is for whoever holds the lock, which is given up if there can be none."""
     try:
-        with explained(path):
+        with explain_faults(path):
             return _opened(path, writing=lock is not None)
     except StoreError:
         if lock is not None:
@@ -453,7 +469,7 @@ def _has_log(path: Path) -> bool:
 
 def _blank(path: Path) -> bool:
     """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
-    with explained(path):
+    with explain_faults(path):
         connection = _opened(path, writing=True)  # also where it was cut off with a log that only a writer takes in
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
         connection.close()

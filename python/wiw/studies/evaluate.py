@@ -115,7 +115,7 @@ def run_arms(
 
 
 def resume_run(
-    run: str | Path, workers: int | None = None, progress: bool = True, retry_failed: bool = False
+    run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False
 ) -> RunLog:
     """Goes on with a run of named parts: only episodes that have not ended are run.
 
@@ -123,7 +123,7 @@ def resume_run(
         run: the run's folder.
         workers: processes; None means as many as it was begun with.
         progress: whether to show bars.
-        retry_failed: whether to run episodes again whose infrastructure failed.
+        retry_errors: whether to rerun episodes that ended with an infrastructure error.
 
     Raises:
         ArgumentError: fewer than one worker.
@@ -144,8 +144,8 @@ def resume_run(
     except Error:
         store.close()
         raise
-    require_left(built, store, agents, retry_failed)
-    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_failed=retry_failed)
+    require_left(built, store, agents, retry_errors)
+    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
 
 
 USUAL = 20
@@ -273,9 +273,9 @@ def _finish(
     workers: int,
     progress: bool,
     *,
-    retry_failed: bool = False,
+    retry_errors: bool = False,
 ) -> RunLog:
     """Runs what is missing, closes the store and opens it for reading."""
-    pending = {arm: store.pending(arm, retry_failed) for arm in agents}
+    pending = {arm: store.pending(arm, retry_errors) for arm in agents}
     run_pending(store, task, agents, pending, workers, progress)
     return RunLog(RunStore.read(store.path))
