@@ -87,7 +87,7 @@ def test_utility_is_undefined_where_the_interval_of_ceiling_minus_floor_includes
         one = found.utility("mine")
         assert not one.is_defined and all(map(math.isnan, (one.value, one.low, one.high)))
         assert any(
-            "Utility undefined: the interval for oracle - copy includes 0." == note for note in notes(found)
+            note == "Utility undefined: the interval for oracle - copy includes 0." for note in notes(found)
         ) and "<small>undefined</small>" in summary_html(found)
     assert summary().difference("oracle", "copy").estimate.low > 0 and summary().utility("mine").is_defined
 

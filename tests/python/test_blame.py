@@ -139,7 +139,7 @@ def test_a_stopped_attribution_goes_on_where_it_was(blamed: Any, run: Path, monk
 def test_some_episodes_then_more_and_nothing_twice(run: Path, blamed: Any) -> None:
     found = wiw.blame(run, "spinner", episodes=1, progress=False)
     some, before = found["spinner"], again(run)
-    assert (len(some.episodes), some.open) == (1, EPISODES - 1)
+    assert (len(some.episodes), some.remaining) == (1, EPISODES - 1)
     assert f"{EPISODES - 1} of {EPISODES} failures have not been rerun" in found.notes()[0]
     whole = wiw.blame(run, "spinner", progress=False)["spinner"]
     assert {one.episode for one in some.episodes} < {one.episode for one in whole.episodes}
@@ -166,10 +166,10 @@ def test_infrastructure_is_not_blamed_but_named(
     assert "--retry-errors" in shown.err
     (line,) = wiw.load_run(run).blame()
     assert line["errors"] == [1] and line["examined"] == 0 and set(line["rerun_errors"]) == {0, 2}
-    assert "no server" in line["broken"][0]
+    assert "no server" in line["rerun_errors"][0]
     broken.unlink()
     found = wiw.blame(run, progress=False, retry_errors=True)["Frail"]
-    assert not found.broken and len(found.episodes) == 2
+    assert not found.rerun_errors and len(found.episodes) == 2
 
 
 @pytest.mark.parametrize(
@@ -197,10 +197,10 @@ def test_what_is_shown_and_kept(blamed: Any, capsys: Any, tmp_path: Path) -> Non
     lines = {line["arm"]: line for line in log.blame()}
     assert lines["noise"]["mended_all"] == 100 and lines["noise"]["blame_scoring"] == blamed["noise"].failures
     page = log.report(tmp_path / "report.html").read_text()
-    assert 'id="blame"' in page and "by the stage that has to be told the truth" in page
+    assert 'id="blame"' in page and "Failures by the stage whose ground truth" in page
     view = log.view(tmp_path / "view")
-    told = "".join(path.read_text() for path in (view.parent / "episodes").glob("*.html"))
-    assert len(re.findall("to blame: scoring", told)) >= blamed["noise"].failures
+    pages = "".join(path.read_text() for path in (view.parent / "episodes").glob("*.html"))
+    assert len(re.findall("to blame: scoring", pages)) >= blamed["noise"].failures
 
 
 def test_a_run_without_it_shows_nothing_of_it(run: Path, tmp_path: Path) -> None:
@@ -243,7 +243,7 @@ def test_a_task_must_say_what_progress_is(tmp_path: Path) -> None:
     fake = f"{Path(__file__).with_name('fakes.py')}:line_task"
     task = TaskRecipe(fake, {})
     evaluate(task, AgentRecipe("heuristic", horizon=1), 6, out=tmp_path / "run", progress=False).close()
-    with pytest.raises(ArgumentError, match="does not say what a plan is truly worth"):
+    with pytest.raises(ArgumentError, match="does not define the true value of a plan"):
         wiw.blame(tmp_path / "run")
 
 

@@ -40,7 +40,7 @@ class EvilTask(LineTask):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Nine episodes of three arms, two with an error in each; all keep pictures, and one decision knows what was true."""
+    """Nine episodes of three arms, two of them errors; all have pictures, one decision has its true future."""
     arms = dict(zip(ARMS, (LineAgent(0.4), LineAgent(0.9), LineAgent(0.6)), strict=True))
     out = tmp_path_factory.mktemp("view") / "run"
     log = run_arms(EvilTask(broken=("0004", "0007")), arms, 9, out=out, progress=False, keep_images="all")
@@ -116,12 +116,12 @@ def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):
 def test_a_picture_that_cannot_be_made_is_told(tmp_path):
     with ThreadPoolExecutor(2) as pool:
         album = Beside(tmp_path / "images", pool)
-        assert [album.draw(name, lambda name=name: name.encode()) for name in "ab"] == [
-            "../images/a.jpg",
-            "../images/b.jpg",
+        assert [album.draw(name, lambda name=name: name.encode()).source for name in "ab"] == [
+            "../images/a.webp",
+            "../images/b.webp",
         ]
         album.finish()
-        assert (tmp_path / "images/b.jpg").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
+        assert (tmp_path / "images/b.webp").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
         album.draw("c", lambda: decode_jpeg(b"no picture"))
         with pytest.raises(StoreError, match="no JPEG"):
             album.finish()

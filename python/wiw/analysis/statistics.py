@@ -63,7 +63,7 @@ def estimate_mean(values: ArrayLike, scenes: Sequence[str], metric: Metric, *, s
 def estimate_difference(
     arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0
 ) -> Estimate:
-    """Return the mean paired difference, arm minus base, with a 95 % interval over scenes; `seed` is the bootstrap's."""
+    """Return the mean paired difference, arm minus base, with a 95 % interval over scenes."""
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
     return _estimate(data, scenes, metric, "difference" if metric.kind == "rate" else "length", seed)
 
@@ -76,7 +76,7 @@ def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """Return p values adjusted for multiple tests (Holm 1979): the smallest times their number, the next times one less.
+    """Return Holm-adjusted p values (1979): the smallest times their number, the next times one less, and so on.
 
     Rejecting where the adjusted value is at most 0.05 keeps the chance of any false rejection at 5 %.
     """

@@ -20,8 +20,8 @@ from wiw.runs.run import Records, Run
 
 ROLES = {
     "none": "policy without a world model",
-    "copy": "floor: predicts that nothing changes",
-    "oracle": "ceiling: the true future",
+    "copy": "floor, predicts that nothing changes",
+    "oracle": "ceiling, the true future",
 }
 """Roles of the reference arms; any other arm is a world model under test, or a policy without one."""
 PLACEBOS = {
@@ -319,7 +319,7 @@ def notes(summary: Summary) -> list[str]:
 
 
 def _describe_missing(line: ArmSummary) -> str:
-    """Return the range of the rate over all episodes: with every missing one a failure, and with every one a success."""
+    """Return the range of the rate over all episodes: every missing one a failure, or every one a success."""
     text = f"{line.name}: {line.done} of {line.asked} episodes are scored"
     if line.errors:
         count = "1 infrastructure error is" if line.errors == 1 else f"{line.errors} infrastructure errors are"

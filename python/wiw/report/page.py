@@ -15,10 +15,10 @@ from wiw.analysis.blame import RERUNS, VERDICTS, Blame, read_blame
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, fidelity, shown_columns
 from wiw.analysis.statistics import Difference
-from wiw.analysis.summary import Summary, notes, list_columns, summarise_run
+from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
 from wiw.files import whole_file
 from wiw.report import plots
-from wiw.report.episodes import stories, wording
+from wiw.report.episodes import read_stories, wording
 from wiw.report.story import Album
 from wiw.report.templating import environment, signed
 from wiw.runs.run import Run
@@ -40,7 +40,8 @@ def write_report(run: Run, path: Path) -> Path:
 def render(run: Run) -> str:
     """Return a run's report as self-contained HTML. All text from the run is escaped."""
     summary, config, info = summarise_run(run), run.store.config, run.store.info
-    shown, pictures = stories(run.store, run.arms)
+    album = Album()
+    shown, maps = read_stories(run.store, run.arms, album)
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
     measured, paid = shown_columns(truths), cost_columns(ledger)
     return (
@@ -57,7 +58,8 @@ def render(run: Run) -> str:
             sentence=sentence(summary, wording(run.store)),
             plots=_plots(run, summary, truths, blamed),
             stories=shown,
-            pictures=pictures,
+            maps=maps,
+            pictures=album.pictures,
             costs=[(line, line.cells()[: len(paid)]) for line in ledger],
             cost_columns=paid,
             fidelity=[(line, line.cells(measured)) for line in truths],

@@ -17,19 +17,20 @@ from wiw._core import core
 from wiw.files import whole_folder
 from wiw.report.episodes import outcomes_by_episode, read_story, wording
 from wiw.report.plots import arm_colors
-from wiw.report.story import Album, Story, final_answer, place, where
+from wiw.report.story import Album, Picture, Story, final_answer, place, where
 from wiw.report.templating import environment
 from wiw.runs.run import Run
 from wiw.types import Episode, Wording
 
 
 class Beside(Album):
-    """Pictures as files of a folder, each written once; those that are to be made are made by a pool's threads."""
+    """Pictures as files in a folder, each written once, made by the threads of a pool."""
 
-    panorama_width, frame_height, quality = 1024, 132, 76
-    front_side, end_side, whole = 480, 160, True
+    panorama_width, frame_height, quality = 1024, 132, 60
+    front_side, end_side, goal_side, map_side, whole = 480, 160, 480, 1100, True
 
     def __init__(self, folder: Path, pool: Executor) -> None:
+        super().__init__()
         self._folder, self._pool = folder, pool
         self._folder.mkdir()
         self._sizes: dict[str, int] = {}
@@ -46,27 +47,23 @@ class Beside(Album):
         return sum(self._sizes.values())
 
     def put(self, name: str, kind: str, data: bytes) -> str:
-        """The picture's address, seen from an episode's page. Names are numbers and our own words, never the run's."""
-        file = self._folder / _file(name, kind)
+        """Return the picture's address, relative to an episode's page. No text of the run is part of a name."""
+        file = self._folder / f"{name}.{kind}"
         if file.name not in self._sizes:
             file.write_bytes(data)
             self._sizes[file.name] = len(data)
         return f"../{self._folder.name}/{file.name}"
 
-    def draw(self, name: str, make: Callable[[], bytes]) -> str:
-        """The address of a picture that will be there after `finish`."""
-        self._making.append(self._pool.submit(lambda: self.put(name, "jpeg", make())))
-        return f"../{self._folder.name}/{_file(name, 'jpeg')}"
+    def draw(self, name: str, make: Callable[[], bytes]) -> Picture:
+        """Return a picture whose file is there after `finish`."""
+        self._making.append(self._pool.submit(lambda: self.put(name, "webp", make())))
+        return Picture(f"../{self._folder.name}/{name}.webp")
 
     def finish(self) -> None:
         """Wait for the pictures that are being made; raise the error of one that could not be made."""
         making, self._making = self._making, []
         for picture in making:
             picture.result()
-
-
-def _file(name: str, kind: str) -> str:
-    return f"{name}.{'jpg' if kind == 'jpeg' else kind}"
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ def write_view(run: Run, folder: Path) -> Site:
         (draft / "index.html").write_text(_index(run, lines, common), encoding="utf-8")
         listed = [line for line in lines if line.has_page]
         for number, line in enumerate(listed):
-            scenes: dict[str, str] = {}
+            scenes: dict[str, Picture] = {}
             story = read_story(run.store, line.index, line.episode, outcomes[line.index], scenes, album)
             common |= {"before": listed[number - 1] if number else None}
             common |= {"after": listed[number + 1] if number + 1 < len(listed) else None}
@@ -165,9 +162,9 @@ def _index(run: Run, lines: list[Line], common: Mapping[str, Any]) -> str:
     return template.render(**common, lines=lines, groups=list(dict.fromkeys(line.group for line in lines)))
 
 
-def _episode(story: Story, scenes: Mapping[str, str], values: Mapping[str, Any]) -> str:
+def _episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any]) -> str:
     template = environment().get_template("episode_page.html.j2")
-    return template.render(**values, story=story, pictures=scenes)
+    return template.render(**values, story=story, maps=maps)
 
 
 def _common(run: Run) -> dict[str, Any]:

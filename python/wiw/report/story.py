@@ -4,34 +4,71 @@
 from __future__ import annotations
 
 import base64
+import hashlib
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from wiw.report import cuts
 from wiw.report.maps import MapFrame, Mark, Trail
 from wiw.report.stage import Drawing
 from wiw.types import Episode, Wording
 
 
-class Album:
-    """Destination of a page's pictures: the page itself, as data URIs."""
+@dataclass(frozen=True)
+class Picture:
+    """A picture on a page."""
 
-    panorama_width, frame_height, quality = 760, 104, 68
-    front_side, end_side = 300, 150
+    source: str
+    """Address or data URI."""
+    id: str = ""
+    """Id among the pictures that the page defines once; empty where `source` is the address of a file."""
+    width: int = 0
+    height: int = 0
+    """Pixels; 0 where the browser reads them from the file."""
+
+
+class Album:
+    """Pictures inside a page, as data URIs; equal pictures, such as those of two arms, are stored once."""
+
+    panorama_width, frame_height, quality = 520, 64, 30
+    front_side, end_side = 256, 128
     """Pixels of the front views of a gripper: of real ones, and of imagined ones."""
+    goal_side, map_side = 280, 700
     whole = False
-    """Whether imagined ways of a gripper are shown frame by frame, or their ends alone."""
+    """Whether imagined futures of a gripper are shown frame by frame, or only their last frames."""
+
+    def __init__(self) -> None:
+        self._pictures: dict[bytes, Picture] = {}
+
+    @property
+    def pictures(self) -> list[Picture]:
+        """All pictures that the page has to define."""
+        return list(self._pictures.values())
 
     def put(self, name: str, kind: str, data: bytes) -> str:
-        """What an `src` attribute says of a picture; `name` tells it from the others of the run."""
+        """Return the `src` attribute of a picture; `name` is unique within the run."""
         return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
-    def draw(self, name: str, make: Callable[[], bytes]) -> str:
-        """The same for a JPEG that is still to be made."""
-        return self.put(name, "jpeg", make())
+    def put_map(self, name: str, webp: bytes) -> Picture:
+        """Return the picture of a scene's map, whose coordinates are pixels of `webp` whatever its file's size."""
+        width, height = Image.open(io.BytesIO(webp)).size
+        small = cuts.shrink_map(webp, self.map_side)
+        return Picture(self.put(name, "webp", small), name, width, height)
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> Picture:
+        """Return a picture of which `make` returns the WebP bytes; `name` is unique within the run."""
+        data = make()
+        key = hashlib.sha256(data).digest()
+        if key not in self._pictures:
+            width, height = Image.open(io.BytesIO(data)).size
+            self._pictures[key] = Picture(self.put(name, "webp", data), f"p{len(self._pictures)}", width, height)
+        return self._pictures[key]
 
 
 @dataclass(frozen=True)
@@ -44,9 +81,9 @@ class Candidate:
     """0 (worst of the decision) to 1 (best), for a bar."""
     chosen: bool
     note: str
-    strip: str | None
-    """Imagined future; as `Album.put` returns it."""
-    true: str | None
+    strip: Picture | None
+    """Imagined future."""
+    true: Picture | None
     """True future."""
     truth: str
     """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
@@ -67,8 +104,8 @@ class Step:
 
     number: int
     executed: str
-    seen: str | None
-    """Observation; as `Album.put` returns it."""
+    seen: Picture | None
+    """Observation."""
     candidates: tuple[Candidate, ...]
     rewritten: str
     """The plan, where it is none of the candidates."""
@@ -106,7 +143,7 @@ class Attempt:
     choices: Sequence[str] = ()
     """What answers are chosen from, where the task asks for any."""
     film: str | None = None
-    """The episode in motion; as `Album.put` says."""
+    """Film of the episode; as `Album.put` returns it."""
     end: str = ""
     """Id of what was seen at the end among the story's shots; empty where it was not kept."""
 
@@ -138,7 +175,7 @@ class Story:
 
     index: int
     episode: Episode
-    goal: str | None
+    goal: Picture | None
     picture: str | None
     """Id of the scene's map among the page's shared pictures."""
     frame: MapFrame | None
@@ -149,8 +186,8 @@ class Story:
     words: Wording
     poses: bool = False
     """Whether plans are of poses of a gripper."""
-    shots: Mapping[str, str] = field(default_factory=dict)
-    """What a gripper's camera saw, by id; as `Album.put` says."""
+    shots: Mapping[str, Picture] = field(default_factory=dict)
+    """Images of a gripper's camera, by id."""
 
     @property
     def place(self) -> str:

@@ -19,11 +19,11 @@ from wiw.analysis.summary import (
     Group,
     Summary,
     column_title,
+    list_columns,
     notes,
     show_estimate,
     show_p,
     show_utility,
-    list_columns,
 )
 from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html

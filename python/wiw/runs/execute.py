@@ -166,6 +166,7 @@ class _Desk:
         errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
-                f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was stopped: "
-                f"{errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the tracebacks are in the run store"
+                f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was "
+                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the run "
+                "store has the tracebacks"
             )

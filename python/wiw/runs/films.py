@@ -18,7 +18,7 @@ from PIL import Image
 from wiw.runs.store import RunStore
 from wiw.tabletop.workbench import Workbench
 
-SIDE = (320, 320)
+SIDE = (256, 256)
 """Pixels."""
 SPEED = 2.0
 """Of what is shown, against what happened."""
