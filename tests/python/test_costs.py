@@ -130,7 +130,7 @@ def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:
 def test_table_and_report_show_the_ledger(log, capsys) -> None:
     assert main(["report", str(log.path)]) == 0
     shown = capsys.readouterr().out
-    assert "Costs, an episode" in shown and "rollouts / success" in shown and "100 %" in shown
+    assert "Costs per episode" in shown and "rollouts / success" in shown and "100 %" in shown
     assert "lost calls" not in shown
     page = (log.path / "report.html").read_text()
     assert '<section id="costs">' in page and "rollouts / success" in page

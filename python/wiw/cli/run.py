@@ -107,8 +107,9 @@ def run(
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.
         live: Episodes kept live at a time in a process, so that model calls are batched.
-        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, of manipulation one of each kind at
-            least; all: every one, at 0.2 MB a decision.
+        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, with one in which a model succeeds and
+            the floor fails if there is any (so up to 12 keep them until the run ends); of manipulation at least one of
+            each kind; all: every one, at 0.2 MB per decision.
         deadline: Most seconds for a call of the world model, 300 if not given. A call is retried twice; after that the
             episode is an infrastructure error, excluded from scores.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
@@ -182,7 +183,10 @@ def resume(
 
 def finish(log: Any, report: bool) -> int:
     """Print tables and errors, write the report; return 1 if the run is invalid."""
+    from wiw.report.tables import print_fidelity
+
     numbers = log.summary()
+    print_fidelity(log)
     errors = [episode for episode in log.episodes if episode["status"] == "error"]
     if errors:
         count = "1 infrastructure error" if len(errors) == 1 else f"{len(errors)} infrastructure errors"

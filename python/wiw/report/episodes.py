@@ -23,15 +23,16 @@ from wiw.report.plans import of_poses, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Picture, Step, Story
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.types import Episode, Wording
 
 
 def read_stories(store: RunStore, arms: Sequence[str], album: Album) -> tuple[list[Story], dict[str, Picture]]:
-    """Return the episodes that have pictures and have ended, and the scene maps by id."""
+    """Return the ended episodes among those chosen for pictures, and the scene maps by id."""
     outcomes = outcomes_by_episode(store, arms)
     episodes, maps = store.episodes(), dict[str, Picture]()
-    kept = [index for index in store.info["pictures"] if outcomes.get(index)]
+    kept = [index for index in pictured_episodes(store) if outcomes.get(index)]
     return [read_story(store, index, episodes[index], outcomes[index], maps, album) for index in kept], maps
 
 

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from wiw.errors import Error, InfrastructureError, StoreError
 from wiw.runs.films import keep_films
+from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
@@ -61,16 +62,6 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
     store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
 
 
-def with_pictures(episodes: Sequence[Episode], count: int) -> list[int]:
-    """`count` indices spread evenly over the episodes, and the first of each kind of task that has none among them."""
-    count, last = min(count, len(episodes)), len(episodes) - 1
-    kept = {round(i * last / max(1, count - 1)) for i in range(count)}
-    for index, episode in enumerate(episodes):
-        if count and episode.kind not in {episodes[other].kind for other in kept}:
-            kept.add(index)
-    return sorted(kept)
-
-
 def run_pending(
     store: RunStore,
     task: Any,
@@ -90,6 +81,7 @@ def run_pending(
             store.discard(arm, indices)
         desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
         _run_jobs(plan, episodes, pending, desk, workers)
+        drop_spare_pictures(store)
         keep_scene_maps(store, task)
         keep_films(store, task)
     finally:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.tabletop.workbench import Workbench
 
@@ -65,7 +66,7 @@ def animated(frames: Sequence[NDArray[np.uint8]]) -> bytes:
 
 def _wanted(store: RunStore) -> Iterator[tuple[str, int]]:
     episodes = store.episodes()
-    first = {episodes[index].kind: index for index in reversed(store.info["pictures"])}
+    first = {episodes[index].kind: index for index in reversed(pictured_episodes(store))}
     ended = {(row["arm"], row["episode"]) for row in store.outcomes() if row["status"] == "done"}
     yield from ((arm, index) for arm, index in sorted(ended) if index in first.values())
 

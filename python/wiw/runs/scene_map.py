@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
 
 HFOV_DEG = 15.0
@@ -45,7 +46,7 @@ def keep_scene_maps(store: RunStore, task: Any) -> None:
     from wiw.datasets.worlds import world
 
     episodes = store.episodes()
-    for index in store.info["pictures"]:
+    for index in pictured_episodes(store):
         episode = episodes[index]
         if store.scene_map(episode.scene) is None:
             place = world(episode.scene, built.backend)

@@ -11,8 +11,8 @@ import fcntl
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -367,6 +367,17 @@ class RunStore:
             for episode in episodes:
                 _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
                 connection.execute("DELETE FROM outcome WHERE arm = ? AND episode = ?", (arm, episode))
+
+    def keep_pictures(self, episodes: Sequence[int]) -> None:
+        """Drop the pictures of all other episodes; `info["pictures"]` has these, the one to show first in front."""
+        info = {name: value for name, value in self.info.items() if name != "keep_images"} | {"pictures": episodes}
+        numbers = ", ".join(str(int(episode)) for episode in episodes)
+        with self._writing() as connection:
+            dropped = connection.execute(f"DELETE FROM image WHERE episode NOT IN ({numbers})").rowcount
+            connection.execute("UPDATE run SET info = ?", (to_json(info),))
+        if dropped:
+            with suppress(sqlite3.OperationalError):  # a reader or a full disk: the file stays larger than it must be
+                self._connection.execute("VACUUM")
 
     def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
         """Keeps how a scene looks from above."""

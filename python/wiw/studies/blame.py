@@ -136,7 +136,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
     folder = base.path.parent / FOLDER
     if RunStore.begun(folder):
         return RunStore.resume(folder, config)
-    info = base.info
+    info = {name: value for name, value in base.info.items() if name != "keep_images"}  # the run chooses for both
     info |= {
         "platform": describe_platform(),
         "agents": {name: recipe.to_json() for name, recipe in agents.items()},

@@ -13,7 +13,8 @@ from typing import Any, Literal
 
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.metrics import Lpips
-from wiw.runs.execute import recipes_of, require_left, require_of, run_pending, with_pictures
+from wiw.runs.execute import recipes_of, require_left, require_of, run_pending
+from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
 from wiw.runs.store import RunStore
@@ -63,8 +64,9 @@ def evaluate(
             "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
             mapping gives the arms names of their own. None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
-        keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one. Where a
-            task has several kinds, one of each does at least, unless it is 0.
+        keep_images: how many episodes keep pictures for report and view, spread evenly but for one in which a model
+            succeeds and the floor fails; "all" for every one. Where a task has several kinds, at least one of each,
+            unless it is 0.
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
             300 unless it was given another.
@@ -252,7 +254,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "platform": describe_platform(),
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
-            "pictures": with_pictures(episodes, options.pictures),
+            "pictures": pool_episodes(episodes, options.pictures),
+            "keep_images": options.pictures,
             "scenes": used,
             "stage": getattr(built, "stage", None),
             "wording": asdict(getattr(built, "wording", Wording())),
