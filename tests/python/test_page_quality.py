@@ -55,6 +55,16 @@ LOW_CONTRAST = """
   return [...new Set(found)];
 })()
 """
+COLLIDING = """
+[...document.querySelectorAll(".plots svg")].flatMap((drawing) => {
+  const texts = [...drawing.querySelectorAll("text")], frame = drawing.getBoundingClientRect();
+  const boxes = texts.map((text) => text.getBoundingClientRect());
+  const outside = texts.filter((_, i) => boxes[i].left < frame.left - 2 || boxes[i].right > frame.right + 2);
+  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 2 && b.top < a.bottom - 2;
+  const pairs = texts.filter((_, i) => boxes.some((box, k) => k > i && meet(boxes[i], box)));
+  return [...outside, ...pairs].map((text) => text.textContent.trim());
+})
+"""
 OPEN_ALL = "document.querySelectorAll('details').forEach((element) => { element.open = true; }); 0"
 
 
@@ -113,3 +123,11 @@ def test_headings_are_in_order_and_no_header_is_empty(addresses, browser, page):
     assert all(after <= before + 1 for before, after in pairwise(levels))
     assert browser.ask("[...document.querySelectorAll('th')].filter((cell) => !cell.textContent.trim()).length") == 0
     assert browser.ask("[...document.images].every((image) => image.hasAttribute('alt'))")
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_texts_of_plots_do_not_collide(addresses, browser, width):
+    browser.resize(width, 900)
+    browser.open(addresses["report"])
+    assert browser.ask("document.querySelectorAll('.plots svg text').length") > 20
+    assert browser.ask(COLLIDING) == []
