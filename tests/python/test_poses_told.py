@@ -25,8 +25,8 @@ from wiw.errors import ArgumentError
 from wiw.report.page import render
 from wiw.report.site import write_view
 from wiw.report.stage import SIDE, Stage, signs, stage_of
-from wiw.runs.films import film, keep_films
-from wiw.runs.rows import decode_jpeg, kept_frames
+from wiw.runs.films import film, film_episodes
+from wiw.runs.rows import decode_jpeg, select_frames
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import Manipulation
@@ -84,8 +84,8 @@ def test_plans_are_drawn_where_the_camera_sees_them() -> None:
 
 
 def test_many_frames_are_thinned_with_the_last_kept() -> None:
-    assert kept_frames(5).tolist() == [0, 1, 2, 3, 4]
-    kept = kept_frames(50)
+    assert select_frames(5).tolist() == [0, 1, 2, 3, 4]
+    kept = select_frames(50)
     assert len(kept) == 20 and kept[-1] == 49 and (np.diff(kept) >= 2).all()
 
 
@@ -120,7 +120,7 @@ def test_arms_that_did_the_same_are_filmed_once(log: Any) -> None:
 
 
 def test_failures_that_are_run_again_are_not_filmed() -> None:
-    keep_films(SimpleNamespace(config={"attributes": {}}), SimpleNamespace(build=Manipulation))  # type: ignore[arg-type]
+    film_episodes(SimpleNamespace(config={"attributes": {}}), SimpleNamespace(build=Manipulation))  # type: ignore[arg-type]
 
 
 def test_the_report_speaks_of_the_table(log: Any, html: str) -> None:

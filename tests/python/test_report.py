@@ -139,7 +139,7 @@ def test_the_sentence_claims_no_more_than_the_interval_bears():
     assert "the interval includes 0" in sentence(summary(1))
     assert "includes 0" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
     assert "primitives" not in sentence(summary(1))
-    assert "It took 2.0 primitives fewer" in sentence(summary(1, saved=2.0))
+    assert "It took 2.0 fewer primitives" in sentence(summary(1, saved=2.0))
     assert sentence(summarise(["none"], [], 3)) == ""
 
 

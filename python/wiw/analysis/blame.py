@@ -199,7 +199,7 @@ def _verdict_cells(line: ArmBlame) -> list[str]:
 def read_blame(run: RunStore) -> Blame | None:
     """Return the verdicts on a run's failures so far; None where none was rerun."""
     folder = run.path.parent / FOLDER
-    if not RunStore.begun(folder):
+    if not RunStore.exists(folder):
         return None
     with RunStore.read(folder) as store:
         if store.config["attributes"] != run.created:  # of an older run in the same folder

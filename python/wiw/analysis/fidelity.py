@@ -64,7 +64,7 @@ class ArmFidelity:
 
     def cells(self, columns: Sequence[Column]) -> list[str]:
         """Return the cells of the table."""
-        return [_shown(getattr(self, column.name), column.form) for column in columns]
+        return [_format(getattr(self, column.name), column.form) for column in columns]
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values."""
@@ -105,5 +105,5 @@ def _mean(values: Sequence[float | None]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def _shown(value: float, form: str) -> str:
+def _format(value: float, form: str) -> str:
     return "–" if math.isnan(value) else f"{value:{form}}"

@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from wiw.analysis.intervals import Interval, left_out_covariance, made_up, per_cluster, steadied
+from wiw.analysis.intervals import (
+    Interval,
+    count_pseudo_episodes,
+    jackknife_covariance,
+    stabilise_mean,
+    sum_by_cluster,
+)
 
 FLOOR, CEILING = "copy", "oracle"
 UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
@@ -75,12 +81,12 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
     """
     labels = np.asarray(clusters)
     both = [np.asarray(values, np.float64) for values in (gains, spans)]
-    (over, counts), (under, _) = (per_cluster(values, labels) for values in both)
+    (over, counts), (under, _) = (sum_by_cluster(values, labels) for values in both)
     if len(counts) < 2:
         return UNKNOWN
     squares = [float(np.square(values).sum()) for values in both]
-    a, var_a = map(float, steadied(over, squares[0], counts, "difference"))
-    b, var_b = map(float, steadied(under, squares[1], counts, "difference"))
+    a, var_a = map(float, stabilise_mean(over, squares[0], counts, "difference"))
+    b, var_b = map(float, stabilise_mean(under, squares[1], counts, "difference"))
     apart = [
         all_squares - float(sums.sum() ** 2 / counts.sum())
         for all_squares, sums in zip(squares, (over, under), strict=True)
@@ -97,13 +103,13 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
 def _correlation(
     over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64], apart: list[float]
 ) -> float:
-    """Of the two means over clusters; `apart` are sums of squared distances from the mean, over episodes.
+    """Return the correlation of the two means over clusters; `apart` are sums of squared deviations over episodes.
 
     The made-up episodes count too: three fair coins, floor, arm and ceiling, give either difference a variance of 1/2
     and both a covariance of 1/4. So an arm that did as the ceiling in every episode is not certain to be its equal.
     """
-    shared, *own = (float(left_out_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
-    scale, weight = math.sqrt(own[0] * own[1]), made_up(len(counts))
+    shared, *own = (float(jackknife_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
+    scale, weight = math.sqrt(own[0] * own[1]), count_pseudo_episodes(len(counts))
     seen = min(1.0, max(-1.0, shared / scale)) if scale > 1e-12 else 0.0
     more = [one + weight / 2 for one in apart]
     return (seen * math.sqrt(max(0.0, apart[0] * apart[1])) + weight / 4) / math.sqrt(more[0] * more[1])

@@ -21,7 +21,7 @@ def blame(
     workers: Annotated[int | None, arg(metavar="N")] = None,
     retry_errors: bool = False,
 ) -> int:
-    """Finds the stage of the loop that causes the failures of a run: imagination, scoring or proposals.
+    """Find the stage of the loop that causes the failures of a run: imagination, scoring or proposals.
 
     $ wiw blame runs/first
     $ wiw blame runs/first --arm warp

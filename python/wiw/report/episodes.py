@@ -110,7 +110,7 @@ def _attempt(
             shots[made.shot] = made.seen
         if "end" in images:
             end = f"shot-{name}-end"
-            shots[end] = album.draw(end, partial(way.seen, images["end"], album))
+            shots[end] = album.draw(end, partial(way.observation, images["end"], album))
         steps.append(made)
     film = store.film(arm, index)
     return Attempt(

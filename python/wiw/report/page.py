@@ -20,7 +20,7 @@ from wiw.files import whole_file
 from wiw.report import plots
 from wiw.report.episodes import read_stories, wording
 from wiw.report.story import Album
-from wiw.report.templating import environment, signed
+from wiw.report.templating import environment, format_signed
 from wiw.runs.run import Run
 from wiw.types import Wording
 
@@ -100,7 +100,7 @@ def _describe_gain(difference: Difference | None) -> str:
         return "."
     found = difference.estimate
     against = f"{abs(found.value):.1f} points {'more' if found.value >= 0 else 'fewer'} than without a world model"
-    interval = f"95 % interval {signed(found.low)} to {signed(found.high)}"
+    interval = f"95 % interval {format_signed(found.low)} to {format_signed(found.high)}"
     if found.excludes_zero:
         return f", {against} ({interval})."
     return f", {against}; the interval includes 0 ({interval})."
@@ -112,7 +112,8 @@ def _describe_actions(difference: Difference | None, words: Wording) -> str:
         return ""
     found = difference.estimate
     kind = "more" if found.value > 0 else "fewer"
-    return f" It took {abs(found.value):.1f} {words.steps} {kind} ({signed(found.low)} to {signed(found.high)})."
+    interval = f"{format_signed(found.low)} to {format_signed(found.high)}"
+    return f" It took {abs(found.value):.1f} {kind} {words.steps} ({interval})."
 
 
 def _find_difference(summary: Summary, arm: str, base: str, metric: str) -> Difference | None:

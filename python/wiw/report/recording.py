@@ -16,7 +16,7 @@ from wiw.types import Episode
 
 
 def record(run: Run, file: Path) -> None:
-    """Writes the ended episodes of all arms."""
+    """Write the ended episodes of all arms."""
     import rerun as rr
 
     stream = rr.RecordingStream("wiw", recording_id=f"{run.path.name} {run.store.created}")
@@ -80,5 +80,5 @@ def _decision(rr: Any, stream: Any, place: str, row: dict[str, Any], way: Primit
 
 
 def color_of(web: str) -> int:
-    """0xRRGGBBAA of "#rrggbb"."""
+    """Return 0xRRGGBBAA of "#rrggbb"."""
     return (int(web.removeprefix("#"), 16) << 8) | 0xFF

@@ -124,7 +124,7 @@ class Site:
 
 
 def write_view(run: Run, folder: Path) -> Site:
-    """Writes `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
+    """Write `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
 
     Raises:
         FileError: the folder holds something that is no view, or cannot be written.
@@ -149,7 +149,7 @@ def write_view(run: Run, folder: Path) -> Site:
 
 
 def is_view(folder: Path) -> bool:
-    """Whether a folder holds a view and nothing else, so that a new one may take its place."""
+    """Return whether a folder holds a view and nothing else, so that a new one may take its place."""
     return (folder / "index.html").is_file() and {path.name for path in folder.iterdir()} <= {
         "index.html",
         "episodes",

@@ -218,10 +218,10 @@ def final_answer(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
 
 
 def place(scene: str) -> str:
-    """A scene's name without its folders."""
+    """Return a scene's name without its folders."""
     return scene if scene.startswith("apartments:") else Path(scene).name
 
 
 def where(episode: Episode) -> str:
-    """The kind of an episode where its task has several, else its scene's name without its folders."""
+    """Return the kind of an episode where its task has several, else its scene's name without its folders."""
     return episode.kind.replace("_", " ") or place(episode.scene)

@@ -214,7 +214,8 @@ def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> 
     """Return one group's paired differences; `gap` stands between an estimate and its interval."""
     metrics, rows = list_columns(summary), list(group.rows.values())
     columns = [
-        Column(column_title(metric), [_signed(row[metric.name].estimate, gap) for row in rows]) for metric in metrics
+        Column(column_title(metric), [_format_difference(row[metric.name].estimate, gap) for row in rows])
+        for metric in metrics
     ]
     leading = [row[metrics[0].name] for row in rows]
     columns.append(Column("W/L", [f"{one.wins}/{one.losses}" for one in leading]))
@@ -222,6 +223,6 @@ def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> 
     return stack_tables(group.title, list(group.rows), columns, width)
 
 
-def _signed(estimate: Estimate, gap: str) -> Text:
+def _format_difference(estimate: Estimate, gap: str) -> Text:
     shown = show_estimate(estimate, signed=True).replace(" ", gap, 1)
     return Text(shown, style="bold" if estimate.excludes_zero else "")

@@ -8,12 +8,12 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from wiw.errors import Error, InfrastructureError, StoreError
-from wiw.runs.films import keep_films
+from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
-from wiw.runs.scene_map import keep_scene_maps
+from wiw.runs.scene_map import draw_scene_maps
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Plan, Row, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
@@ -82,8 +82,8 @@ def run_pending(
         desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
         _run_jobs(plan, episodes, pending, desk, workers)
         drop_spare_pictures(store)
-        keep_scene_maps(store, task)
-        keep_films(store, task)
+        draw_scene_maps(store, task)
+        film_episodes(store, task)
     finally:
         board.close()
         store.close()

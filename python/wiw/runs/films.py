@@ -33,13 +33,13 @@ QUALITY = 85
 """Of WebP; below it, where the arm was shines through."""
 
 
-def keep_films(store: RunStore, task: Any) -> None:
-    """Films the first episode of each kind that keeps pictures, in every arm, where the task is one at a table."""
+def film_episodes(store: RunStore, task: Any) -> None:
+    """Film the first episode of each kind that has pictures, in every arm, where the task is one at a table."""
     built = task.build()
     if not hasattr(built, "table") or "attributes" in store.config:  # failures that are run again have no page
         return
     episodes, known = store.episodes(), dict[tuple[int, str], bytes]()
-    for arm, index in _wanted(store):
+    for arm, index in _list_films(store):
         if store.film(arm, index) is None:
             executed = [pose for row in store.decisions(arm, index) for pose in row["executed"]]
             name = index, str(executed)
@@ -49,14 +49,14 @@ def keep_films(store: RunStore, task: Any) -> None:
 
 
 def film(bench: Workbench, poses: Sequence[Sequence[float]]) -> bytes:
-    """Animated WebP of what the front camera sees while the gripper goes to these poses."""
+    """Return the animated WebP of what the front camera sees while the gripper goes to these poses."""
     frames = list(_frames(bench, poses))
     every = -(-len(frames) // MOST)
-    return animated([*frames[:-1:every], frames[-1]])
+    return encode_film([*frames[:-1:every], frames[-1]])
 
 
-def animated(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Animated WebP of pictures uint8 [H, W, 3] at `RATE`, over and over."""
+def encode_film(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """Return the animated WebP of pictures uint8 [H, W, 3] at `RATE`, over and over."""
     first, *others = (Image.fromarray(frame) for frame in frames)
     lasting = [round(1000 / RATE)] * len(others) + [LAST]
     file = io.BytesIO()
@@ -64,7 +64,7 @@ def animated(frames: Sequence[NDArray[np.uint8]]) -> bytes:
     return file.getvalue()
 
 
-def _wanted(store: RunStore) -> Iterator[tuple[str, int]]:
+def _list_films(store: RunStore) -> Iterator[tuple[str, int]]:
     episodes = store.episodes()
     first = {episodes[index].kind: index for index in reversed(pictured_episodes(store))}
     ended = {(row["arm"], row["episode"]) for row in store.outcomes() if row["status"] == "done"}
@@ -72,7 +72,7 @@ def _wanted(store: RunStore) -> Iterator[tuple[str, int]]:
 
 
 def _frames(bench: Workbench, poses: Sequence[Sequence[float]]) -> Iterator[NDArray[np.uint8]]:
-    """Pictures at even times, and of the end."""
+    """Return pictures at even times, and of the end."""
     due, period = bench.seconds, SPEED / RATE
     for pose in poses:
         begin = bench.seconds

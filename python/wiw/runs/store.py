@@ -49,7 +49,7 @@ _SCHEMA = Path(__file__).with_name("schema.sql")
 
 
 def store_path(run: str | Path) -> Path:
-    """The store's file, from a run's folder or the file itself."""
+    """Return the store's file, from a run's folder or the file itself."""
     path = Path(run).expanduser()
     return path if path.suffix == ".sqlite" else path / FILE_NAME
 
@@ -66,13 +66,13 @@ class RunStore:
     def create(
         cls, run: str | Path, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
     ) -> RunStore:
-        """A new store for writing.
+        """Create a store for writing.
 
         Raises:
             StoreError: a run is already there, or the folder cannot be written.
         """
         path = store_path(run)
-        if cls.begun(run):
+        if cls.exists(run):
             raise StoreError(
                 f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
@@ -101,14 +101,14 @@ class RunStore:
         return store
 
     @staticmethod
-    def begun(run: str | Path) -> bool:
-        """Whether a run is there, rather than nothing or a creation that was cut off."""
+    def exists(run: str | Path) -> bool:
+        """Return whether a run is there, rather than nothing or a creation that was cut off."""
         path = store_path(run)
         return path.exists() and not _blank(path)
 
     @classmethod
     def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:
-        """An existing store for writing; partial episodes are discarded.
+        """Open an existing store for writing and discard partial episodes.
 
         Raises:
             StoreError: missing, damaged, of another version, of another configuration than `config`, or in use.
@@ -124,7 +124,7 @@ class RunStore:
         return store
 
     def require_version(self) -> None:
-        """Holds the run to the version of wiw that began it.
+        """Check that this is the version of wiw that started the run.
 
         Raises:
             StoreError: this is another.
@@ -136,7 +136,7 @@ class RunStore:
             )
 
     def require_task(self, task: dict[str, Any]) -> None:
-        """Holds the run to the task it was begun with, whose preset may be a file that has changed since.
+        """Check that the task is the one the run was started with; its preset may be a file that has changed.
 
         Raises:
             StoreError: the task differs; says in what.
@@ -144,7 +144,7 @@ class RunStore:
         _require_same(self.path, self.config["task"], json.loads(to_json(task)))
 
     def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
-        """Holds the run to something else it was begun with.
+        """Check a mapping against the one that the run was started with.
 
         Raises:
             StoreError: it differs; says in what.
@@ -153,7 +153,7 @@ class RunStore:
 
     @classmethod
     def read(cls, run: str | Path) -> RunStore:
-        """An existing store for reading, also while it is being written.
+        """Open an existing store for reading, also while it is being written.
 
         Raises:
             StoreError: missing, damaged or of another version.
@@ -172,7 +172,7 @@ class RunStore:
         return store
 
     def _require_whole(self) -> None:
-        """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
+        """Check the file's length: SQLite reads a last page that is cut short as zeros."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
         if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
             raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
@@ -227,11 +227,11 @@ class RunStore:
         return dict(json.loads(self._value("info")))
 
     def episodes(self) -> list[Episode]:
-        """The episodes that every arm runs; their place in the list is their index."""
+        """Return the episodes that every arm runs; their place in the list is their index."""
         return [_episode(row) for row in self._rows("SELECT * FROM episode ORDER BY episode")]
 
     def outcomes(self) -> list[dict[str, Any]]:
-        """Ended episodes of all arms; those of a task with several kinds say of which ("task")."""
+        """Return the ended episodes of all arms, with their kind ("task") where a task has several."""
         rows = self._rows(
             "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
             "FROM outcome o JOIN episode e USING (episode) "
@@ -241,7 +241,7 @@ class RunStore:
         return [{**row, "metrics": json.loads(row["metrics"])} for row in named]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
-        """Decisions of ended episodes, of one arm or episode if named, in order."""
+        """Return the decisions of ended episodes in order, of all or of one arm or episode."""
         rows = self._rows(
             "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (?1 IS NULL OR arm = ?1) "
             "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
@@ -253,8 +253,10 @@ class RunStore:
         return rows
 
     def totals(self, column: str) -> dict[str, dict[str, float]]:
-        """Sums over the decisions of ended episodes of a column of named numbers ("seconds", "calls", "spent"), by arm,
-        with their number as "decisions".
+        """Return sums over the decisions of ended episodes by arm, with the number of decisions as "decisions".
+
+        Args:
+            column: of named numbers: "seconds", "calls" or "spent".
         """
         if column not in ("seconds", "calls", "spent"):
             raise ArgumentError(f"totals: expected seconds, calls or spent, got '{column}'")
@@ -268,14 +270,14 @@ class RunStore:
         return found
 
     def lost(self) -> dict[str, dict[str, float]]:
-        """By arm and name, what was spent on decisions that failed or were begun again."""
+        """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}
         for row in self._rows("SELECT arm, name, value FROM lost"):
             found.setdefault(row["arm"], {})[row["name"]] = row["value"]
         return found
 
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
-        """JPEG by name, empty where no pictures were kept."""
+        """Return JPEG by name, empty where no pictures were kept."""
         rows = self._rows(
             "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
             (arm, episode, decision),
@@ -283,18 +285,18 @@ class RunStore:
         return {row["name"]: row["jpeg"] for row in rows}
 
     def film(self, arm: str, episode: int) -> bytes | None:
-        """Animated WebP of an episode, if one was kept."""
+        """Return the animated WebP of an episode, if one was kept."""
         found = self._rows("SELECT webp FROM film WHERE arm = ? AND episode = ?", (arm, episode))
         return found[0]["webp"] if found else None
 
     def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
-        """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
+        """Return WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
         for row in self._rows("SELECT * FROM scene_map WHERE scene = ?", (scene,)):
             return row["webp"], json.loads(row["world_to_pixel"])
         return None
 
     def pending(self, arm: str, retry_errors: bool = False) -> list[int]:
-        """Indices of the episodes still to be run in an arm."""
+        """Return indices of the episodes still to be run in an arm."""
         status = "AND status = 'done'" if retry_errors else ""
         rows = self._rows(
             f"SELECT episode FROM episode WHERE episode NOT IN "
@@ -306,7 +308,7 @@ class RunStore:
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def write(self, row: DecisionRow | OutcomeRow) -> None:
-        """Writes one decision with its pictures, or one episode's end, as one transaction.
+        """Write one decision with its pictures, or one episode's end, as one transaction.
 
         An episode whose file gave no length takes it from the first arm that has measured it ("shortest").
         """
@@ -339,7 +341,7 @@ class RunStore:
                     )
 
     def write_agent(self, row: AgentRow) -> None:
-        """Keeps what an arm's agent says of itself, as `info["built"][arm]`.
+        """Store the description of an arm's agent as `info["built"][arm]`.
 
         Raises:
             StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
@@ -355,14 +357,14 @@ class RunStore:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
     def write_lost(self, row: LostRow) -> None:
-        """Books what a failed decision had spent."""
+        """Record what an interrupted decision had spent."""
         with self._writing() as connection:
             connection.executemany(
                 f"INSERT INTO lost VALUES (?, ?, ?) {_ADD}", [(row.arm, *item) for item in row.spent.items()]
             )
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
-        """Forgets what was written of episodes that are to be run again, but for what it cost."""
+        """Delete episodes that are to be run again; their costs are recorded as lost."""
         with self._writing() as connection:
             for episode in episodes:
                 _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
@@ -380,19 +382,19 @@ class RunStore:
                 self._connection.execute("VACUUM")
 
     def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
-        """Keeps how a scene looks from above."""
+        """Store a picture of a scene from above."""
         with self._writing() as connection:
             connection.execute(
                 "INSERT OR REPLACE INTO scene_map VALUES (?, ?, ?)", (scene, webp, to_json(world_to_pixel))
             )
 
     def write_film(self, arm: str, episode: int, webp: bytes) -> None:
-        """Keeps how an episode went."""
+        """Store the film of an episode."""
         with self._writing() as connection:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def close(self) -> None:
-        """Closes the file and lets others write."""
+        """Close the file and lets others write."""
         self._connection.close()
         if self._lock is not None:
             self._lock.close()
@@ -438,17 +440,17 @@ class RunStore:
 
 
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
-    """A connection; one that may write is for whoever holds the lock, which is given up if there can be none."""
+    """Connect; a connection that may write is for the holder of the lock, which is released if connecting fails."""
     try:
         with explain_faults(path):
-            return _opened(path, writing=lock is not None)
+            return _open_file(path, writing=lock is not None)
     except StoreError:
         if lock is not None:
             lock.close()
         raise
 
 
-def _opened(path: Path, writing: bool) -> sqlite3.Connection:
+def _open_file(path: Path, writing: bool) -> sqlite3.Connection:
     uri = f"{path.absolute().as_uri()}?mode={'rwc' if writing else 'ro'}"
     connection = _plain(uri)
     if writing:
@@ -473,22 +475,22 @@ def _plain(uri: str) -> sqlite3.Connection:
 
 
 def _has_log(path: Path) -> bool:
-    """Whether transactions lie in the log beside the file."""
+    """Return whether transactions lie in the log beside the file."""
     log = path.with_name(path.name + "-wal")
     return log.exists() and log.stat().st_size > 0
 
 
 def _blank(path: Path) -> bool:
-    """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
+    """Return whether a creation was cut off before anything was written: the schema and the run are one transaction."""
     with explain_faults(path):
-        connection = _opened(path, writing=True)  # also where it was cut off with a log that only a writer takes in
+        connection = _open_file(path, writing=True)  # also where it was cut off with a log that only a writer takes in
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
         connection.close()
     return bool(tables == 0)
 
 
 def _lock(path: Path) -> Any:
-    """An advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
+    """Take an advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
     try:
         handle = path.with_suffix(".lock").open("w")
     except OSError as error:
@@ -513,7 +515,7 @@ _ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
 
 
 def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
-    """Deletes decisions, pictures and films `d` that meet a condition; what they cost is booked as lost."""
+    """Delete decisions, pictures and films `d` that meet a condition; record their costs as lost."""
     for column, name in (("spent", "key"), ("seconds", "'seconds'")):
         connection.execute(
             f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "

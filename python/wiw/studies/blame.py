@@ -134,7 +134,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
         "attributes": base.created,
     }
     folder = base.path.parent / FOLDER
-    if RunStore.begun(folder):
+    if RunStore.exists(folder):
         return RunStore.resume(folder, config)
     info = {name: value for name, value in base.info.items() if name != "keep_images"}  # the run chooses for both
     info |= {

@@ -242,7 +242,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     }
     for recipe in agents.values():
         recipe.require(config["task"])
-    if options.resume and options.out is not None and RunStore.begun(options.out):
+    if options.resume and options.out is not None and RunStore.exists(options.out):
         store = RunStore.resume(options.out, config)
         require_left(built, store, agents)
     else:
