@@ -17,8 +17,8 @@ import pytest
 from browser import COMMAND, WHY, Browser
 from PIL import Image, ImageSequence
 from pressing_policy import Pressing
-from test_evaluation_report import Page
 from test_export import contents_of
+from test_report import Page
 
 import wiw
 from wiw.errors import ArgumentError
@@ -109,7 +109,7 @@ def test_films_show_what_truly_happened(log: Any, html: str) -> None:
             seen = cv2.resize(decode_jpeg(kept), frame.shape[:2], interpolation=cv2.INTER_AREA).astype(float)
             assert np.abs(frame - seen).mean() < 4
         assert 8 < len(frames) < 60 and np.abs(frames[0] - frames[len(frames) // 2]).mean() > 1
-    assert html.count("data:image/webp") == len(log.episodes)
+    assert html.count('<img class="film moving"') == len(log.episodes)
 
 
 def test_arms_that_did_the_same_are_filmed_once(log: Any) -> None:
@@ -142,9 +142,10 @@ def test_the_report_shows_plans_beside_their_ends(log: Any, html: str) -> None:
     )
     assert classes.count("imagined") == classes.count("true") == imagined
     assert classes.count("tick") == decisions and classes.count("best") >= imagined // PLANS
-    shared = {attributes["id"] for tag, attributes in tags if tag == "image"}
+    shared = {attributes["id"] for tag, attributes in tags if tag == "symbol"}
     used = {attributes["href"][1:] for tag, attributes in tags if tag == "use" and "href" in attributes}
-    assert used == shared and len(shared) == decisions + 2 * len(ARMS)
+    ends = 2 * len(ARMS)  # two episodes of each; equal pictures are stored once
+    assert used == shared and PLANS < len(shared) < decisions + ends + 2 * imagined
 
 
 def test_exports_hold_poses_and_pictures(log: Any, tmp_path: Path) -> None:
@@ -172,7 +173,7 @@ def test_success_is_told_by_kind(log: Any) -> None:
 def test_the_view_steps_through_imagined_ways(log: Any, tmp_path: Path) -> None:
     site = write_view(log, tmp_path / "view")
     index, page = site.index.read_text(), (site.index.parent / "episodes" / "0001.html").read_text()
-    assert "Way" not in index and "push buttons" in index and " m<" not in index
+    assert "Path" not in index and "push buttons" in index and " m<" not in index
     assert log.store.episodes()[1].info["instruction"] in index
     assert page.count('type="range" min="1" max="3"') == 2 and "metres" not in page
     if COMMAND is None:

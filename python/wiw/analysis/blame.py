@@ -171,7 +171,7 @@ class Blame:
             ("Stage to blame, episodes", (*VERDICTS,), _verdict_cells),
         ):
             table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
-            table.add_column("arm", style="bold")
+            table.add_column("arm", style="bold", overflow="fold")
             for column in ("failures", "rerun", *columns):
                 table.add_column(column, justify="right", no_wrap=True)
             for line in self.arms:
