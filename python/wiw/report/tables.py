@@ -135,7 +135,7 @@ def stack_tables(
         if groups[-1] and needed > width:
             groups.append([])
         groups[-1].append(column)
-    tables = []
+    tables: list[Table] = []
     for group in groups:
         table = _table(f"{title} (continued)" if tables else title)
         table.add_column(heading, style="bold", width=max(first, len(heading)), overflow="fold")
