@@ -95,7 +95,7 @@ def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypa
         (line,) = log.costs()
         assert line["spent_calls"] + line["lost_calls"] == pytest.approx(len(model._asked))
         assert line["spent_rows"] + line["lost_rows"] == pytest.approx(sum(model._asked))
-        return line, [row["episode"] for row in log.episodes if row["status"] == "failed"]
+        return line, [row["episode"] for row in log.episodes if row["status"] == "error"]
 
     line, failed = run()
     assert len(failed) == (live == 1)  # more at a time: each is run again by itself
@@ -131,7 +131,7 @@ def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:
 def test_table_and_report_show_the_ledger(log, capsys) -> None:
     assert main(["report", str(log.path)]) == 0
     shown = capsys.readouterr().out
-    assert "Costs, an episode" in shown and "rollouts / success" in shown and "100 %" in shown
+    assert "Costs per episode" in shown and "rollouts / success" in shown and "100 %" in shown
     assert "lost calls" not in shown
     page = (log.path / "report.html").read_text()
     assert '<section id="costs">' in page and "rollouts / success" in page

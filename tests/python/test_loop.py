@@ -173,7 +173,7 @@ def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) 
 
     recorder = run(task, wiw.Agent(Greedy(), Attempted(Flaky())), count=3, live=1)
     states = {i: r.status for i, r in recorder.results.items()}
-    assert states == {0: "failed", 1: "done", 2: "done"}
+    assert states == {0: "error", 1: "done", 2: "done"}
     assert "server is gone" in recorder.results[0].error and not recorder.results[0].metrics
     assert recorder.results[0].kind == "world_model/raised"
 
@@ -191,7 +191,7 @@ def test_a_model_that_hangs_fails_its_episode_and_the_rest_goes_on(task: ImageNa
 
     recorder = run(task, wiw.Agent(Greedy(), Attempted(Stuck(), deadline=0.6)), count=3, live=3)
     release.set()
-    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done"}
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "error", 2: "done"}
     assert recorder.results[1].kind == "world_model/deadline" and "within 0.6 s" in recorder.results[1].error
 
 
@@ -207,7 +207,7 @@ def test_what_fails_does_not_depend_on_what_else_is_live(task: ImageNav, live: i
             return super().rollout(observations, controls, seeds)
 
     recorder = run(task, wiw.Agent(Greedy(), Attempted(Picky())), count=4, live=live)
-    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done", 3: "done"}
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "error", 2: "done", 3: "done"}
     assert "not this one" in recorder.results[1].error
     clean = run(task, wiw.Agent(Greedy(), Stamp()), count=4, live=1)
     for (episode, index), record in recorder.decisions.items():
@@ -320,7 +320,7 @@ def test_a_model_that_breaks_its_contract_fails_the_episode_with_what_was_expect
             return super().rollout(observations, controls, seeds)[:, 1:]
 
     result = run(task, wiw.Agent(Greedy(), Attempted(Wrong())), count=1).results[0]
-    assert (result.status, result.kind) == ("failed", "world_model/frames")
+    assert (result.status, result.kind) == ("error", "world_model/frames")
     assert re.search(r"expected uint8 .* got uint8", result.error)
 
 

@@ -15,7 +15,7 @@ from wiw.errors import ArgumentError
 from wiw.report.cuts import BAND, FRONT, part
 from wiw.report.plans import glyphs, numbers, of_primitives
 from wiw.report.stage import signs
-from wiw.runs.rows import kept_frames
+from wiw.runs.rows import select_frames
 from wiw.tabletop.workbench import SHUT
 from wiw.types import ArmObservation, Decision, Observation, Rollout
 
@@ -99,7 +99,7 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
 
 
 def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) -> None:
-    kept = kept_frames(len(rollout.frames))
+    kept = select_frames(len(rollout.frames))
     cells = place.subgridspec(1, len(kept), wspace=0.02)
     for column, k in enumerate(kept):
         axes = figure.add_subplot(cells[0, column])
