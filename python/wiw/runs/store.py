@@ -447,7 +447,7 @@ class RunStore:
         Raises:
             StoreError: a value is of another type.
         """
-        columns = self._rows(f"PRAGMA table_info({table})")
+        columns = self._rows(f"PRAGMA main.table_info({table})")
         declared = {
             column["name"]: _TYPES[column["type"]] + (() if column["notnull"] or column["pk"] else (type(None),))
             for column in columns
