@@ -94,7 +94,7 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
         labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
         agent = AgentRecipe(policy, model, semantics=labels, candidates=2, horizon=2)
         how: Any = {"progress": False, "keep_images": 0, "cache": "off"}
-        return wiw.evaluate(task, agent, 1, 0, tmp_path / "run", **how, **options(task))
+        return wiw.evaluate(task, agent, 1, seed=0, out=tmp_path / "run", **how, **options(task))
 
     return run
 

@@ -107,7 +107,7 @@ class Moved(LineTask):
     ],
 )
 def test_unlike_runs_are_refused_by_the_first_difference(runs, tmp_path, task, count, seed, message, capsys):
-    run_arms(task, {"warp": LineAgent(0.5)}, count, seed, out=tmp_path / "run", progress=False)
+    run_arms(task, {"warp": LineAgent(0.5)}, count, seed=seed, out=tmp_path / "run", progress=False)
     with pytest.raises(StoreError, match=message):
         wiw.compare(runs[0], tmp_path / "run")
     assert main(["compare", str(runs[0]), str(tmp_path / "run")]) == 2

@@ -304,7 +304,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
             recipe = AgentRecipe(
                 "vlm", "copy", policy_options={"vlm": {"vlm": server.url, "dialect": "vllm", "tries": 2}}
             )
-            log = evaluate(task, recipe, 1, 0, tmp_path / task, progress=False, preset=str(preset), **options)
+            log = evaluate(task, recipe, 1, seed=0, out=tmp_path / task, progress=False, preset=str(preset), **options)
             (episode,) = log.episodes
             assert episode["status"] == "done"
             rows = list(log.store.decisions("copy"))

@@ -14,30 +14,15 @@ from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
 from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
 from wiw.experiments.semantics import Labelled
 from wiw.loop.agent import Agent
-from wiw.loop.attempts import DEADLINE, Attempted, make_model
+from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
+from wiw.loop.limits import DEADLINE, Limits
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.parts import Parts, space_option
-from wiw.loop.rollout_cache import BUDGET_GB, cache_rollouts
+from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What every agent of a run is built with beyond its identity; none of it changes what an agent decides."""
-
-    deadline: float = DEADLINE
-    """Seconds that a call of a world model may take before it counts as an error."""
-    cache: str = "auto"
-    """Where rollouts are kept: "auto", "off", or a folder (`wiw.loop.rollout_cache`)."""
-    cache_gb: float = BUDGET_GB
-    """Most gigabytes of that folder."""
-    fidelity: bool = False
-    """Whether every imagined plan is also replayed in the simulator (`wiw.experiments.fidelity`)."""
-    lpips: str | None = None
-    """Folder of the weights of LPIPS, to measure fidelity by it as well."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +68,7 @@ def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunCo
         reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
-    observers = [FidelityObserver(limits.lpips)] if limits.fidelity or limits.lpips is not None else []
+    observers = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
     return Agent(policy, imaginer, reviser, config, observers=observers)
 
 

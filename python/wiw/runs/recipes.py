@@ -14,10 +14,11 @@ from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
+from wiw.loop.limits import Limits
 from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
-from wiw.runs.compose import Experiment, Limits, RunContext, compose, make_for_space
+from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES

@@ -21,7 +21,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError
-from wiw.runs.compose import Limits, RunContext
+from wiw.loop.limits import Limits
+from wiw.runs.compose import RunContext
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult

@@ -20,7 +20,8 @@ from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
 from wiw.report.tables import print_stacked
-from wiw.runs.recipes import agent_recipe, task_recipe
+from wiw.runs.config import RunConfig, take_settings
+from wiw.runs.recipes import agent_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
@@ -97,18 +98,9 @@ def scale(
     agent: Any,
     candidates: Sequence[int] | None = None,
     imagine_fraction: Sequence[float] | None = None,
-    episodes: int = 20,
-    seed: int | None = None,
-    out: str | Path | None = None,
-    workers: int = 1,
-    progress: bool = True,
     *,
-    live: int = 4,
-    deadline: float | None = None,
-    cache: str | Path | None = None,
-    cache_gb: float | None = None,
-    resume: bool = False,
-    **task_options: Any,
+    config: RunConfig | None = None,
+    **settings: Any,
 ) -> Scaling:
     """Run an agent with different amounts of imagination on the same episodes.
 
@@ -121,17 +113,8 @@ def scale(
         candidates: plans imagined at each decision; 1, 2, 4, 8 where this and `imagine_fraction` are None.
         imagine_fraction: shares of decisions for which the model is consulted, with the agent's own candidates; 0 is
             the proposer's own preference.
-        episodes: how many.
-        seed: of the run; None means the task's own.
-        out: folder of the run; None means `runs/scale-<time>`.
-        workers: processes.
-        progress: whether to show bars.
-        live: episodes kept live at a time in each process.
-        deadline: see `wiw.evaluate`.
-        cache: see `wiw.evaluate`; a folder spares any model what several amounts imagine.
-        cache_gb: see `wiw.evaluate`.
-        resume: whether to go on with the run in `out` where it was stopped.
-        task_options: options of a task given by name, such as `scenes` and `preset`.
+        config: how the run goes; a folder as `cache` spares any model what several amounts imagine.
+        settings: any of `RunConfig`'s in place of the config's, and options of a task given by name.
 
     Raises:
         ArgumentError: an agent without a world model; no amounts, equal ones or ones out of range.
@@ -140,12 +123,9 @@ def scale(
         raise ArgumentError("scale: expected an agent with a world model, got one without")
     amounts = _amounts(candidates, imagine_fraction)
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
-    task = task_recipe(env_or_task, task_options)
-    folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
-    log = run_arms(
-        task, agents, episodes, seed, folder, workers, progress,
-        live=live, keep_images=0, resume=resume, deadline=deadline, cache=cache, cache_gb=cache_gb,
-    )  # fmt: skip
+    own, task_options = take_settings(config, settings)
+    out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    log = run_arms(env_or_task, agents, config=replace(own, out=out, keep_images=0), **task_options)
     return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
 
