@@ -154,8 +154,13 @@ def _makes(thing: Any) -> bool:
 def _attribute(path: str) -> Any:
     """What `path.py:Name` or `package.module:Name` names."""
     module_name, _, attribute = path.rpartition(":")
-    file = module_name.endswith(".py")
-    return getattr(_import_file(Path(module_name)) if file else importlib.import_module(module_name), attribute)
+    if not module_name.endswith(".py"):
+        return getattr(importlib.import_module(module_name), attribute)
+    module = _import_file(Path(module_name))
+    if not hasattr(module, attribute):
+        own = [name for name, thing in vars(module).items() if getattr(thing, "__module__", "") == module.__name__]
+        raise AttributeError(f"{module_name} defines no '{attribute}'" + (f"; it has {', '.join(own)}" if own else ""))
+    return getattr(module, attribute)
 
 
 def _import_file(path: Path) -> Any:

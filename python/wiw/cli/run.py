@@ -130,9 +130,12 @@ def run(
         prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
     """
-    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
-    from wiw.studies.evaluate import evaluate
+    from wiw.cli.announcement import announce
+    from wiw.errors import ArgumentError
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
 
+    if width is not None and depth == 1:
+        raise ArgumentError("--width: a search of one level extends no plan; give --depth 2 or more, or leave it out")
     flags = {
         "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
         "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder, "robot": robot,
@@ -151,6 +154,9 @@ def run(
         policy_options=policy_options(absolute(policy), policy_option, vlm_options(given, speaking)),
     )  # fmt: skip
     folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
+
+    announce(recipe.build(), arm_recipes(agent, names), episodes, seed, workers, folder)
+    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
 
     def work() -> Any:
         return evaluate(

@@ -67,6 +67,15 @@ class Policy(ABC):
         """The policy itself, behind everything that wraps it."""
         return self
 
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Check, before a run begins, that the policy is made for a task that describes itself so. Default: any task.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        return
+
     def begin(self, goal: Goal, key: Key) -> Any:
         """Return the memory of a new episode; None for a policy without memory."""
         return None

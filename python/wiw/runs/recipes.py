@@ -162,14 +162,17 @@ class AgentRecipe(AgentConfig):
         return found
 
     def require(self, task: Mapping[str, Any]) -> None:
-        """See that the world model is made for a task that describes itself so.
+        """Require that world model and policies are made for a task that describes itself so.
 
         Raises:
-            ArgumentError: it is not.
+            ArgumentError: one of them is not.
         """
-        found = WORLD_MODELS.find(self.model) if isinstance(self.model, str) else self.model
-        if isinstance(found, WorldModel) or (isinstance(found, type) and issubclass(found, WorldModel)):
-            found.require(task)
+        parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
+        for registry, part in parts:
+            found = registry.find(part) if isinstance(part, str) else part
+            kind = found if isinstance(found, type) else type(found)
+            if issubclass(kind, WorldModel | Policy):
+                found.require(task)
 
     def replaying(self, run: Path) -> AgentRecipe:
         """Return the same agent with the answers that a run has recorded in the place of its language model."""

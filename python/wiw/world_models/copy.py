@@ -34,5 +34,8 @@ class CopyFront(Copy):
 
 
 def make_copy(space: str = PRIMITIVES) -> Copy:
-    """Return the floor of a plan space."""
+    """Predict that every future frame equals the present one: the floor.
+
+    Return the model for plans of a space.
+    """
     return CopyFront() if space == GRIPPER_POSES else Copy()

@@ -64,5 +64,8 @@ class ArmOracle(Oracle):
 
 
 def make_oracle(space: str = PRIMITIVES) -> Oracle:
-    """Return the oracle of a plan space."""
+    """Carry each plan out in a fork of the simulator: the ceiling.
+
+    Return the model for plans of a space.
+    """
     return ArmOracle() if space == GRIPPER_POSES else Oracle()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD
+from wiw.errors import ArgumentError
 from wiw.panorama import from_cubemap
 from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
 from wiw.perception.recogniser import Recogniser
@@ -63,6 +64,20 @@ class Recognition(Policy):
     """
 
     frames = FrameSpec("panorama", (576, 1024))
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Require a task whose goal is to name an object.
+
+        Raises:
+            ArgumentError: the task has no categories to choose from.
+        """
+        if not task.get("categories"):
+            raise ArgumentError(
+                "policy recogniser names the object that a task marks, and task "
+                f"'{task.get('task', 'of this run')}' marks none; use it with task ar (`wiw run ar`), and for imagenav "
+                "a policy such as matcher"
+            )
 
     def __init__(
         self,

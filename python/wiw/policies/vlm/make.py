@@ -12,7 +12,10 @@ from wiw.types import GRIPPER_POSES, PRIMITIVES
 
 
 def make_vlm(space: str = PRIMITIVES, **options: Any) -> VLM:
-    """Return the policy `vlm` of a plan space; `VLM` documents its options."""
+    """Ask a vision-language model for plans, scores and answers (any OpenAI-compatible server, or a local model).
+
+    `VLM` documents the options.
+    """
     return (ArmVLM if space == GRIPPER_POSES else VLM)(**options)
 
 
