@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import SizeReader
+from fakes import SizeReader, agent_for
 from gymnasium.utils.env_checker import check_env
 
 import wiw
@@ -95,7 +95,7 @@ def test_ids_reach_neither_policies_nor_world_models_and_boxes_no_world_model(fi
             return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, axis=1)
 
     task = AR(episode_file=file)
-    agent = wiw.Agent(Spy(), Watcher()).settled(task.defaults)
+    agent = agent_for(task, wiw.Agent(Spy(), Watcher()))
     run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     observations, situation = seen[0], seen[1]
     env = task.environment()
@@ -136,7 +136,7 @@ class Sink:
 @pytest.mark.parametrize(("execute", "carried_out"), [("primitive", 1), ("sequence", 2)])
 def test_the_budget_ends_an_episode_after_the_last_answer(file: Path, execute: str, carried_out: int) -> None:
     task, sink = AR(episode_file=file, execute=execute, decisions=4), Sink()
-    agent = wiw.Agent(SizeReader(0.5, (TURN_LEFT, TURN_LEFT))).settled(task.defaults)
+    agent = agent_for(task, wiw.Agent(SizeReader(0.5, (TURN_LEFT, TURN_LEFT))))
     run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=sink)
     assert [len(record.executed) for record in sink.decisions] == [carried_out] * 3 + [0]
     metrics = sink.results[0].metrics
@@ -210,9 +210,9 @@ def test_many_at_a_time_are_as_one_by_one(file: Path) -> None:
 
 def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
     task = AR(episode_file=file)
-    for model, revision in ((None, "heuristic"), ("copy", "matcher")):
-        agent = wiw.Agent("heuristic", model, revision).settled(task.defaults)
-        with pytest.raises(ContractError, match=r"gives no answer, .* one of 4 choices.*revision="):
+    for model, reviser in ((None, "heuristic"), ("copy", "matcher")):
+        agent = agent_for(task, wiw.Agent("heuristic", model, reviser))
+        with pytest.raises(ContractError, match=r"gives no answer, .* one of 4 choices.*reviser="):
             run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     env = task.environment()
     shown, info = env.reset(options={"episode": 0})
@@ -224,8 +224,8 @@ def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
 
 def test_a_single_primitive_is_carried_out_at_any_horizon(two_rooms: str) -> None:
     for execute, expected in (("primitive", 1), ("sequence", 0)):
-        defaults = AR(two_rooms, execute=execute).defaults
-        assert wiw.Agent(SizeReader(), horizon=6).settled(defaults).execute == expected
+        task = AR(two_rooms, execute=execute)
+        assert agent_for(task, wiw.Agent(SizeReader(), horizon=6)).config.execute == expected
 
 
 def test_the_official_box_is_around_the_largest_piece_and_larger() -> None:
@@ -290,4 +290,4 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     )
     outcome = {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}
     missed = Attempt("none", outcome, (), None, task.wording, CHOICES)
-    assert missed.text == "taken for shelf in 0 decisions"
+    assert missed.text == "answered shelf after 0 decisions"

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from wiw.evaluation.runlog import load_run
-from wiw.evaluation.store import RunStore
+from wiw.runs.store import RunStore
+from wiw.studies.run_log import load_run
 
 BUSY = """
 from pathlib import Path

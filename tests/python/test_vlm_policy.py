@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
@@ -20,7 +21,7 @@ from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
-from wiw.loop.agent import Query
+from wiw.loop.memory import Query
 from wiw.policies.vlm import VLM, presets, prompt_images
 from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
@@ -60,7 +61,7 @@ def imagenav(scene: str) -> Any:
 
 def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
     _, info = env.reset(options={"episode": 0})
-    agent = wiw.Agent(policy, model, **options).settled(env.unwrapped.task.defaults)
+    agent = agent_for(env.unwrapped.task, wiw.Agent(policy, model, **options))
     return agent.decide(env.observation, env.goal, info["key"])
 
 
@@ -318,7 +319,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
 
 def test_recipes_that_name_no_server_are_replayed_too() -> None:
     assert AgentRecipe("vlm").replaying(Path("r")).policy_options == {"vlm": {"vlm": "replay:r", "cache": "off"}}
-    recipe = AgentRecipe("heuristic", revision="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
+    recipe = AgentRecipe("heuristic", reviser="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
     assert recipe.replaying(Path("r")).policy_options["vlm"] == {"vlm": "replay:r", "cache": "off", "tries": 2}
     assert recipe.describe()["policy_options"] == {"vlm": {"tries": 2}}, "the address is no part of the identity"
     assert AgentRecipe("matcher").replaying(Path("r")) == AgentRecipe("matcher")
@@ -329,7 +330,7 @@ def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str)
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
         log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/status"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/status"
 
 
 def test_the_command_line_against_the_tiny_random_model(

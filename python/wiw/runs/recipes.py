@@ -306,7 +306,7 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     """
     recipe = agent_recipe(agent)
     if arms is None:
-        return {recipe.arm if isinstance(recipe, AgentRecipe) else "none": recipe}
+        return {_name_own_arm(agent, recipe): recipe}
     if not isinstance(recipe, AgentRecipe):
         raise ArgumentError(f"arms: {type(agent).__name__} has no world model that could be another")
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
@@ -314,6 +314,13 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     if len(dict(made)) < max(1, len(made)):
         raise ArgumentError(f"arms: expected different world models, got {[name for name, _ in made]}")
     return dict(made)
+
+
+def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
+    """Return the name of an agent's own model: a recipe's as its user writes it, else its class behind all wrappers."""
+    if isinstance(agent, Agent):
+        return "none" if agent.model is None else type(agent.model.unwrapped).__name__.lower()
+    return recipe.arm if isinstance(recipe, AgentRecipe) else "none"
 
 
 def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, AgentRecipe]:
