@@ -242,11 +242,12 @@ def test_the_oracle_imagines_in_place_of_any_model() -> None:
         assert "placebo" not in agent.describe() and agent.describe()["model"] == wiw.world_model("oracle").describe()
 
 
-def test_an_agent_says_which_of_its_policies_is_given_the_truth() -> None:
+@pytest.mark.parametrize("policy", ["heuristic", Noise()], ids=["another reviser", "its own reviser"])
+def test_an_agent_says_which_of_its_policies_is_given_the_truth(policy: Any) -> None:
     context = RunContext(ImageNav(scenes="apartments:val:1"))
 
     def describe(*stages: str) -> Any:
-        return AgentRecipe("heuristic", "copy", ground_truth=stages).build(context).describe()
+        return AgentRecipe(policy, "copy", ground_truth=stages).build(context).describe()
 
     plain, scoring, proposals = describe(), describe("scoring"), describe("proposals")
     assert scoring == {**plain, "revision": {**plain["revision"], "ground_truth": "scoring"}}
