@@ -48,7 +48,7 @@ class Parts:
         if model is not None:
             space.check_model(model, config.longest)
             if "semantic" in set(model.accepts.needs) - imaginer.gives:
-                raise ArgumentError(f"{type(model.base).__name__} {NO_SEMANTICS}")
+                raise ArgumentError(f"{type(model.unwrapped).__name__} {NO_SEMANTICS}")
             if config.depth > 1:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers
