@@ -22,7 +22,6 @@ import wiw
 from recognition_file import CHOICES, a_file
 from wiw import panorama
 from wiw.errors import ArgumentError
-from wiw.policies.vlm import VLM
 from wiw.policies.vlm.prompt_images import VIEW
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import served
@@ -90,7 +89,9 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
 
     def run(task: str, model: Any) -> Any:
         server.client.calls.clear()
-        policy = VLM(server.url, "scripted", dialect="vllm", proposals="listed", cache="off")
+        space = "pose7" if task == "manipulation" else "discrete"
+        asked: Any = {"model": "scripted", "dialect": "vllm", "proposals": "listed", "cache": "off"}
+        policy = wiw.policy("vlm", vlm=server.url, space=space, **asked)
         labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
         agent = AgentRecipe(policy, model, semantics=labels, candidates=2, horizon=2)
         how: Any = {"progress": False, "keep_images": 0, "cache": "off"}
