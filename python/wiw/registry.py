@@ -284,12 +284,12 @@ METRICS = Registry(
     "metric",
     "wiw.metrics",
     {
-        "success": "wiw.metrics.headlines:SUCCESS",
-        "spl": "wiw.metrics.headlines:SPL",
-        "mean_trajectory": "wiw.metrics.headlines:MEAN_TRAJECTORY",
-        "refused": "wiw.metrics.headlines:REFUSED",
+        "success": "wiw.metrics.metric:SUCCESS",
+        "spl": "wiw.metrics.metric:SPL",
+        "mean_trajectory": "wiw.metrics.metric:MEAN_TRAJECTORY",
+        "refused": "wiw.metrics.metric:REFUSED",
     },
-    "wiw.metrics.headlines:Headline",
+    "wiw.metrics.metric:Metric",
 )
 
 

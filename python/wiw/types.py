@@ -441,12 +441,12 @@ class DecisionRecord:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The end of one episode. `status` is "failed" when infrastructure failed, and then nothing counts as a score."""
+    """The end of one episode. `status` is "error" where something broke; it then counts in no score."""
 
     episode: int
     episode_id: str
     scene: str
-    status: Literal["done", "failed"]
+    status: Literal["done", "error"]
     metrics: Mapping[str, float] = field(default_factory=dict)
     """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
     AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of

@@ -290,4 +290,4 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     )
     outcome = {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}
     missed = Attempt("none", outcome, (), None, task.wording, CHOICES)
-    assert missed.text == "taken for shelf in 0 decisions"
+    assert missed.text == "answered shelf after 0 decisions"

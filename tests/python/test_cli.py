@@ -97,12 +97,14 @@ def test_report_and_resume_of_a_finished_run(tmp_path, capsys):
     assert list(load_run(tmp_path / "run").episodes) == before
 
 
-def test_failed_episodes_are_said_aloud_and_can_be_retried(tmp_path, capsys):
+def test_errors_are_printed_and_can_be_retried(tmp_path, capsys):
     assert run("--scenes", "broken", "--episodes", 3, "--out", tmp_path / "run", "--no-report") == 1
     shown = capsys.readouterr()
-    assert "1 episode failed for infrastructure" in shown.err
+    assert "1 infrastructure error, excluded from scores" in shown.err
     assert "INVALID RUN" in shown.out and "2/3" in shown.out
-    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 1
+    assert main(["resume", str(tmp_path / "run"), "--retry-errors", "--no-report"]) == 1
+    assert "no such scene" in capsys.readouterr().err
+    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 1  # the old name
     assert "no such scene" in capsys.readouterr().err
 
 

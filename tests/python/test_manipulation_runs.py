@@ -180,7 +180,7 @@ def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     options = {"tasks": "push_buttons", "actions": 4, "seed": 3}
     log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False, keep_images=0)
     assert [episode["metrics"]["success"] for episode in log.episodes] == [0.0, 0.0]
-    found = wiw.attribute(tmp_path, progress=False)["copy"]
+    found = wiw.blame(tmp_path, progress=False)["copy"]
     assert found.verdicts["beyond"] == 1 and sum(found.verdicts.values()) == 2
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from wiw.studies.run_log import load_run
 from wiw.runs.store import RunStore
+from wiw.studies.run_log import load_run
 
 BUSY = """
 from pathlib import Path

@@ -12,10 +12,10 @@ import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.studies.evaluate import resume_run, run_arms
 from wiw.report.export import tables
-from wiw.studies.run_log import load_run
 from wiw.runs.store import DECISION_JSON
+from wiw.studies.evaluate import resume_run, run_arms
+from wiw.studies.run_log import load_run
 
 ODD = (
     "",

@@ -331,7 +331,7 @@ def test_a_server_that_is_too_slow_is_infrastructure(tmp_path: Path) -> None:
         policy = ArmVLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
         log = evaluate(Manipulation(), wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/timeout"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/timeout"
 
 
 def test_the_tiny_random_model_writes_plans() -> None:

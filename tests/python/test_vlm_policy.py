@@ -330,7 +330,7 @@ def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str)
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
         log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/status"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/status"
 
 
 def test_the_command_line_against_the_tiny_random_model(

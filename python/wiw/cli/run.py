@@ -110,10 +110,11 @@ def run(
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.
         live: Episodes kept live at a time in a process, so that model calls are batched.
-        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, of manipulation one of each kind at
-            least; all: every one, at 0.2 MB a decision.
-        deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
-            episode is recorded as failed for infrastructure, which is never a failure of the task.
+        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, with one in which a model succeeds and
+            the floor fails if there is any (so up to 12 keep them until the run ends); of manipulation at least one of
+            each kind; all: every one, at 0.2 MB per decision.
+        deadline: Most seconds for a call of the world model, 300 if not given. A call is retried twice; after that the
+            episode is an infrastructure error, excluded from scores.
         cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
             themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model that declares a version; or off.
         cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
@@ -166,7 +167,7 @@ def resume(
     /,
     *,
     workers: MaybeCount = None,
-    retry_failed: bool = False,
+    retry_errors: bool = False,
     report: bool = True,
 ) -> int:
     """Goes on with a run that was stopped: only the episodes that have not ended are run.
@@ -176,26 +177,30 @@ def resume(
     Args:
         run: The run's folder.
         workers: Processes; as many as it was begun with if not given.
-        retry_failed: Whether to run episodes again whose infrastructure failed.
+        retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         report: Whether to write report.html at the end.
     """
     from wiw.studies.evaluate import resume_run
 
-    return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
+    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors), run), report)
 
 
 def finish(log: Any, report: bool) -> int:
-    """Prints the table and what went wrong, writes the report; 1 if the run is invalid."""
+    """Print tables and errors, write the report; return 1 if the run is invalid."""
+    from wiw.report.tables import print_fidelity
+
     numbers = log.summary()
-    failed = [episode for episode in log.episodes if episode["status"] == "failed"]
-    if failed:
-        count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
-        first, cause = failed[0], failed[0]["error"].strip().splitlines()[-1]
+    print_fidelity(log)
+    errors = [episode for episode in log.episodes if episode["status"] == "error"]
+    if errors:
+        count = "1 infrastructure error" if len(errors) == 1 else f"{len(errors)} infrastructure errors"
+        first, cause = errors[0], errors[0]["error"].strip().splitlines()[-1]
         print(
-            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {printable(cause)}",
+            f"\n{count}, excluded from scores. "
+            f"The first, {first['arm']} episode {first['episode']}: {printable(cause)}",
             file=sys.stderr,
         )
-        print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)
+        print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
     if report:
         print(f"report  {log.report()}")

@@ -120,7 +120,7 @@ def scale(
         print(path)
     problems = found.log.numbers().invalid
     for reason in problems:
-        print(f"INVALID RUN, not to be quoted: {reason}")
+        print(f"INVALID RUN, do not report: {reason}")
     return 1 if problems else 0
 
 

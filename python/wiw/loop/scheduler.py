@@ -174,4 +174,4 @@ def _finished(trial: Trial) -> EpisodeResult:
 def _failed(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     seconds = time.perf_counter() - begin
-    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, seconds, text, kind)
+    return EpisodeResult(index, episode.episode_id, episode.scene, "error", {}, seconds, text, kind)

@@ -77,8 +77,10 @@ def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunCo
     reviser = parts.reviser
     if reviser is None and policy.default_revision is not None:
         reviser = context.task.defaults.get("revision")
+    if "scoring" in stages or "proposals" in stages:
+        reviser = Parts(policy, imaginer, reviser, config, ()).build().reviser
     if "scoring" in stages:
-        reviser = TrueScores(Parts(policy, imaginer, reviser, config, ()).build().reviser)
+        reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
     observers = [FidelityObserver(limits.lpips)] if limits.fidelity or limits.lpips is not None else []

@@ -317,7 +317,7 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
 
 
 def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
-    """Return the name of an agent's own model: a recipe's as its user writes it, else its class, behind all wrappers."""
+    """Return the name of an agent's own model: a recipe's as its user writes it, else its class behind all wrappers."""
     if isinstance(agent, Agent):
         return "none" if agent.model is None else type(agent.model.unwrapped).__name__.lower()
     return recipe.arm if isinstance(recipe, AgentRecipe) else "none"

@@ -240,7 +240,7 @@ class _Crew:
                 self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
             else:
                 error = f"the worker process died twice on this episode, last: {cause}"
-                result = EpisodeResult(index, episode.episode_id, episode.scene, "failed", error=error, kind="worker")
+                result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
                 self._desk.write(OutcomeRow(worker.job.arm, result))
 
 

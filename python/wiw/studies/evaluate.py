@@ -13,14 +13,8 @@ from typing import Any, Literal
 
 from wiw.errors import ArgumentError, Error, StoreError
 from wiw.metrics import Lpips
-from wiw.runs.execute import (
-    recipes_of,
-    require_left,
-    require_own_sources,
-    run_pending,
-    sources_of,
-    with_pictures,
-)
+from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
+from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
 from wiw.runs.store import RunStore, removed_if_empty
@@ -70,8 +64,9 @@ def evaluate(
             "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
             mapping gives the arms names of their own. None means the agent's own model.
         live: episodes kept live at a time in each process, so that model calls are batched.
-        keep_images: how many episodes keep pictures for report and view, spread evenly; "all" for every one. Where a
-            task has several kinds, one of each does at least, unless it is 0.
+        keep_images: how many episodes keep pictures for report and view, spread evenly but for one in which a model
+            succeeds and the floor fails; "all" for every one. Where a task has several kinds, at least one of each,
+            unless it is 0.
         resume: whether to go on with the run in `out` where it was stopped.
         deadline: seconds that a call of a world model may take before it counts as failed; None means the agent's own,
             300 unless it was given another.
@@ -123,7 +118,7 @@ def run_arms(
 
 
 def resume_run(
-    run: str | Path, workers: int | None = None, progress: bool = True, retry_failed: bool = False
+    run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False
 ) -> RunLog:
     """Goes on with a run of named parts: only episodes that have not ended are run.
 
@@ -131,7 +126,7 @@ def resume_run(
         run: the run's folder.
         workers: processes; None means as many as it was begun with.
         progress: whether to show bars.
-        retry_failed: whether to run episodes again whose infrastructure failed.
+        retry_errors: whether to rerun episodes that ended with an infrastructure error.
 
     Raises:
         ArgumentError: fewer than one worker.
@@ -154,8 +149,8 @@ def resume_run(
     except Error:
         store.close()
         raise
-    require_left(built, store, agents, retry_failed)
-    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_failed=retry_failed)
+    require_left(built, store, agents, retry_errors)
+    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
 
 
 FOR_EVER = 1e12
@@ -248,7 +243,7 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
     }
     for recipe in agents.values():
         recipe.require(config["task"])
-    if options.resume and options.out is not None and RunStore.begun(options.out):
+    if options.resume and options.out is not None and RunStore.exists(options.out):
         store = RunStore.resume(options.out, config)
         require_left(built, store, agents)
         require_own_sources(store, task, agents)
@@ -262,7 +257,8 @@ def _run(task: Any, agents: Mapping[str, Any], options: _Options) -> RunLog:
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "sources": sources_of(task, agents),
-            "pictures": with_pictures(episodes, options.pictures),
+            "pictures": pool_episodes(episodes, options.pictures),
+            "keep_images": options.pictures,
             "scenes": used,
             "stage": built.stage,
             "wording": asdict(built.wording),
@@ -285,9 +281,9 @@ def _finish(
     workers: int,
     progress: bool,
     *,
-    retry_failed: bool = False,
+    retry_errors: bool = False,
 ) -> RunLog:
     """Runs what is missing, closes the store and opens it for reading."""
-    pending = {arm: store.pending(arm, retry_failed) for arm in agents}
+    pending = {arm: store.pending(arm, retry_errors) for arm in agents}
     run_pending(store, task, agents, pending, workers, progress)
     return RunLog(RunStore.read(store.path))

@@ -19,13 +19,14 @@ from wiw.analysis.costs import costs
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
+from wiw.report.tables import print_stacked
 from wiw.runs.recipes import agent_recipe, task_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
 
 CANDIDATES = (1, 2, 4, 8)
-"""Swept where nothing is said."""
+"""Values of the sweep by default."""
 
 
 @dataclass(frozen=True)
@@ -38,30 +39,30 @@ class ScalePoint:
     value: float
     success: Estimate
     rollouts: float
-    """Imagined futures an episode, whether the model or the cache gave them: the paper's world-model inferences."""
+    """Imagined futures per episode, from the model or the cache: the paper's world-model inferences."""
     consultations: float
-    """Decisions an episode for which the model was consulted."""
+    """Decisions per episode that consulted the model."""
     calls: float
-    """Batches an episode that the model was asked for, without what came from the cache."""
+    """Batches per episode sent to the model, without rollouts from the cache."""
     cached: float
     """Share of the rollouts that came from the cache."""
     seconds: float
-    """Wall time an episode, all stages."""
+    """Wall time per episode, all stages."""
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """What `wiw.scale` found."""
+    """The result of `wiw.scale`."""
 
     log: RunLog
     points: tuple[ScalePoint, ...]
 
     def to_json(self) -> str:
-        """The points as JSON."""
+        """Return the points as JSON."""
         return json.dumps({"points": json.loads(to_json([asdict(point) for point in self.points]))}, indent=2)
 
     def svg(self) -> str:
-        """Success against imagined futures, with intervals."""
+        """Return the plot of success against imagined futures, with intervals."""
         from wiw.report.plots import success_by_rollouts
 
         series: dict[str, list[tuple[float, Estimate, str]]] = {}
@@ -70,27 +71,25 @@ class Scaling:
         return str(success_by_rollouts({name.replace("_", " "): points for name, points in series.items()}))
 
     def save(self) -> tuple[Path, Path]:
-        """Writes scale.json and scale.svg into the run's folder."""
+        """Write scale.json and scale.svg into the run's folder."""
         written = self.log.path / "scale.json", self.log.path / "scale.svg"
         for path, text in zip(written, (self.to_json(), self.svg()), strict=True):
             path.write_text(text, encoding="utf-8")
         return written
 
     def summary(self) -> None:
-        """Prints the table."""
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-
-        table = Table(title="More imagination", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-        for title in ("arm", "SR % ↑", "rollouts", "consulted", "calls", "cached", "s"):
-            table.add_column(title, justify="left" if title == "arm" else "right")
-        for point in self.points:
-            numbers = (f"{value:.1f}" for value in (point.rollouts, point.consultations, point.calls))
-            cached, seconds = f"{100 * point.cached:.0f} %", f"{point.seconds:.2f}"
-            table.add_row(point.arm, show_estimate(point.success), *numbers, cached, seconds)
-        console = Console()
-        Console(width=None if console.is_terminal else max(console.width, 100)).print(table)
+        """Print the table."""
+        rows = [
+            [
+                show_estimate(point.success),
+                *(f"{value:.1f}" for value in (point.rollouts, point.consultations, point.calls)),
+                f"{100 * point.cached:.0f} %",
+                f"{point.seconds:.2f}",
+            ]
+            for point in self.points
+        ]
+        titles = ["SR % ↑", "rollouts", "consulted", "calls", "cached", "s"]
+        print_stacked("Inference-time scaling, per episode", [point.arm for point in self.points], titles, rows)
 
 
 def scale(
@@ -111,7 +110,7 @@ def scale(
     resume: bool = False,
     **task_options: Any,
 ) -> Scaling:
-    """Runs an agent with different amounts of imagination on the same episodes.
+    """Run an agent with different amounts of imagination on the same episodes.
 
         found = wiw.scale("imagenav", wiw.Agent("matcher", "warp"), candidates=[1, 2, 4, 8], scenes="apartments:val")
         found.summary()
@@ -153,7 +152,7 @@ def scale(
 def _amounts(
     candidates: Sequence[int] | None, fractions: Sequence[float] | None
 ) -> dict[tuple[str, float], dict[str, Any]]:
-    """What is changed of the agent for each (sweep, value)."""
+    """Return the options of the agent for each (sweep, value)."""
     if candidates is None and fractions is None:
         candidates = CANDIDATES
     for name, values in (("candidates", candidates), ("imagine_fraction", fractions)):
@@ -176,18 +175,18 @@ def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
 
 
 def _points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:
-    """One point for each arm of which an episode was judged."""
+    """Return one point per arm that has a scored episode."""
     summary, found = log.numbers(), []
     for line in costs(log):
-        judged = summary[line.arm].estimates.get("success")
-        if judged is None:
+        success = summary[line.arm].estimates.get("success")
+        if success is None:
             continue
         rows = line.calls.get("rows", 0.0)
         found.append(
             ScalePoint(
                 line.arm,
                 *amounts[line.arm],
-                judged,
+                success,
                 rows / line.episodes,
                 line.calls.get("consultations", 0.0) / line.episodes,
                 line.spent.get("calls", 0.0) / line.episodes,
