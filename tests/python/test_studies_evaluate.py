@@ -153,9 +153,8 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
     built = {name: agent_for(LineTask(), recipe) for name, recipe in made.items()}
     assert built["this"].model.unwrapped is mine and built["off"].model is None and built["h"].model is None
     assert [type(built[name].model.unwrapped).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
-    assert type(built["h"].policy).__name__ == "Heuristic" and {each.config.candidates for each in built.values()} == {
-        4
-    }
+    assert type(built["h"].policy).__name__ == "Heuristic"
+    assert {each.config.candidates for each in built.values()} == {4}
     assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
     with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
         arm_recipes(agent, [mine, Mine])
