@@ -314,7 +314,9 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None
     with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
         options = {"vlm": server.url, "dialect": "vllm", "tries": 1, "cache": "off"}
         recipe = AgentRecipe("vlm", "copy", candidates=2, policy_options={"vlm": options})
-        log = evaluate("manipulation", recipe, 1, seed=0, out=tmp_path / "run", progress=False, tasks="slide_block", actions=6)
+        log = evaluate(
+            "manipulation", recipe, 1, seed=0, out=tmp_path / "run", progress=False, tasks="slide_block", actions=6
+        )
     assert not any(episode["error"] for episode in log.episodes), "".join(e["error"] for e in log.episodes)
     rows = list(log.store.decisions("copy"))
     exchanges = [each for row in rows for each in row["exchanges"]]

@@ -17,6 +17,8 @@ from wiw.cli.terminal import printable
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
 
+SEARCH, SETTINGS = AgentConfig(), RunConfig()
+"""What holds where the command line says nothing."""
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -51,8 +53,8 @@ def run(
     semantics: MaybeName = None,
     semantics_option: Options = (),
     report: bool = True,
-    search: Annotated[AgentConfig, arg(name="")] = AgentConfig(),
-    config: Annotated[RunConfig, arg(name="")] = RunConfig(),
+    search: Annotated[AgentConfig, arg(name="")] = SEARCH,
+    config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
 

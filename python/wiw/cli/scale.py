@@ -16,6 +16,8 @@ from wiw.runs.config import RunConfig
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
 Values = Annotated[str | None, arg(metavar="A,B,...")]
+SETTINGS = RunConfig()
+"""What holds where the command line says nothing."""
 
 
 def scale(
@@ -40,7 +42,7 @@ def scale(
     vlm_model: Annotated[str | None, arg(metavar="NAME")] = None,
     semantics: Annotated[str | None, arg(metavar="NAME")] = None,
     semantics_option: Options = (),
-    config: Annotated[RunConfig, arg(name="")] = RunConfig(),
+    config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
     """Success against the number of futures that a world model imagines, all amounts on the same episodes.
 

@@ -26,6 +26,8 @@ from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
 
+EPISODES = 20
+"""Where neither the caller nor the config says how many."""
 CANDIDATES = (1, 2, 4, 8)
 """Values of the sweep by default."""
 
@@ -125,7 +127,12 @@ def scale(
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
     own, task_options = take_settings(config, settings)
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
-    log = run_arms(env_or_task, agents, config=replace(own, out=out, keep_images=0), **task_options)
+    log = run_arms(
+        env_or_task,
+        agents,
+        config=replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES),
+        **task_options,
+    )
     return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
 
