@@ -72,7 +72,7 @@ def test_list_names_everything_with_a_line(capsys):
         "imagenav",
         "spl",
         "wiw.world_models",
-        "Predicts that every future frame",
+        "predicts that every",
     ):
         assert name in shown
 

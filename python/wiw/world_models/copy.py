@@ -34,5 +34,5 @@ class CopyFront(Copy):
 
 
 def make_copy(space: str = PRIMITIVES) -> Copy:
-    """Return the floor of a plan space."""
+    """Return the floor, which predicts that every future frame equals the observation."""
     return CopyFront() if space == GRIPPER_POSES else Copy()
