@@ -72,7 +72,7 @@ def test_list_names_everything_with_a_line(capsys):
         "imagenav",
         "spl",
         "wiw.world_models",
-        "Predict that every future frame",
+        "predicts that every",
     ):
         assert name in shown
 
@@ -449,7 +449,7 @@ def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, cap
         return code, capsys.readouterr().err
 
     code, said = ends("Quits")
-    assert code == 1 and "1 episode failed for infrastructure" in said and "SystemExit(0)" in said
+    assert code == 1 and "1 infrastructure error, excluded from scores" in said and "SystemExit(0)" in said
     code, said = ends("Unmade")
     assert code == 2 and "cannot be made: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
     code, said = ends("Endless", "--deadline", "0.2")

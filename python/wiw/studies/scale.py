@@ -127,12 +127,8 @@ def scale(
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
     own, task_options = take_settings(config, settings)
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
-    log = run_arms(
-        env_or_task,
-        agents,
-        config=replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES),
-        **task_options,
-    )
+    run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)
+    log = run_arms(env_or_task, agents, config=run_config, **task_options)
     return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
 
