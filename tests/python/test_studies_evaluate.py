@@ -15,6 +15,9 @@ from fakes import LineAgent, LineTask, agent_for
 import wiw
 import wiw.tasks.navigation
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
+from wiw.experiments.fidelity import FidelityObserver
+from wiw.experiments.gating import Gated
+from wiw.experiments.placebos import ShuffledPlacebo
 from wiw.loop.attempts import Attempted
 from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, absolute, arm_recipes
 from wiw.runs.store import store_path
@@ -380,3 +383,18 @@ def test_a_run_that_begins_with_the_same_failure_stops_and_says_so(tmp_path):
     ):
         run_arms(task, {"a": LineAgent()}, episodes=12, out=tmp_path / "run", progress=False)
     assert len(wiw.load_run(tmp_path / "run").episodes) == 5
+
+
+def test_agents_of_wrapped_parts_are_evaluated_as_they_are(two_rooms: str, tmp_path: Path) -> None:
+    agent = wiw.Agent(
+        "heuristic",
+        Gated(ShuffledPlacebo(Attempted(wiw.world_model("copy"), 5.0)), 0.5),
+        "matcher",
+        candidates=2,
+        observers=[FidelityObserver()],
+    )
+    log = wiw.evaluate("imagenav", agent, 1, scenes=two_rooms, decisions=4, out=tmp_path / "run", progress=False)
+    said = log.store.config["arms"][0]["agent"]["model"]
+    assert (said["placebo"], said["imagine_fraction"]) == ("shuffled", 0.5)
+    imagined = [row for row in log.decisions if row["fidelity"] is not None]
+    assert 0 < len(imagined) < len(log.decisions) == 4

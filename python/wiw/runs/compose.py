@@ -68,19 +68,20 @@ def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunCo
         reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
-    observers = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
+    measured = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
+    observers = [*parts.observers, *measured]
     return Agent(policy, imaginer, reviser, config, observers=observers)
 
 
-def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options: Any) -> WorldModel | None:
-    """Return a world model for plans of a space, from a name, class or instance; None for "none"."""
-    if model is None or isinstance(model, WorldModel):
+def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options: Any) -> WorldModel | Imaginer | None:
+    """Return a world model for plans of a space, from a name or class; instances and imaginers as they are."""
+    if model is None or isinstance(model, WorldModel | Imaginer):
         return model
     return make_model(model, deadline, **{**space_option(WORLD_MODELS, model, space), **options})
 
 
 def _wrap_model(
-    model: WorldModel | None,
+    model: WorldModel | Imaginer | None,
     space: str,
     placebo: str | None,
     experiment: Experiment,
@@ -91,8 +92,7 @@ def _wrap_model(
         if placebo is not None:
             raise ArgumentError(f"placebo='{placebo}' needs a world model, and this agent has none")
         return None
-    attempted = Attempted(model, limits.deadline)
-    imaginer: Imaginer = ModelImaginer(cache_rollouts(attempted, limits.cache, limits.cache_gb))
+    imaginer = model if isinstance(model, Imaginer) else ModelImaginer(_limit(model, limits))
     if experiment.semantics is not None:
         imaginer = Labelled(imaginer, experiment.semantics)
     if placebo is not None:
@@ -100,6 +100,13 @@ def _wrap_model(
     if experiment.imagine_fraction is not None:
         imaginer = Gated(imaginer, experiment.imagine_fraction)
     return imaginer
+
+
+def _limit(model: WorldModel, limits: Limits) -> WorldModel:
+    """Return the model with deadline, retries and cache; one that its user has wrapped stays as it is."""
+    if model is not model.unwrapped:
+        return model
+    return cache_rollouts(Attempted(model, limits.deadline), limits.cache, limits.cache_gb)
 
 
 def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContext) -> Imaginer:

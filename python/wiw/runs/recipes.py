@@ -14,7 +14,9 @@ from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
+from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
+from wiw.loop.observers import Observer
 from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
@@ -79,6 +81,8 @@ class AgentRecipe(AgentConfig):
     semantics: Any = None
     semantics_options: Mapping[str, Any] = field(default_factory=dict)
     """What the source of semantics is made with."""
+    observers: Sequence[Observer] = ()
+    """Measure decisions; objects in memory."""
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> Agent:
         """Return the agent; numbers that are open are the task's."""
@@ -91,7 +95,7 @@ class AgentRecipe(AgentConfig):
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
-        return compose(Parts(policy, model, reviser, self.config, ()), experiment, limits, context)
+        return compose(Parts(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context)
 
     @property
     def config(self) -> AgentConfig:
@@ -114,7 +118,7 @@ class AgentRecipe(AgentConfig):
     def is_named(self) -> bool:
         """Whether all parts are names, so that any process can make them again."""
         parts = (self.policy, self.model, self.reviser, self.semantics)
-        return all(part is None or isinstance(part, str) for part in parts)
+        return not self.observers and all(part is None or isinstance(part, str) for part in parts)
 
     def to_json(self) -> dict[str, Any] | None:
         """Return the recipe for the run store; `AgentRecipe.from_json` is the way back. None with objects in memory."""
@@ -158,7 +162,7 @@ class AgentRecipe(AgentConfig):
             if isinstance(part, str):
                 found |= {} if part in registry.built_in else source_digests(registry.find(part))
             elif part is not None:
-                found |= source_digests(part)
+                found |= source_digests(_unwrap(part))
         return found
 
     def require(self, task: Mapping[str, Any]) -> None:
@@ -201,13 +205,19 @@ class AgentRecipe(AgentConfig):
         return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **self.policy_options[policy]})
 
 
-_FIELDS = tuple(field.name for field in fields(AgentRecipe))
+_FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
 _RENAMED = {"revision": "reviser", "swaps": "ground_truth"}
+
+
+def _unwrap(part: Any) -> Any:
+    """Return the model or policy behind everything that wraps it."""
+    model = part.model if isinstance(part, Imaginer) else part
+    return model.unwrapped if isinstance(model, Policy | WorldModel) else model
 
 
 def _describe(part: Any) -> Any:
     """Return a part's name, or what an object says of itself."""
-    if isinstance(part, Policy | WorldModel):
+    if isinstance(part, Policy | WorldModel | Imaginer):
         return part.describe()
     return part.__name__ if isinstance(part, type) else part
 
@@ -294,7 +304,7 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
         return agent
     if isinstance(agent, Agent):
         parts = agent.parts
-        return AgentRecipe(parts.policy, parts.model, parts.reviser, **parts.config.numbers)
+        return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
     if isinstance(agent, BaseAgent):
         return AgentInMemory(agent)
     raise ArgumentError(f"expected a wiw.Agent, an AgentRecipe or a BaseAgent, got {type(agent).__name__}")
