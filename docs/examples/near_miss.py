@@ -13,4 +13,4 @@ def is_near(metrics: Mapping[str, float]) -> float:
     return float(metrics["distance_to_goal"] < 1.5)
 
 
-NEAR = wiw.Headline("near", "Near", "rate", True, of=is_near, about="Episodes that end within 1.5 m of the goal.")
+NEAR = wiw.Metric("near", "Near", "rate", True, of=is_near, about="Episodes that end within 1.5 m of the goal.")

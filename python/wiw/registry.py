@@ -11,7 +11,6 @@ wiw.world_model(MyModel)                 the class itself, or an instance
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import inspect
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
+from wiw.suggestions import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,7 @@ class Registry:
             return partial(self.find(prefix + colon), argument)
         if colon:
             return self._load(name, partial(_attribute, name))
-        near = difflib.get_close_matches(name, self.names(), n=3)
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        hint = did_you_mean(name, self.names())
         raise RegistryError(
             f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
             + "or give path.py:Class, package.module:Class"
@@ -255,6 +254,7 @@ TASKS = Registry(
         "ar": "wiw.tasks.ar:AR",
         "manipulation": "wiw.tasks.manipulation:Manipulation",
     },
+    "wiw.tasks.base:Task",
 )
 TRACKERS = Registry(
     "tracker",
@@ -289,12 +289,12 @@ METRICS = Registry(
     "metric",
     "wiw.metrics",
     {
-        "success": "wiw.metrics.headlines:SUCCESS",
-        "spl": "wiw.metrics.headlines:SPL",
-        "mean_trajectory": "wiw.metrics.headlines:MEAN_TRAJECTORY",
-        "refused": "wiw.metrics.headlines:REFUSED",
+        "success": "wiw.metrics.metric:SUCCESS",
+        "spl": "wiw.metrics.metric:SPL",
+        "mean_trajectory": "wiw.metrics.metric:MEAN_TRAJECTORY",
+        "refused": "wiw.metrics.metric:REFUSED",
     },
-    "wiw.metrics.headlines:Headline",
+    "wiw.metrics.metric:Metric",
 )
 
 
@@ -379,9 +379,15 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
 def _task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The task, and those of the options that are its environments'."""
     name = task_name(task_id)
-    senses = getattr(TASKS.find(name), "senses", ())
-    task = TASKS.make(name, **{key: value for key, value in options.items() if key not in senses})
-    return task, {key: value for key, value in options.items() if key in senses}
+    sensors = task_class(name).sensor_options
+    task = TASKS.make(name, **{key: value for key, value in options.items() if key not in sensors})
+    return task, {key: value for key, value in options.items() if key in sensors}
+
+
+def task_class(name: str) -> Any:
+    """Return the class behind a task's name; `wiw.Task` for a factory, which says nothing before it is called."""
+    found = TASKS.find(name)
+    return found if inspect.isclass(found) else _attribute(TASKS.base)
 
 
 def task_name(task_id: str) -> str:

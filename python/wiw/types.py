@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,10 @@ from wiw.errors import ArgumentError
 
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
-PRIMITIVES, GRIPPER_POSES = "discrete", "pose7"
-"""What plans can be made of (`wiw.loop.plan_space`): primitives, or poses of a gripper (x, y, z, roll, pitch, yaw,
-gripper)."""
+PRIMITIVES: Final = "discrete"
+"""Plans are ids of `wiw.action`, int8 [K]."""
+GRIPPER_POSES: Final = "pose7"
+"""Plans are poses of a gripper (x, y, z, roll, pitch, yaw, gripper), float64 [K, 7]."""
 
 
 @dataclass(frozen=True)
@@ -440,12 +441,12 @@ class DecisionRecord:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The end of one episode. `status` is "failed" when infrastructure failed, and then nothing counts as a score."""
+    """The end of one episode. `status` is "error" where something broke; it then counts in no score."""
 
     episode: int
     episode_id: str
     scene: str
-    status: Literal["done", "failed"]
+    status: Literal["done", "error"]
     metrics: Mapping[str, float] = field(default_factory=dict)
     """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
     AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of

@@ -22,11 +22,11 @@ import wiw
 from recognition_file import CHOICES, a_file
 from wiw import panorama
 from wiw.errors import ArgumentError
-from wiw.policies.vlm import VLM
 from wiw.policies.vlm.prompt_images import VIEW
+from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import served
 from wiw.serving.vlm_server import VlmServer
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 NAMES = wiw.registry.list_world_models()
@@ -89,11 +89,13 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
 
     def run(task: str, model: Any) -> Any:
         server.client.calls.clear()
-        policy = VLM(server.url, "scripted", dialect="vllm", proposals="listed", cache="off")
-        labels = {"semantics": "simulator"} if model is not None and "semantic" in model.accepts.needs else {}
-        space: Any = {"space": "pose7"} if task == "manipulation" else {}
-        agent = wiw.Agent(policy, model, candidates=2, horizon=2, cache="off", **space, **labels)
-        return wiw.evaluate(task, agent, 1, 0, tmp_path / "run", progress=False, keep_images=0, **options(task))
+        space = "pose7" if task == "manipulation" else "discrete"
+        asked: Any = {"model": "scripted", "dialect": "vllm", "proposals": "listed", "cache": "off"}
+        policy = wiw.policy("vlm", vlm=server.url, space=space, **asked)
+        labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
+        agent = AgentRecipe(policy, model, semantics=labels, candidates=2, horizon=2)
+        how: Any = {"progress": False, "keep_images": 0, "cache": "off"}
+        return wiw.evaluate(task, agent, 1, seed=0, out=tmp_path / "run", **how, **options(task))
 
     return run
 

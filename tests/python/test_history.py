@@ -13,16 +13,18 @@ from history_models import Recalling, digest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
-from wiw.evaluation.recipes import AgentRecipe, TaskRecipe
-from wiw.loop.agent import Query
-from wiw.loop.attempts import Attempts
-from wiw.loop.beam import moved
+from wiw.experiments.placebos import SwappedPlacebo
+from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
 from wiw.loop.history import EpisodeHistories, Frame, relative_poses, stack_histories
-from wiw.loop.imagine import imagine
-from wiw.loop.rollout_cache import Remembered, RolloutCache
+from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.memory import Query
+from wiw.loop.plan_space import plan_space
+from wiw.loop.rollout_cache import Cached, RolloutCache
 from wiw.loop.scheduler import run_episodes
-from wiw.policies.base import FrameSpec
+from wiw.loop.search import move
+from wiw.policies.base import FrameSpec, Situation
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.serving.background import served
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import ArmObservation, Goal, History, Key, Observation, Proposal
@@ -213,7 +215,7 @@ def test_histories_do_not_depend_on_what_else_is_live(task: ImageNav, frames: in
 def test_nor_on_workers_or_the_wire(two_rooms: str, tmp_path: Path) -> None:
     here = f"{Path(__file__).with_name('history_models.py')}:Recalling"
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = AgentRecipe("heuristic", here, revision="matcher")
+    agent = AgentRecipe("heuristic", here, reviser="matcher")
     with served(Recalling) as server:
         arms = [here, f"remote:{server.address}"]
         one = wiw.evaluate(task, agent, 3, out=tmp_path / "1", live=3, arms=arms, cache="off", progress=False)
@@ -260,7 +262,7 @@ def test_an_episode_that_is_run_again_after_an_error_remembers_nothing(task: Ima
     def found(model, live):
         return run(task, wiw.Agent(Brightest(), model, candidates=1, horizon=4), live=live)
 
-    assert found(Small(), 3) == found(Recalling(), 1) and Small.refused == 3
+    assert found(Attempted(Small()), 3) == found(Recalling(), 1) and Small.refused == 3
 
 
 def test_a_decision_that_is_asked_for_again_is_no_other_moment(task: ImageNav) -> None:
@@ -280,13 +282,19 @@ def test_a_decision_that_is_asked_for_again_is_no_other_moment(task: ImageNav) -
 
 
 def test_the_swapped_placebo_is_shown_a_first_moment() -> None:
+    class Bright:
+        """Every other episode begins in a bright place."""
+
+        def of(self, key):
+            panorama = np.full((576, 1024, 3), 200, np.uint8)
+            return ModelInput(Observation(panorama, panorama[:480, :480], np.zeros(3)))
+
     model = Watching()
-    agent = wiw.Agent(Walking(), model, candidates=3, horizon=4, placebo="swapped")
+    agent = wiw.Agent(Walking(), SwappedPlacebo(model, Bright()), candidates=3, horizon=4)
     for decision in range(2):
-        own, other = (np.full((576, 1024, 3), fill, np.uint8) for fill in (40, 200))
-        stranger = Query(Observation(other, other[:480, :480], np.zeros(3)), Goal("x"), Key(0, 9))
+        own = np.full((576, 1024, 3), 40, np.uint8)
         seen = Observation(own, own[:480, :480], np.zeros(3))
-        agent.decide_batch([Query(seen, Goal("x"), Key(0, 0, decision), stranger=stranger)])
+        agent.decide_batch([Query(seen, Goal("x"), Key(0, 0, decision))])
     history = model._calls[-1][0].history
     assert history.count.tolist() == [1, 2, 2] and (history.images == 200).all()
 
@@ -315,14 +323,17 @@ class Chunked(wiw.WorldModel):
 
 def imagined(model, plans, past=()):
     """Asks about an agent that has observed `past` (x, grey) and now stands at 0 and sees black."""
-    histories, executed = EpisodeHistories(model.accepts), []
+    histories, executed = EpisodeHistories(model.accepts), ()
     for decision, (x, grey) in enumerate((*past, (0.0, 0))):
         panorama = np.full((576, 1024, 3), grey, np.uint8)
         observation = Observation(panorama, panorama[:480, :480], np.array([x, 0.0, 0.0]))
-        (query,) = histories.add([Query(observation, Goal("x"), Key(0, 0, decision))], [executed])
-        executed = [*executed, int(FORWARD)]
-    proposals = [[Proposal(plan) for plan in plans]]
-    imagine(Attempts(model), [query], proposals, [range(len(plans))], FrameSpec("front", SIZE), Clock())
+        key = Key(0, 0, decision)
+        (history,) = histories.add([Situation(observation, Goal("x"), key, None, executed)])
+        executed = (*executed, int(FORWARD))
+    proposals, space = [[Proposal(plan) for plan in plans]], plan_space("discrete")
+    shown, seeds = [ModelInput(observation, history=history)], [range(len(plans))]
+    frames = FrameSpec("front", SIZE)
+    space.imagine(Attempted(model), Request(space, [key], [observation], shown, proposals, seeds, frames, Clock()))
     return model._calls
 
 
@@ -399,7 +410,7 @@ def test_one_frame_is_frame_0(task: ImageNav) -> None:
 
 def test_poses_are_where_odometry_was() -> None:
     start, actions = np.array([1.0, -2.0, 3.0]), [FORWARD, TURN_LEFT, FORWARD, TURN_LEFT, FORWARD]
-    odometry = np.array([start, *(moved(start, np.array(actions[: k + 1], np.int8)) for k in range(5))])
+    odometry = np.array([start, *(move(start, np.array(actions[: k + 1], np.int8)) for k in range(5))])
     found = relative_poses(odometry)
     assert not found[-1].any()
     np.testing.assert_allclose(found[0, :2], -rotate(to_trajectory(actions)[-1, :2], -2 * TURN), atol=1e-9)
@@ -448,7 +459,7 @@ def test_the_cache_tells_histories_apart_but_not_batches(tmp_path: Path) -> None
     def asked(history, rows=1):
         before = len(model._calls)
         seen = replace(observations, image=np.repeat(observations.image, rows, 0), history=history)
-        Remembered(Attempts(model), RolloutCache(tmp_path))(seen, controls * rows, np.zeros(rows, np.uint64))
+        Cached(Attempted(model), RolloutCache(tmp_path)).rollout(seen, controls * rows, np.zeros(rows, np.uint64))
         return sum(len(call[1]) for call in model._calls[before:])
 
     assert asked(given) == 1 and asked(given) == 0
@@ -461,13 +472,12 @@ def test_gripper_poses_are_absolute_and_their_actions_poses() -> None:
     declared = {"space": "pose7", "needs": ("history",), "history": 3}
     histories = EpisodeHistories(wiw.accepts("action", "perspective", SIZE, **declared))
     poses = np.array([[0.1, 0, 1, 0, 0, 0, 1], [0.2, 0, 1, 0, 0, 0, 1], [0.3, 0, 1, 0, 0, 0, 0]])
-    carried, query = [poses[:1].repeat(2, 0), poses[1:2]], None
-    executed = []
+    carried, history, executed = [poses[:1].repeat(2, 0), poses[1:2]], (), ()
     for decision, pose in enumerate(poses[:3]):
         seen = ArmObservation(np.full((480, 480, 3), decision, np.uint8), pose)
-        (query,) = histories.add([Query(seen, Goal("x"), Key(0, 0, decision))], [executed])
-        executed = [*executed, *(carried[decision].tolist() if decision < 2 else [])]
-    found = stack_histories([query.history, query.history[1:]], 3)
+        (history,) = histories.add([Situation(seen, Goal("x"), Key(0, 0, decision), None, executed)])
+        executed = (*executed, *(carried[decision].tolist() if decision < 2 else ()))
+    found = stack_histories([history, history[1:]], 3)
     np.testing.assert_array_equal(found.poses, [poses, poses[[1, 1, 2]]])
     assert found.lengths.tolist() == [[2, 1], [0, 1]] and found.actions.shape == (2, 2, 2, 7)
     np.testing.assert_array_equal(found.actions[0], [carried[0], poses[[1, 1]]])  # padded with the last pose

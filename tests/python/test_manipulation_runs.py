@@ -149,7 +149,7 @@ def test_other_tasks_have_no_tasks(capsys: Any) -> None:
 
 
 def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Manipulation().usual == 200 and Manipulation("slide_block").usual == 50
+    assert Manipulation().default_episodes == 200 and Manipulation("slide_block").default_episodes == 50
     own = tmp_path / "mine.yaml"
     own.write_text("episodes: 1\nactions: 1\n")
     agent = AgentRecipe(POLICY, candidates=1, horizon=1)
@@ -171,7 +171,7 @@ def test_gymnasium_knows_the_task() -> None:
 
 def test_a_run_says_which_renderer_drew_it() -> None:
     assert Manipulation(backend="cpu").describe()["backend"] == "cpu"
-    assert Manipulation.portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}
+    assert Manipulation.make_portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}
 
 
 def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
@@ -180,7 +180,7 @@ def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     options = {"tasks": "push_buttons", "actions": 4, "seed": 3}
     log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False, keep_images=0)
     assert [episode["metrics"]["success"] for episode in log.episodes] == [0.0, 0.0]
-    found = wiw.attribute(tmp_path, progress=False)["copy"]
+    found = wiw.blame(tmp_path, progress=False)["copy"]
     assert found.verdicts["beyond"] == 1 and sum(found.verdicts.values()) == 2
 
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import wiw
 from wiw._core import core
 from wiw.action import PoseGrid
-from wiw.envs.manipulation import checked
+from wiw.envs.manipulation import check_poses
 from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.envs.sensors import ARM
 from wiw.errors import ArgumentError
@@ -166,10 +166,10 @@ def test_a_plan_that_is_none_moves_nothing(plan: Any, said: str) -> None:
 def test_plans_are_finite_or_refused(plan: list[list[float]]) -> None:
     valid = all(np.isfinite(pose).all() and 0 <= pose[6] <= 1 for pose in plan)
     if valid:
-        np.testing.assert_array_equal(checked(plan), plan)
+        np.testing.assert_array_equal(check_poses(plan), plan)
     else:
         with pytest.raises(ArgumentError):
-            checked(plan)
+            check_poses(plan)
 
 
 def test_refused_ways_leave_a_valid_state() -> None:

@@ -290,7 +290,7 @@ def test_the_loop_hands_it_what_was_seen(model: NWM, monkeypatch: pytest.MonkeyP
         def score(self, situations, proposals, rollouts):
             return [np.zeros(1) for _ in situations]
 
-    agent = wiw.Agent(Ahead(), model, candidates=1, horizon=1, cache="off")
+    agent = wiw.Agent(Ahead(), model, candidates=1, horizon=1)
     panoramas = np.random.default_rng(0).integers(0, 256, (6, 576, 1024, 3), np.uint8)
     for decision, panorama in enumerate(panoramas):
         seen = Observation(panorama, panorama[:480, :480], np.array([0.2 * decision, 0, 0]))

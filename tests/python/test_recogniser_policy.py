@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 from hypothesis import given
 from hypothesis import strategies as st
 from test_active_recognition import Sink
@@ -127,7 +128,7 @@ def policy(weights: Path, **options: Any) -> Any:
 def answers(task: Any, agent: Any, live: int = 4, episodes: int = 1) -> list[list[float]]:
     sink = Sink()
     numbered = [(i, replace(task.episodes(1)[0], start_yaw=0.7 * i)) for i in range(episodes)]
-    run_episodes(task, agent.settled(task.defaults), numbered, seed=0, live=live, sink=sink)
+    run_episodes(task, agent_for(task, agent), numbered, seed=0, live=live, sink=sink)
     assert [result.status for result in sink.results] == ["done"] * episodes
     return [
         [list(row.decision.answer.probabilities) for row in sink.decisions if row.episode == i] for i in range(episodes)
@@ -241,10 +242,10 @@ def test_a_policy_that_only_proposes_is_revised_by_it(
     monkeypatch.setattr("wiw.policies.recogniser.WEIGHTS", weights)
     task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=2)
     agent = wiw.Agent("heuristic", model)
-    assert isinstance(agent.settled(task.defaults).revision, Recognition)
+    assert isinstance(agent_for(task, agent).reviser, Recognition)
     assert len(answers(task, agent)[0]) == 2
-    assert not isinstance(wiw.Agent("heuristic", "copy", "matcher").settled(task.defaults).revision, Recognition)
-    assert not isinstance(wiw.Agent("matcher", model).settled(task.defaults).revision, Recognition)
+    assert not isinstance(agent_for(task, wiw.Agent("heuristic", "copy", "matcher")).reviser, Recognition)
+    assert not isinstance(agent_for(task, wiw.Agent("matcher", model)).reviser, Recognition)
 
 
 def test_it_is_told_by_its_weights(weights: Path, tmp_path: Path) -> None:

@@ -87,9 +87,9 @@ def test_a_task_names_its_robot(other: Path, monkeypatch: pytest.MonkeyPatch) ->
     task = Manipulation("slide_block", robot=other)
     assert task.describe()["robot"] == load_robot(other).identity
     assert Manipulation("slide_block").describe()["robot"] == {"name": "panda"}
-    assert task.table(task.episode(0)).bench.robot is task.robot
+    assert task.set_table(task.episode(0)).bench.robot is task.robot
     monkeypatch.chdir(other.parent)
-    assert Manipulation.portable({"robot": "acme.urdf"})["robot"] == str(other)
+    assert Manipulation.make_portable({"robot": "acme.urdf"})["robot"] == str(other)
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_it_revises_other_policies_of_a_gripper(tmp_path: Path) -> None:
                 for s in situations
             ]
 
-    agent = wiw.Agent(Wavering(), "oracle", revision="scripted")
+    agent = wiw.Agent(Wavering(), "oracle", reviser="scripted")
     log = evaluate(Manipulation("slide_block"), agent, 2, out=tmp_path, progress=False)
     assert [decision["chosen"] for decision in log.decisions] == [1, 1]
 

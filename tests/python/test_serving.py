@@ -28,7 +28,7 @@ from websockets.sync.server import serve as serve_sync
 import wiw
 from wiw.errors import ArgumentError, ContractError, InfrastructureError, RemoteError, RolloutError
 from wiw.loop import attempts
-from wiw.loop.attempts import Attempts
+from wiw.loop.attempts import Attempted
 from wiw.serving import outbox
 from wiw.serving import server as serving
 from wiw.serving.background import served
@@ -203,7 +203,7 @@ def test_a_whole_run_is_the_same_as_at_home(two_rooms, tmp_path):
     from wiw.tasks.imagenav import ImageNav
 
     def facts(model, name):
-        agent = wiw.Agent("heuristic", model, revision="matcher")
+        agent = wiw.Agent("heuristic", model, reviser="matcher")
         out = tmp_path / name
         wiw.evaluate(ImageNav(scenes=two_rooms, decisions=2), agent, 2, out=out, progress=False, workers=1)
         with RunStore.read(out) as store:
@@ -247,7 +247,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
             ask(client)
         assert caught.value.kind == kind
         with pytest.raises(RolloutError) as caught:
-            Attempts(client, 20.0)(seen(4), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 20.0).rollout(seen(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind
 
 
@@ -261,7 +261,7 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
             ask(client, 4)
         assert caught.value.kind == "deadline" and time.monotonic() - begin < 5
         with pytest.raises(RolloutError) as caught:
-            Attempts(client, 0.5)(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 0.5).rollout(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == "deadline"
         wait_for(lambda: len(server.queue) == 0)
         gate.set()

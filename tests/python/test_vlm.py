@@ -22,10 +22,10 @@ pytest.importorskip("json_repair")
 
 from wiw.errors import ArgumentError, FileError, VlmError, WeightsError  # noqa: E402
 from wiw.vlm import Request, choices, connect, user  # noqa: E402
-from wiw.vlm.base import Completion  # noqa: E402
 from wiw.vlm.cache import ReplyCache, open_reply_cache  # noqa: E402
 from wiw.vlm.images import from_data_uri, to_data_uri  # noqa: E402
 from wiw.vlm.instances import generate_instance  # noqa: E402
+from wiw.vlm.messages import Completion  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 from wiw.vlm.prices import Prices  # noqa: E402
 

@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm import VLM
 from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
 from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
-from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Goal, Key, Proposal
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 ABOVE, BELOW = [50, 50, 30, 0, 60, 60, 1], [50, 50, 25, 0, 60, 60, 0]
@@ -58,9 +58,8 @@ def words(call: Call) -> str:
 def decided(policy: Any, model: Any = None, kind: str = "push_buttons", **options: Any) -> Any:
     env = Manipulation(kind, seed=1).environment()
     env.reset(options={"episode": 1})
-    agent = wiw.Agent(policy, model, cache="off", **options).settled(env.task.defaults)
-    simulator = env.fork() if "simulator" in agent.needs else None
-    return agent.decide(env.observation, env.goal, Key(0, 1), simulator)
+    agent = agent_for(env.task, wiw.Agent(policy, model, **options), cache="off")
+    return agent.decide(env.observation, env.goal, Key(0, 1))
 
 
 class Reader(wiw.WorldModel):
@@ -79,7 +78,7 @@ class Reader(wiw.WorldModel):
 def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
     answers = iter([said(ABOVE), said(BELOW, words="Down."), said(ABOVE, BELOW), said(ABOVE), said(BELOW), said(BELOW)])
     client, model = MockClient(lambda call: next(answers)), Reader()
-    decision = decided(VLM(client), model)
+    decision = decided(ArmVLM(client), model)
     *proposing, revising = client.calls
     assert len(proposing) == 5 and len({call.seed for call in proposing}) == 5
     assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
@@ -102,20 +101,20 @@ def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
 
 def test_without_a_world_model_one_plan_is_asked_for() -> None:
     client = MockClient(lambda call: said(ABOVE, BELOW))
-    decision = decided(VLM(client))
+    decision = decided(ArmVLM(client))
     assert len(client.calls) == 1 and decision.chosen == 0 and decision.execute == 2
 
 
 def test_a_plan_may_be_written_anew_or_chosen_and_plans_may_be_listed() -> None:
     both = json.dumps({"plans": [answer(ABOVE), answer(ABOVE, BELOW)]})
     client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(ABOVE, ABOVE))
-    decision = decided(VLM(client, proposals="listed"), "copy")
+    decision = decided(ArmVLM(client, proposals="listed"), "copy")
     assert len(client.calls) == 2 and "Give 5 plans" in words(client.calls[0])
     assert client.calls[0].max_tokens == 5 * client.calls[1].max_tokens
     assert decision.chosen is None and decision.scores.tolist() == [0.5, 0.5]
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE, ABOVE]))
     client = MockClient(lambda call: {"B": 0.7, "A": 0.3} if call.labels else both)
-    decision = decided(VLM(client, proposals="listed", revision="select"), "copy")
+    decision = decided(ArmVLM(client, proposals="listed", revision="select"), "copy")
     assert decision.chosen == 1 and "B. plan 2" in words(client.calls[-1])
 
 
@@ -132,7 +131,7 @@ class Glider(wiw.Policy):
 
 def test_of_another_policys_plans_one_is_chosen_by_some_of_its_poses() -> None:
     client = MockClient(lambda call: {"B": 0.8, "A": 0.2})
-    decision = decided(Glider(), "copy", revision=VLM(client), horizon=12, execute=12)
+    decision = decided(Glider(), "copy", reviser=ArmVLM(client), horizon=12, execute=12)
     (call,) = client.calls
     assert decision.chosen == 1 and call.labels == ("A", "B")
     assert [strip.shape[1] // 384 for strip in images(call)[1:]] == [5, 5]
@@ -145,7 +144,7 @@ def test_a_long_plan_that_may_be_written_again_is_told_whole() -> None:
     long = [[50, 50, height, 0, 60, 60, 1] for height in range(30, 23, -1)]
     both = json.dumps({"plans": [answer(*long), answer(ABOVE)]})
     client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(*long))
-    decision = decided(VLM(client, proposals="listed"), "copy", horizon=7)
+    decision = decided(ArmVLM(client, proposals="listed"), "copy", horizon=7)
     assert f"Plan 1: Go there.\nActions: {long}" in words(client.calls[-1])
     assert [strip.shape[1] // 384 for strip in images(client.calls[-1])[1:]] == [5, 1]
     assert decision.chosen == 0
@@ -160,7 +159,7 @@ def test_the_end_of_a_plan_is_always_shown(count: int, places: Any) -> None:
 
 def test_numbers_out_of_range_are_understood_and_counted() -> None:
     odd = [100, -3, 250, 120, -60, 180, 2]
-    decision = decided(VLM(MockClient(lambda call: said(ABOVE, odd))))
+    decision = decided(ArmVLM(MockClient(lambda call: said(ABOVE, odd))))
     np.testing.assert_array_equal(decision.actions[1], GRID.decode([99, 0, 99, 0, 60, 60, 1]))
     assert decision.exchanges[0].result["out_of_range"] == 5 and decision.note == ""
 
@@ -180,19 +179,19 @@ def test_numbers_out_of_range_are_understood_and_counted() -> None:
 )
 def test_unusable_answers_are_asked_for_again_and_then_a_pose_is_drawn(text: str, problem: str) -> None:
     client = MockClient(lambda call: text)
-    decision = decided(VLM(client, tries=2))
+    decision = decided(ArmVLM(client, tries=2))
     assert len(client.calls) == 2 and decision.exchanges[0].problem.startswith(problem)
     assert "a pose was drawn" in decision.note and decision.actions.shape == (1, 7)
     assert plans.is_on_grid(decision.actions) and "drawn" in decision.proposals[0].note
     some = iter(["junk", said(ABOVE), text.replace("'", ""), *["junk"] * 3])
-    decision = decided(VLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
+    decision = decided(ArmVLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
     assert len(decision.proposals) == 1 and decision.chosen == 0
     assert "the plan was left out" in decision.note and "the first plan was taken" in decision.note
 
 
 def test_slips_of_syntax_are_mended() -> None:
     slip = said(ABOVE).replace('"language_plan"', "language_plan")
-    decision = decided(VLM(MockClient(lambda call: f"Here you are:\n{slip}")))
+    decision = decided(ArmVLM(MockClient(lambda call: f"Here you are:\n{slip}")))
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE]))
     assert decision.exchanges[0].result["repaired"] is True
 
@@ -202,7 +201,7 @@ def test_slips_of_syntax_are_mended() -> None:
 def test_marks_are_on_their_objects_and_hide_little_of_them(kind: str, size: int) -> None:
     task = Manipulation(kind, seed=2)
     for index in range(4):
-        table = task.table(task.episode(index))
+        table = task.set_table(task.episode(index))
         seen = table.bench.render_view("front", (size, size), ("color", "instance"))
         observation = wiw.types.ArmObservation(
             seen["color"], table.bench.pose, places=table.bench.get_poses(table.objects)
@@ -281,39 +280,43 @@ def test_a_users_own_prompts_have_the_tasks_slots(tmp_path: Path) -> None:
     file = tmp_path / "manipulation/planner.j2"
     file.write_text("Up to {{ position_bins }}, {{ rotation_bins }}, {{ rotation_degrees }}!")
     client = MockClient(lambda call: said(ABOVE))
-    decided(VLM(client, prompts=tmp_path))
+    decided(ArmVLM(client, prompts=tmp_path))
     assert words(client.calls[0]).startswith("Up to 100, 120, 3!")
     file.write_text("{{ obs_key }}")
     with pytest.raises(PromptError, match="unknown slot 'obs_key'; the slots are look_ahead_action_num"):
-        VLM("mock", prompts=tmp_path)
+        ArmVLM("mock", prompts=tmp_path)
 
 
 def test_one_name_for_primitives_and_poses() -> None:
-    policy = VLM("mock")
-    agent = wiw.Agent(policy, "oracle", revision=policy)
-    assert agent.policy is policy and agent.model.accepts.space == "discrete"
-    settled = agent.settled(Manipulation().defaults)
-    assert isinstance(settled.policy, ArmVLM) and isinstance(settled.revision, ArmVLM)
-    assert settled.model.accepts.space == "pose7" and settled.policy.needs == ()
-    assert settled.policy.for_space("discrete") is policy and settled.but(candidates=2).policy.space == "pose7"
-    assert settled.policy.describe()["policy"] == "ArmVLM" and "tracker" not in settled.policy.describe()
-    recipe = AgentRecipe("vlm", "oracle", policy_options={"vlm": {"vlm": "mock"}})
-    assert recipe.build(Manipulation().defaults).policy.space == "pose7"
-    with pytest.raises(ArgumentError, match="asked for in poses of a gripper, but policy Heuristic makes them of disc"):
-        wiw.Agent("heuristic").settled(Manipulation().defaults)
+    mock = {"vlm": {"vlm": "mock"}}
+    agent = wiw.Agent(wiw.policy("vlm", vlm="mock"), "oracle", reviser=VLM("mock"))
+    assert type(agent.policy) is VLM and agent.policy.space == agent.model.accepts.space == "discrete"
+    posing = agent_for(Manipulation(), AgentRecipe("vlm", "oracle", reviser="vlm", policy_options=mock))
+    assert isinstance(posing.policy, ArmVLM) and isinstance(posing.reviser, ArmVLM)
+    assert posing.model.accepts.space == "pose7" and posing.policy.needs == ()
+    assert posing.replace(candidates=2).policy.space == "pose7"
+    assert isinstance(wiw.policy("vlm", vlm="mock", space="pose7"), ArmVLM)
+    assert posing.policy.describe()["policy"] == "ArmVLM" and "tracker" not in posing.policy.describe()
+    for policy, name in (("heuristic", "Heuristic"), (agent.policy, "VLM")):
+        with pytest.raises(
+            ArgumentError, match=f"asked for in poses of a gripper, but policy {name} makes them of discrete primitives"
+        ):
+            agent_for(Manipulation(), wiw.Agent(policy))
     with pytest.raises(ArgumentError, match="among ar, imagenav, got 'manipulation'"):
-        policy.begin(Goal("manipulation"), Key(0, 0))
+        agent.policy.begin(Goal("manipulation"), Key(0, 0))
     with pytest.raises(ArgumentError, match="among manipulation, got 'ar'"):
-        policy.for_space("pose7").begin(Goal("ar"), Key(0, 0))
+        posing.policy.begin(Goal("ar"), Key(0, 0))
 
 
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None:
     """With drawn answers, over HTTP with faults; what was said is enough to run it again."""
     faults = Misbehaviour({"429": 0.1, "malformed": 0.2, "refusal": 0.1, "truncated": 0.1}, seed=0, retry_after=0.01)
-    with VlmServer(MockClient(), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
         options = {"vlm": server.url, "dialect": "vllm", "tries": 1, "cache": "off"}
         recipe = AgentRecipe("vlm", "copy", candidates=2, policy_options={"vlm": options})
-        log = evaluate("manipulation", recipe, 1, 0, tmp_path / "run", progress=False, tasks="slide_block", actions=6)
+        log = evaluate(
+            "manipulation", recipe, 1, seed=0, out=tmp_path / "run", progress=False, tasks="slide_block", actions=6
+        )
     assert not any(episode["error"] for episode in log.episodes), "".join(e["error"] for e in log.episodes)
     rows = list(log.store.decisions("copy"))
     exchanges = [each for row in rows for each in row["exchanges"]]
@@ -326,11 +329,11 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None
 
 
 def test_a_server_that_is_too_slow_is_infrastructure(tmp_path: Path) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
-        policy = VLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
+        policy = ArmVLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
         log = evaluate(Manipulation(), wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/timeout"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/timeout"
 
 
 def test_the_tiny_random_model_writes_plans() -> None:
@@ -342,5 +345,5 @@ def test_the_tiny_random_model_writes_plans() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         client = TransformersClient(make_tiny(Path(folder) / "tiny"), device="cpu")
-        decision = decided(VLM(client, tries=1), horizon=1, execute=1)
+        decision = decided(ArmVLM(client, tries=1), horizon=1, execute=1)
     assert decision.note == "" and decision.actions.shape == (1, 7)

@@ -19,7 +19,7 @@ pytest.importorskip("json_repair")
 
 from wiw.policies.vlm.plans import parse_plans, plan_schema
 from wiw.vlm import Request, user
-from wiw.vlm.base import Completion, Kind
+from wiw.vlm.messages import Completion, Kind
 from wiw.vlm.mock import MockClient
 
 ACTIONS = ["forward", "turn_left", "turn_right", "forward"]

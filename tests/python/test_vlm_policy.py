@@ -10,24 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
-from wiw.loop.agent import Query
+from wiw.loop.memory import Query
 from wiw.policies.vlm import VLM, presets, prompt_images
 from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.types import Rollout
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 FORWARD, LEFT, RIGHT = 1, 2, 3
@@ -60,7 +61,7 @@ def imagenav(scene: str) -> Any:
 
 def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
     _, info = env.reset(options={"episode": 0})
-    agent = wiw.Agent(policy, model, **options).settled(env.unwrapped.task.defaults)
+    agent = agent_for(env.unwrapped.task, wiw.Agent(policy, model, **options))
     return agent.decide(env.observation, env.goal, info["key"])
 
 
@@ -295,7 +296,7 @@ def test_presets_name_a_model_and_how_it_is_served() -> None:
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_rooms: str) -> None:
     """Both tasks, with the scripted model, over HTTP with faults; what was said is enough to run them again."""
     faults = Misbehaviour({"429": 0.1, "500": 0.05, "malformed": 0.05, "refusal": 0.05}, seed=1, retry_after=0.01)
-    with VlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
         file = a_file(tmp_path, two_rooms)
         preset = tmp_path / "short.yaml"
         preset.write_text("decisions: 4\n")
@@ -303,7 +304,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
             recipe = AgentRecipe(
                 "vlm", "copy", policy_options={"vlm": {"vlm": server.url, "dialect": "vllm", "tries": 2}}
             )
-            log = evaluate(task, recipe, 1, 0, tmp_path / task, progress=False, preset=str(preset), **options)
+            log = evaluate(task, recipe, 1, seed=0, out=tmp_path / task, progress=False, preset=str(preset), **options)
             (episode,) = log.episodes
             assert episode["status"] == "done"
             rows = list(log.store.decisions("copy"))
@@ -318,18 +319,18 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
 
 def test_recipes_that_name_no_server_are_replayed_too() -> None:
     assert AgentRecipe("vlm").replaying(Path("r")).policy_options == {"vlm": {"vlm": "replay:r", "cache": "off"}}
-    recipe = AgentRecipe("heuristic", revision="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
+    recipe = AgentRecipe("heuristic", reviser="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
     assert recipe.replaying(Path("r")).policy_options["vlm"] == {"vlm": "replay:r", "cache": "off", "tries": 2}
     assert recipe.describe()["policy_options"] == {"vlm": {"tries": 2}}, "the address is no part of the identity"
     assert AgentRecipe("matcher").replaying(Path("r")) == AgentRecipe("matcher")
 
 
 def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
         log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/status"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/status"
 
 
 def test_the_command_line_against_the_tiny_random_model(

@@ -6,22 +6,20 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 from wiw.cli.terminal import printable
+from wiw.runs.config import RunConfig
+from wiw.tasks.base import Task
 
 
-def announce(task: Any, arms: Mapping[str, Any], episodes: int | None, seed: int, workers: int, folder: Path) -> None:
+def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
     """Print task, scenes, arms, workers and folder of a run.
 
     Args:
         task: as built.
         arms: recipes by name.
-        episodes: how many; None means the task's own number.
-        seed: of the run.
-        workers: processes.
-        folder: of the run.
+        config: how the run goes.
 
     Raises:
         RegistryError: an arm's part is not known, or takes other options.
@@ -31,16 +29,14 @@ def announce(task: Any, arms: Mapping[str, Any], episodes: int | None, seed: int
     for recipe in arms.values():
         recipe.describe()
         recipe.require(said)
-    count = episodes
-    if count is None:
-        count = int(getattr(task, "default_episodes", getattr(task, "usual", 20)))
-    policies = sorted({str(getattr(recipe, "policy", type(recipe).__name__)) for recipe in arms.values()})
+    count = task.default_episodes if config.episodes is None else config.episodes
+    policies = sorted({str(recipe.policy) for recipe in arms.values()})
     trials = f"{count_noun(count, 'episode')}{_describe_scenes(said, count)}"
     lines = {
-        "task": f"{said.get('task', task.name)}: {trials}, seed {seed}",
+        "task": f"{said.get('task', task.name)}: {trials}, seed {config.seed}",
         "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",
-        "workers": str(workers),
-        "run": str(folder),
+        "workers": str(config.workers),
+        "run": str(config.out),
     }
     for name, line in lines.items():
         print(f"{name:<8}{printable(line)}", file=sys.stderr)

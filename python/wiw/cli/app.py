@@ -58,7 +58,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "World models, policies, trackers, tasks, presets and metrics by name."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
-    (blame, "blame", "Which stage of the loop a run's failures are due to."),
+    (blame, "blame", "Find the stage of the loop that causes a run's failures."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "How many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),
@@ -98,11 +98,15 @@ def run_process() -> NoReturn:
     end_process(code)
 
 
+RENAMED_OPTIONS = {"--retry-failed": "--retry-errors"}
+"""Old names of options, which still work but are not shown."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code: 0, 1 (the run is invalid), 2 (error), 75 or 130 (stopped)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
-    given = [argument for argument in given if argument != "--debug"]
+    given = [RENAMED_OPTIONS.get(argument, argument) for argument in given if argument != "--debug"]
     if given == ["--version"]:
         print(f"wiw {wiw.__version__}")
         return 0

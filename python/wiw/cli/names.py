@@ -74,8 +74,8 @@ def _add_presets(table: Any) -> None:
 
     for task in TASKS.built_in:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
-        for name in presets.names(task):
-            table.add_row(f"  {name}", escape(presets.about(task, name)))
+        for name in presets.list_presets(task):
+            table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
     table.add_row()
 
 

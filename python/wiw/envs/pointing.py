@@ -28,18 +28,18 @@ class Pointing:
     """Whether the episode goes on where neither panorama nor front view shows the target."""
 
     def target(self, panorama_ids: NDArray[np.uint32], front_ids: NDArray[np.uint32], instance: int) -> Target:
-        """The instance as the agent is shown it."""
+        """Return the instance as the agent is shown it."""
         mask = panorama_ids == instance
         return Target(mask, self._box(mask, wraps=True), self._box(front_ids == instance, wraps=False))
 
     def split(self, images: dict[str, Any], instance: int) -> dict[str, Any]:
-        """What the simulator showed, with the ids made into `target`."""
+        """Return the simulator's images, with the ids made into `target`."""
         ids = [images[name] for name in IDS]
         plain = {name: image for name, image in images.items() if name not in IDS}
         return {**plain, "target": self.target(ids[0], ids[1], instance)}
 
     def ends(self, target: Target | None) -> bool:
-        """Whether the episode is over for want of a target."""
+        """Return whether the episode is over for want of a target."""
         return self.lost == "stop" and target is not None and target.panorama_box is None and target.front_box is None
 
     def _box(self, mask: Mask, wraps: bool) -> Box | None:

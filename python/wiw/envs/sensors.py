@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a manipulator can be given to see and feel, as gymnasium knows it."""
+"""Sensors of a manipulator: cameras and joints, as gymnasium knows them."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ class Sensors:
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """What is drawn for each camera."""
+        """Images that each camera draws."""
         depth: tuple[Output, ...] = ("depth",) if self.depth or self.cloud else ()
         return ("color", *depth, *(("instance",) if self.ids else ()))
 
     def space(self) -> spaces.Dict:
-        """Of observations."""
+        """Return the space of observations."""
         shape = (self.size, self.size)
         count = len(self.names) * self.size**2
         seen: dict[str, spaces.Space[Any]] = {
@@ -76,13 +76,13 @@ class Sensors:
         return spaces.Dict(seen)
 
     def pictures(self, bench: Workbench, camera: str = "front") -> dict[str, NDArray[Any]]:
-        """What one camera gives: those of "color", "depth" and "instance" that are asked for."""
+        """Return the images of one camera: those of "color", "depth" and "instance" that are asked for."""
         return bench.render_view(camera, (self.size, self.size), self.outputs)
 
     def read(
         self, bench: Workbench, objects: Sequence[str], front: dict[str, NDArray[Any]] | None = None
     ) -> dict[str, Any]:
-        """An observation in `space`.
+        """Return an observation in `space`.
 
         Args:
             bench: what is looked at.

@@ -52,8 +52,8 @@ class Gated(ImaginerWrapper):
         return PartlyImagined(super().imagine(select(request, places)), places, len(request.keys))
 
     def describe(self) -> dict[str, Any]:
-        """Describe the model and the share."""
-        return {**super().describe(), "imagine_fraction": self.fraction}
+        """Describe the model, and the share where it is less than all."""
+        return super().describe() | ({} if self.fraction == 1 else {"imagine_fraction": self.fraction})
 
 
 class PartlyImagined(Imagination):

@@ -10,7 +10,7 @@ policy's last one gives way where there would be too many. It still has to be re
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,9 @@ def sort_stages(stages: Collection[str]) -> tuple[str, ...]:
 class _Guided(PolicyWrapper, Privileged):
     """A policy with an environment's guide at hand."""
 
+    stage: ClassVar[str]
+    """Which of `STAGES` is given the truth."""
+
     def __init__(self, inner: Policy) -> None:
         super().__init__(inner)
         self._environments = LiveEnvironments()
@@ -48,12 +51,18 @@ class _Guided(PolicyWrapper, Privileged):
         if isinstance(self.inner, Privileged):
             self.inner.grant(environments)
 
+    def describe(self) -> dict[str, Any]:
+        """Describe the wrapped policy, and which stage is given the truth."""
+        return {**super().describe(), "ground_truth": self.stage}
+
     def _guide(self, key: Key) -> Any:
         return self._environments.find(key).guide()
 
 
 class TruePlans(_Guided):
     """A policy among whose proposals there is a true plan."""
+
+    stage = "proposals"
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Propose the true plan before the policy's own, at most `candidates` in all."""
@@ -66,6 +75,8 @@ class TruePlans(_Guided):
 
 class TrueScores(_Guided):
     """A reviser that knows how far each plan truly gets, and follows the best."""
+
+    stage = "scoring"
 
     def score_or_prefer(
         self,

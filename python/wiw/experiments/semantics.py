@@ -60,6 +60,11 @@ class Labelled(ImaginerWrapper):
         own = frozenset() if isinstance(self.source, str) else frozenset(self.source.needs) & {"depth"}
         return super().needs | own
 
+    @property
+    def gives(self) -> frozenset[str]:
+        """Semantics, beside what the wrapped imaginer gives."""
+        return super().gives | {"semantic"}
+
     def imagine(self, request: Request) -> Imagination:
         """Imagine with labels, where the model needs them; what is labelled already stays so."""
         if "semantic" not in self.accepts.needs:

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
+from wiw.loop.limits import DEADLINE
 from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts, WorldModel, check_rollout, patience
@@ -37,8 +38,6 @@ from wiw.world_models.base import Accepts, WorldModel, check_rollout, patience
 TRIES = 3
 PAUSES = (0.2, 1.0)
 """Seconds before the second and the third try; a server that restarts may be back by then."""
-DEADLINE = 300.0
-"""Seconds a call may take unless the user says otherwise: room for a first call that loads and compiles."""
 
 
 class Attempted(WorldModel):

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import Suppress, arg
 
 from wiw.errors import ArgumentError
 
@@ -20,22 +22,22 @@ class AgentConfig:
         ArgumentError: a number out of range.
     """
 
-    candidates: int | None = None
-    """M, plans that are chosen from at each decision; 3 without a task."""
-    horizon: int | None = None
-    """L, actions per plan; 5 without a task."""
-    execute: int | None = None
+    candidates: Annotated[int | None, arg(metavar="M")] = None
+    """M, plans imagined at each decision; the task's own number if not given, 3 without a task."""
+    horizon: Annotated[int | None, arg(metavar="L")] = None
+    """L, primitives or poses per plan; the task's own number if not given, 5 without a task."""
+    execute: Annotated[int | None, arg(metavar="N")] = None
     """Actions carried out before the next decision; 0: the whole plan; negative: all of the plan's first `horizon` but
     that many, at least one. L - 2 without a task."""
-    depth: int = 1
+    depth: Annotated[int, arg(metavar="N")] = 1
     """Levels of the beam search. The first chooses among the proposals; each further one extends the best plans by
     `horizon` actions, as `Policy.extend` proposes from their imagined ends."""
-    width: int | None = None
+    width: Annotated[int | None, arg(metavar="N")] = None
     """Plans of an episode that are kept and extended at each level; None means `candidates`."""
-    pool: int | None = None
+    pool: Annotated[int | None, arg(metavar="N")] = None
     """Plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ in
     `candidates` alone are nested; None proposes as many as are kept."""
-    space: str | None = None
+    space: Annotated[str | None, Suppress] = None
     """What plans are made of (`wiw.loop.plan_space`); None means the task's, else the policy's."""
 
     def __post_init__(self) -> None:

@@ -56,9 +56,9 @@ def check_needs(model: WorldModel) -> None:
     """
     if "simulator" in model.accepts.needs and not isinstance(model.unwrapped, Oracle):
         raise ArgumentError(
-            f"{type(model.unwrapped).__name__} needs the simulator, which is handed to the oracle alone: it knows where "
-            "the agent truly is. Declare what the model sees of the world instead (needs=('depth',)), or derive it from "
-            "wiw's Oracle"
+            f"{type(model.unwrapped).__name__} needs the simulator, which is handed to the oracle alone: it knows "
+            "where the agent truly is. Declare what the model sees of the world instead (needs=('depth',)), or derive "
+            "it from wiw's Oracle"
         )
 
 
@@ -105,7 +105,8 @@ def check_answerer(policy: Policy, goal: Goal) -> None:
     if goal.choices and type(policy.unwrapped).answer is Policy.answer:
         raise ContractError(
             f"{type(policy.unwrapped).__name__} gives no answer, but task '{goal.task}' asks for one of "
-            f"{len(goal.choices)} choices at every decision; write its `answer`, or give the agent a policy that answers (reviser=)"
+            f"{len(goal.choices)} choices at every decision; write its `answer`, or give the agent a policy that "
+            "answers (reviser=)"
         )
 
 

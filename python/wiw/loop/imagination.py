@@ -115,6 +115,11 @@ class Imaginer(ABC):
         return frozenset() if self.model is None else frozenset(self.model.accepts.needs) & {"depth"}
 
     @property
+    def gives(self) -> frozenset[str]:
+        """What the model is given beside its observations: "semantic"."""
+        return frozenset()
+
+    @property
     def spent(self) -> Mapping[str, float]:
         """What the model was asked for so far, for the cost ledger."""
         return {} if self.model is None else self.model.spent
@@ -161,6 +166,11 @@ class ImaginerWrapper(Imaginer, Privileged):
     def needs(self) -> frozenset[str]:
         """The wrapped imaginer's."""
         return self.inner.needs
+
+    @property
+    def gives(self) -> frozenset[str]:
+        """The wrapped imaginer's."""
+        return self.inner.gives
 
     def imagine(self, request: Request) -> Imagination:
         """Pass the request on."""

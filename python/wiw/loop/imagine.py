@@ -20,6 +20,11 @@ from wiw.policies.base import FrameSpec
 from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
 from wiw.world_models.base import Accepts, WorldModel, ask
 
+NO_SEMANTICS = (
+    "needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
+    "(wiw.experiments.semantics.Labelled); see docs/perception.md"
+)
+
 
 @dataclass(frozen=True)
 class ImaginedPrimitives(Imagination):
@@ -133,10 +138,7 @@ def _labels(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArr
 
 def _require_labels(shown: ModelInput) -> NDArray[np.uint32]:
     if shown.semantic is None:
-        raise ArgumentError(
-            "the world model needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
-            "(wiw.experiments.semantics.Labelled); see docs/perception.md"
-        )
+        raise ArgumentError(f"the world model {NO_SEMANTICS}")
     return shown.semantic
 
 

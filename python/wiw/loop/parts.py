@@ -11,6 +11,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
 from wiw.loop.decision_pass import Components
 from wiw.loop.imagination import Imaginer, NoModel
+from wiw.loop.imagine import NO_SEMANTICS
 from wiw.loop.memory import EpisodeMemories
 from wiw.loop.model_imaginer import as_imaginer
 from wiw.loop.observers import Observer
@@ -46,6 +47,8 @@ class Parts:
         reviser = self._make_reviser(policy, name, imagines=model is not None)
         if model is not None:
             space.check_model(model, config.longest)
+            if "semantic" in set(model.accepts.needs) - imaginer.gives:
+                raise ArgumentError(f"{type(model.unwrapped).__name__} {NO_SEMANTICS}")
             if config.depth > 1:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.loop.clock import time_apart
+from wiw.loop.limits import BUDGET_GB
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts, WorldModel
 
@@ -38,8 +39,6 @@ _HEADER = struct.Struct("<8s6I")
 """Magic, first frame, frames, height, width, CRC-32 of the frames, CRC-32 of the header so far."""
 _MAGIC = b"wiwroll1"
 _CHANNELS = 3
-BUDGET_GB = 20.0
-"""Most gigabytes of a folder unless the user says otherwise; a panorama takes 1.8 MB, a front view 0.7 MB."""
 
 
 def default_folder() -> Path:

@@ -59,7 +59,7 @@ class Trial:
         seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
         decision = replace(decision, seconds=seconds)
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
-        facts = outcome.executed, before, self.env.truth(), outcome.path, getattr(outcome, "refused", ())
+        facts = outcome.executed, before, self.env.truth(), outcome.path, outcome.refused
         end = self.observation if self.done else None
         record = DecisionRecord(self.index, self.decisions, decision, *facts, end)
         self.decisions += 1
@@ -174,4 +174,4 @@ def _finished(trial: Trial) -> EpisodeResult:
 def _failed(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     seconds = time.perf_counter() - begin
-    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, seconds, text, kind)
+    return EpisodeResult(index, episode.episode_id, episode.scene, "error", {}, seconds, text, kind)

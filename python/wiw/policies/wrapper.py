@@ -53,6 +53,17 @@ class PolicyWrapper(Policy):
         """See `Policy.score`."""
         return self.inner.score(situations, proposals, rollouts)
 
+    def score_or_prefer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[NDArray[np.float64]]:
+        """Score or prefer as the wrapped policy does, or by the `score` of a subclass that has one of its own."""
+        if type(self).score is not PolicyWrapper.score:
+            return super().score_or_prefer(situations, proposals, rollouts)
+        return self.inner.score_or_prefer(situations, proposals, rollouts)
+
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:

@@ -14,30 +14,15 @@ from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
 from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
 from wiw.experiments.semantics import Labelled
 from wiw.loop.agent import Agent
-from wiw.loop.attempts import DEADLINE, Attempted, make_model
+from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
+from wiw.loop.limits import DEADLINE, Limits
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.parts import Parts, space_option
-from wiw.loop.rollout_cache import BUDGET_GB, cache_rollouts
+from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
 from wiw.types import PRIMITIVES, Episode, Key
 from wiw.world_models.base import WorldModel
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What every agent of a run is built with beyond its identity; none of it changes what an agent decides."""
-
-    deadline: float = DEADLINE
-    """Seconds that a call of a world model may take before it counts as an error."""
-    cache: str = "auto"
-    """Where rollouts are kept: "auto", "off", or a folder (`wiw.loop.rollout_cache`)."""
-    cache_gb: float = BUDGET_GB
-    """Most gigabytes of that folder."""
-    fidelity: bool = False
-    """Whether every imagined plan is also replayed in the simulator (`wiw.experiments.fidelity`)."""
-    lpips: str | None = None
-    """Folder of the weights of LPIPS, to measure fidelity by it as well."""
 
 
 @dataclass(frozen=True)
@@ -77,23 +62,26 @@ def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunCo
     reviser = parts.reviser
     if reviser is None and policy.default_revision is not None:
         reviser = context.task.defaults.get("revision")
+    if "scoring" in stages or "proposals" in stages:
+        reviser = Parts(policy, imaginer, reviser, config, ()).build().reviser
     if "scoring" in stages:
-        reviser = TrueScores(Parts(policy, imaginer, reviser, config, ()).build().reviser)
+        reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
-    observers = [FidelityObserver(limits.lpips)] if limits.fidelity or limits.lpips is not None else []
+    measured = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
+    observers = [*parts.observers, *measured]
     return Agent(policy, imaginer, reviser, config, observers=observers)
 
 
-def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options: Any) -> WorldModel | None:
-    """Return a world model for plans of a space, from a name, class or instance; None for "none"."""
-    if model is None or isinstance(model, WorldModel):
+def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options: Any) -> WorldModel | Imaginer | None:
+    """Return a world model for plans of a space, from a name or class; instances and imaginers as they are."""
+    if model is None or isinstance(model, WorldModel | Imaginer):
         return model
     return make_model(model, deadline, **{**space_option(WORLD_MODELS, model, space), **options})
 
 
 def _wrap_model(
-    model: WorldModel | None,
+    model: WorldModel | Imaginer | None,
     space: str,
     placebo: str | None,
     experiment: Experiment,
@@ -104,8 +92,7 @@ def _wrap_model(
         if placebo is not None:
             raise ArgumentError(f"placebo='{placebo}' needs a world model, and this agent has none")
         return None
-    attempted = Attempted(model, limits.deadline)
-    imaginer: Imaginer = ModelImaginer(cache_rollouts(attempted, limits.cache, limits.cache_gb))
+    imaginer = model if isinstance(model, Imaginer) else ModelImaginer(_limit(model, limits))
     if experiment.semantics is not None:
         imaginer = Labelled(imaginer, experiment.semantics)
     if placebo is not None:
@@ -113,6 +100,13 @@ def _wrap_model(
     if experiment.imagine_fraction is not None:
         imaginer = Gated(imaginer, experiment.imagine_fraction)
     return imaginer
+
+
+def _limit(model: WorldModel, limits: Limits) -> WorldModel:
+    """Return the model with deadline, retries and cache; one that its user has wrapped stays as it is."""
+    if model is not model.unwrapped:
+        return model
+    return cache_rollouts(Attempted(model, limits.deadline), limits.cache, limits.cache_gb)
 
 
 def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContext) -> Imaginer:

@@ -6,18 +6,23 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
+from wiw.loop.imagination import Imaginer
+from wiw.loop.limits import Limits
+from wiw.loop.observers import Observer
 from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
-from wiw.runs.compose import Experiment, Limits, RunContext, compose, make_for_space
+from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
 from wiw.runs.sources import source_digests
+from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
 from wiw.world_models.base import WorldModel
 
@@ -35,18 +40,17 @@ class TaskRecipe:
     name: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    def build(self) -> Any:
-        """The task."""
+    def build(self) -> Task:
+        """Return the task."""
         from wiw.registry import TASKS
 
-        return TASKS.make(self.name, **self.options)
+        return cast(Task, TASKS.make(self.name, **self.options))
 
     def to_json(self) -> dict[str, Any]:
         """For the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
-        from wiw.registry import TASKS
+        from wiw.registry import task_class
 
-        portable = getattr(TASKS.find(self.name), "portable", dict)
-        return {"name": absolute(self.name), "options": portable(self.options)}
+        return {"name": absolute(self.name), "options": task_class(self.name).make_portable(self.options)}
 
     def sources(self) -> dict[str, str]:
         """Digests of the user's own source files, by path."""
@@ -77,6 +81,8 @@ class AgentRecipe(AgentConfig):
     semantics: Any = None
     semantics_options: Mapping[str, Any] = field(default_factory=dict)
     """What the source of semantics is made with."""
+    observers: Sequence[Observer] = ()
+    """Measure decisions; objects in memory."""
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> Agent:
         """Return the agent; numbers that are open are the task's."""
@@ -89,7 +95,7 @@ class AgentRecipe(AgentConfig):
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
-        return compose(Parts(policy, model, reviser, self.config, ()), experiment, limits, context)
+        return compose(Parts(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context)
 
     @property
     def config(self) -> AgentConfig:
@@ -112,7 +118,7 @@ class AgentRecipe(AgentConfig):
     def is_named(self) -> bool:
         """Whether all parts are names, so that any process can make them again."""
         parts = (self.policy, self.model, self.reviser, self.semantics)
-        return all(part is None or isinstance(part, str) for part in parts)
+        return not self.observers and all(part is None or isinstance(part, str) for part in parts)
 
     def to_json(self) -> dict[str, Any] | None:
         """Return the recipe for the run store; `AgentRecipe.from_json` is the way back. None with objects in memory."""
@@ -156,7 +162,7 @@ class AgentRecipe(AgentConfig):
             if isinstance(part, str):
                 found |= {} if part in registry.built_in else source_digests(registry.find(part))
             elif part is not None:
-                found |= source_digests(part)
+                found |= source_digests(_unwrap(part))
         return found
 
     def require(self, task: Mapping[str, Any]) -> None:
@@ -199,13 +205,19 @@ class AgentRecipe(AgentConfig):
         return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **self.policy_options[policy]})
 
 
-_FIELDS = tuple(field.name for field in fields(AgentRecipe))
+_FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
 _RENAMED = {"revision": "reviser", "swaps": "ground_truth"}
+
+
+def _unwrap(part: Any) -> Any:
+    """Return the model or policy behind everything that wraps it."""
+    model = part.model if isinstance(part, Imaginer) else part
+    return model.unwrapped if isinstance(model, Policy | WorldModel) else model
 
 
 def _describe(part: Any) -> Any:
     """Return a part's name, or what an object says of itself."""
-    if isinstance(part, Policy | WorldModel):
+    if isinstance(part, Policy | WorldModel | Imaginer):
         return part.describe()
     return part.__name__ if isinstance(part, type) else part
 
@@ -254,10 +266,10 @@ class AgentInMemory:
 
 
 def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskRecipe | TaskInMemory:
-    """Return a recipe of a task by name and options, of a task, or of a gymnasium environment's task.
+    """Return a recipe of a task by name and options, of a task, or of an environment's task.
 
     Raises:
-        ArgumentError: options for a task that is already made.
+        ArgumentError: options for a task that is already made; something else than these.
     """
     if isinstance(task, str):
         from wiw.registry import task_name
@@ -267,8 +279,19 @@ def task_recipe(task: Any, options: Mapping[str, Any] | None = None) -> TaskReci
         raise ArgumentError(f"the task is made already and cannot take {', '.join(options)}; give them to wiw.make")
     if isinstance(task, TaskRecipe):
         return task
-    unwrapped = getattr(task, "unwrapped", task)
-    return TaskInMemory(getattr(unwrapped, "task", unwrapped))
+    return TaskInMemory(task if isinstance(task, Task) else _task_of(task))
+
+
+def _task_of(env: Any) -> Task:
+    """Return the task of an environment, whatever gymnasium has wrapped around it."""
+    import gymnasium
+
+    from wiw.envs import ManipulationVectorEnv, VectorEnv
+
+    bare = env.unwrapped if isinstance(env, gymnasium.Env | gymnasium.vector.VectorEnv) else env
+    if isinstance(bare, Env | VectorEnv | ManipulationVectorEnv) and isinstance(bare.task, Task):
+        return bare.task
+    raise ArgumentError(f"expected a task (wiw.Task), the name of one, or an environment of wiw.make, got {env!r}")
 
 
 def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
@@ -281,7 +304,7 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
         return agent
     if isinstance(agent, Agent):
         parts = agent.parts
-        return AgentRecipe(parts.policy, parts.model, parts.reviser, **parts.config.numbers)
+        return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
     if isinstance(agent, BaseAgent):
         return AgentInMemory(agent)
     raise ArgumentError(f"expected a wiw.Agent, an AgentRecipe or a BaseAgent, got {type(agent).__name__}")
@@ -297,7 +320,7 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     """
     recipe = agent_recipe(agent)
     if arms is None:
-        return {recipe.arm if isinstance(recipe, AgentRecipe) else "none": recipe}
+        return {_name_own_arm(agent, recipe): recipe}
     if not isinstance(recipe, AgentRecipe):
         raise ArgumentError(f"arms: {type(agent).__name__} has no world model that could be another")
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
@@ -305,6 +328,13 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     if len(dict(made)) < max(1, len(made)):
         raise ArgumentError(f"arms: expected different world models, got {[name for name, _ in made]}")
     return dict(made)
+
+
+def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
+    """Return the name of an agent's own model: a recipe's as its user writes it, else its class behind all wrappers."""
+    if isinstance(agent, Agent):
+        return "none" if agent.model is None else type(agent.model.unwrapped).__name__.lower()
+    return recipe.arm if isinstance(recipe, AgentRecipe) else "none"
 
 
 def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, AgentRecipe]:

@@ -21,7 +21,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
 from wiw.errors import Error, InfrastructureError
-from wiw.runs.compose import Limits, RunContext
+from wiw.loop.limits import Limits
+from wiw.runs.compose import RunContext
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
@@ -240,7 +241,7 @@ class _Crew:
                 self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
             else:
                 error = f"the worker process died twice on this episode, last: {cause}"
-                result = EpisodeResult(index, episode.episode_id, episode.scene, "failed", error=error, kind="worker")
+                result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
                 self._desk.write(OutcomeRow(worker.job.arm, result))
 
 

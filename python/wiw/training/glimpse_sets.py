@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.datasets.ar import CATEGORIES, category_of
 from wiw.datasets.imagenav import camera_pose
-from wiw.datasets.visibility import COARSE, seen
+from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
 from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
@@ -102,7 +102,7 @@ def collect_glimpse_sets(
     labels = np.array([-1, *(numbers.get(category_of(thing), -1) for thing in world.scene.instances)])
     key = core.fold_key([seed, 0x4C00])
     points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
-    sizes = np.where(labels >= 0, seen(world, points, COARSE), 0.0)
+    sizes = np.where(labels >= 0, measure_sizes(world, points, COARSE), 0.0)
     tally: Counter[int] = Counter()
     parts: list[GlimpseSets] = []
     for number in range(rules.places):

@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.vlm.base import Client, Message, Problem, Reply, Request, user
+from wiw.vlm.base import Client
+from wiw.vlm.messages import Message, Problem, Reply, Request, user
 
 __all__ = ["Client", "Message", "Problem", "Reply", "Request", "connect", "user"]
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.vlm.base import Completion
+from wiw.vlm.messages import Completion
 
 _log = logging.getLogger("wiw.vlm")
 BUDGET_GB = 1.0

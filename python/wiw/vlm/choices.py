@@ -11,7 +11,7 @@ from string import ascii_uppercase
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.vlm.base import Message
+from wiw.vlm.messages import Message
 
 LETTER_CONTEXT = " \t\r\n\u2581\u0120\u010a().:*\"'`[]"
 """Characters that tokenizers and models put around a letter; the special ones are the spaces of sentencepiece and

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.vlm import choices, structured
-from wiw.vlm.base import Call, Completion, Problem, Reply, Request, Said
+from wiw.vlm.messages import Call, Completion, Problem, Reply, Request, Said
 
 RETRY_TEMPERATURE = 0.7
 """Least temperature of a repeated question: at 0 the same answer would come."""

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from wiw.vlm.base import Call, Client, Completion
+from wiw.vlm.base import Client
 from wiw.vlm.instances import generate_instance
+from wiw.vlm.messages import Call, Completion
 
 Script = Callable[[Call], "str | Mapping[str, float] | Completion"]
 WORDS = ("a", "door", "is", "ahead", "on", "the", "left", "right", "and", "clear")

@@ -16,8 +16,9 @@ from threading import Thread
 from typing import Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
-from wiw.vlm.base import Call, Client, Completion, Message
+from wiw.vlm.base import Client
 from wiw.vlm.images import ImageFormat, to_data_uri
+from wiw.vlm.messages import Call, Completion, Message
 
 Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import FileError, VlmError
-from wiw.vlm.base import Call, Client, Completion
+from wiw.vlm.base import Client
+from wiw.vlm.messages import Call, Completion
 
 
 class ReplayClient(Client):

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from wiw.vlm.base import Completion, Kind, Problem
+from wiw.vlm.messages import Completion, Kind, Problem
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import DependencyError, WeightsError
-from wiw.vlm.base import Call, Client, Completion, Message
+from wiw.vlm.base import Client
 from wiw.vlm.choices import LETTER_CONTEXT
 from wiw.vlm.instances import generate_instance
+from wiw.vlm.messages import Call, Completion, Message
 from wiw.vlm.tiny import MISSING_PACKAGES
 
 MAX_FIRST_TOKENS = 256

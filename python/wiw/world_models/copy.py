@@ -34,8 +34,5 @@ class CopyFront(Copy):
 
 
 def make_copy(space: str = PRIMITIVES) -> Copy:
-    """Predict that every future frame equals the present one: the floor.
-
-    Return the model for plans of a space.
-    """
+    """Return the floor, which predicts that every future frame equals the observation."""
     return CopyFront() if space == GRIPPER_POSES else Copy()

@@ -22,8 +22,8 @@ from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
 from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
 from wiw.vlm import Reply, Request, connect, user
-from wiw.vlm.base import Part
 from wiw.vlm.cache import open_reply_cache
+from wiw.vlm.messages import Part
 from wiw.vlm.prices import Prices
 
 if TYPE_CHECKING:

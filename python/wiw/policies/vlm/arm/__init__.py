@@ -17,7 +17,7 @@ from wiw.policies.vlm.arm.plans import GRID
 from wiw.tabletop.base import PALETTE
 from wiw.types import GRIPPER_POSES, Proposal, Rollout
 from wiw.vlm import Reply, Request, user
-from wiw.vlm.base import Part
+from wiw.vlm.messages import Part
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from wiw.errors import ArgumentError
-from wiw.vlm.base import Completion
+from wiw.serving.vlm_server import Response, VlmServer, make_chat_completion
+from wiw.vlm.base import Client
+from wiw.vlm.messages import Completion
 
 FAULTS = ("429", "500", "slow", "truncated", "malformed", "refusal", "huge")
-RATE = 0.1
 HUGE = 10 << 20
 """Characters of a huge answer."""
 
@@ -34,19 +37,6 @@ class Misbehaviour:
             raise ArgumentError(
                 f"misbehave: expected rates of {', '.join(FAULTS)} that sum to at most 1, got {dict(self.rates)}"
             )
-
-    @classmethod
-    def parse(cls, text: str, seed: int = 0) -> Misbehaviour:
-        """From "429,slow:0.2": faults with their rates, 0.1 where none is given.
-
-        Raises:
-            ArgumentError: an unknown fault, or a rate that is none.
-        """
-        try:
-            pairs = [part.strip().partition(":") for part in text.split(",") if part.strip()]
-            return cls({name: float(rate) if rate else RATE for name, _, rate in pairs}, seed)
-        except ValueError:
-            raise ArgumentError(f"misbehave: expected faults with rates as in 429:0.2,slow, got '{text}'") from None
 
     def fault(self, number: int) -> str | None:
         """What goes wrong with the request of that number, if anything."""
@@ -79,3 +69,23 @@ def spoiled(completion: Completion, fault: str | None, number: int) -> Completio
     if fault == "huge":
         return replace(completion, text=(text * (HUGE // max(1, len(text)) + 1))[:HUGE])
     return completion
+
+
+class MisbehavingVlmServer(VlmServer):
+    """A server that commits faults on demand."""
+
+    def __init__(self, client: Client, port: int = 0, misbehaviour: Misbehaviour | None = None) -> None:
+        super().__init__(client, port)
+        self.misbehaviour = misbehaviour or Misbehaviour()
+
+    def respond(self, body: dict[str, Any], number: int) -> Response:
+        fault = self.misbehaviour.fault(number)
+        if fault == "429":
+            headers = {"Retry-After": f"{self.misbehaviour.retry_after:g}"}
+            return Response(429, {"error": {"message": "too many requests"}}, headers)
+        if fault == "500":
+            return Response(500, {"error": {"message": "something broke"}})
+        if fault == "slow":
+            time.sleep(self.misbehaviour.slow_seconds)
+        completion = spoiled(self.complete(body), fault, number)
+        return Response(200, make_chat_completion(completion, self.client.model, number))

@@ -3,22 +3,35 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
+from fakes import LineTask
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pressing_policy import Pressing
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError
-from wiw.loop.agent import Query
-from wiw.loop.imagine import model_spec
-from wiw.loop.placebo import shuffled
+from wiw.experiments.gating import Gated
+from wiw.experiments.placebos import ShuffledPlacebo, SwappedPlacebo, shuffle
+from wiw.experiments.semantics import Labelled
+from wiw.loop.attempts import Attempted
+from wiw.loop.imagination import ModelInput
+from wiw.loop.imagine import make_model_spec
+from wiw.loop.memory import Query
+from wiw.loop.model_imaginer import ModelImaginer
+from wiw.runs.compose import NextEpisodes, RunContext
 from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
 from wiw.runs.verify import verify
+from wiw.tasks.imagenav import ImageNav
+from wiw.tasks.manipulation import Manipulation
 from wiw.types import Key, Proposal
 
-SPEC = model_spec(wiw.accepts(control="trajectory"))
+NOWHERE = RunContext(LineTask())
+SPEC = make_model_spec(wiw.accepts(control="trajectory"))
 PLANS = st.lists(
     st.lists(st.sampled_from([int(FORWARD), int(TURN_LEFT), int(TURN_RIGHT), int(STOP)]), min_size=1, max_size=6),
     min_size=1,
@@ -33,19 +46,19 @@ def proposals(plans):
 @settings(max_examples=60)
 @given(PLANS, st.integers(0, 5))
 def test_shuffling_keeps_lengths_primitives_and_stops(plans, decision) -> None:
-    dealt = shuffled(proposals(plans), Key(3, 1, decision), SPEC)
+    dealt = shuffle(proposals(plans), Key(3, 1, decision), SPEC)
     assert [len(p.actions) for p in dealt] == [len(plan) for plan in plans]
     assert sorted(a for p in dealt for a in p.actions.tolist()) == sorted(a for plan in plans for a in plan)
     for p, plan in zip(dealt, plans, strict=True):
         assert [a == STOP for a in p.actions.tolist()] == [a == STOP for a in plan]
     assert [(p.prior, p.note) for p in dealt] == [(p.prior, p.note) for p in proposals(plans)]
-    again = shuffled(proposals(plans), Key(3, 1, decision), SPEC)
+    again = shuffle(proposals(plans), Key(3, 1, decision), SPEC)
     assert all((a.actions == b.actions).all() for a, b in zip(dealt, again, strict=True))
 
 
 def test_shuffling_differs_by_decision_and_usually_changes_plans() -> None:
     plans = proposals([[1, 1, 1, 1, 1], [2, 2, 1, 1, 1], [1, 3, 1, 3, 1]])
-    found = {tuple(tuple(p.actions.tolist()) for p in shuffled(plans, Key(0, 0, d), SPEC)) for d in range(30)}
+    found = {tuple(tuple(p.actions.tolist()) for p in shuffle(plans, Key(0, 0, d), SPEC)) for d in range(30)}
     assert len(found) > 15 and tuple(tuple(p.actions.tolist()) for p in plans) not in found
 
 
@@ -73,32 +86,95 @@ class Fixed(wiw.Policy):
         return [np.array([float(r.frames[-1].mean()) for r in rows]) for rows in rollouts]
 
 
-def query(fill, stranger=None):
+def observe(fill):
     panorama = np.full((576, 1024, 3), fill, np.uint8)
-    observation = wiw.types.Observation(panorama, panorama[:480, :480], np.zeros(3))
-    return Query(observation, wiw.types.Goal("x"), Key(0, 0, 0), stranger=stranger)
+    return wiw.types.Observation(panorama, panorama[:480, :480], np.zeros(3))
 
 
-def test_the_swapped_model_sees_the_stranger_and_the_policy_keeps_its_real_views() -> None:
+def query(fill, episode=0):
+    return Query(observe(fill), wiw.types.Goal("x"), Key(0, episode, 0))
+
+
+class Elsewhere:
+    """First moments of one grey; remembers for which episodes they are kept."""
+
+    def __init__(self, fill):
+        self.moment, self.kept = ModelInput(observe(fill)), set()
+
+    def of(self, key):
+        self.kept.add(key.episode)
+        return self.moment
+
+    def forget(self, key):
+        self.kept.discard(key.episode)
+
+
+def test_the_swapped_model_sees_another_episode_and_the_policy_keeps_its_real_views() -> None:
     model = Seen()
-    agent = wiw.Agent(Fixed(), model, placebo="swapped")
-    (decision,) = agent.decide_batch([query(40, stranger=query(200))])
+    agent = wiw.Agent(Fixed(), SwappedPlacebo(model, Elsewhere(200)))
+    (decision,) = agent.decide_batch([query(40)])
     assert [colour for colour, _ in model.log] == [200] * 3
     assert sorted(plan for _, plan in model.log) == [[1, 1], [1, 1, 2], [1, 3, 1]]
     turned, ahead = decision.rollouts[1].frames[0], decision.rollouts[1].frames[1]
     assert turned.mean() == 40 and decision.rollouts[1].real[0] and ahead.mean() == 200
-    with pytest.raises(ArgumentError, match="stranger"):
-        agent.decide_batch([query(40)])
+    assert agent.describe()["placebo"] == "swapped" and agent.model is model
+
+
+def test_a_swapped_placebo_forgets_an_episode_that_has_ended() -> None:
+    moments = Elsewhere(200)
+    agent = wiw.Agent(Fixed(), Gated(SwappedPlacebo(Seen(), moments), 1.0))
+    agent.decide_batch([query(40), query(60, episode=1)])
+    assert moments.kept == {0, 1}
+    agent.forget(Key(0, 0, 3))
+    assert moments.kept == {1}
 
 
 def test_the_shuffled_model_sees_other_plans_and_the_policy_scores_its_own() -> None:
     real, placebo = Seen(), Seen()
     wiw.Agent(Fixed(), real).decide_batch([query(40)])
-    (decision,) = wiw.Agent(Fixed(), placebo, placebo="shuffled").decide_batch([query(40)])
+    (decision,) = wiw.Agent(Fixed(), ShuffledPlacebo(placebo)).decide_batch([query(40)])
     assert [p.actions.tolist() for p in decision.proposals] == [[1, 1, 2], [2, 1, 1], [1, 3, 1]]
     assert [len(r.frames) for r in decision.rollouts] == [3, 3, 3]
     assert sorted(plan for _, plan in placebo.log) != sorted(plan for _, plan in real.log)
     assert len(placebo.log) == len(real.log) == decision.calls["rows"]
+
+
+WRAPPERS = {
+    "shuffled": ShuffledPlacebo,
+    "swapped": lambda model: SwappedPlacebo(model, Elsewhere(200)),
+    "gated": lambda model: Gated(model, 0.5),
+    "labelled": lambda model: Labelled(model, "simulator"),
+}
+
+
+@pytest.mark.parametrize("order", list(permutations(WRAPPERS)), ids="-".join)
+def test_wrappers_of_a_model_compose_in_any_order(order) -> None:
+    def decide(names):
+        model = Seen()
+        changed = Attempted(model)
+        for name in names:
+            changed = WRAPPERS[name](changed)
+        agent = wiw.Agent(Fixed(), changed)
+        return agent, model, agent.decide_batch([query(40 + episode, episode) for episode in range(8)])
+
+    agent, model, decisions = decide(order)
+    _, expected, others = decide(WRAPPERS)
+    assert agent.model.unwrapped is model and model.log == expected.log and {colour for colour, _ in model.log} == {200}
+    for one, other in zip(decisions, others, strict=True):
+        np.testing.assert_array_equal(one.scores, other.scores)
+        assert one.calls == other.calls and (one.rollouts is None) == (other.rollouts is None)
+    assert 0 < sum(decision.rollouts is not None for decision in decisions) < 8
+    assert agent.count_spent()["rows"] == len(model.log) == sum(d.calls.get("rows", 0) for d in decisions)
+    described = agent.describe()
+    assert described["model"] == model.describe() and described["imagine_fraction"] == 0.5
+    assert described["semantics"] == "simulator" and described["placebo"] in ("shuffled", "swapped")
+
+
+def test_the_agent_of_a_changed_model_can_be_replaced_part_by_part() -> None:
+    agent = wiw.Agent(Fixed(), Gated(ShuffledPlacebo(Seen()), 0.5))
+    fewer = agent.replace(candidates=2)
+    assert fewer.describe() == {**agent.describe(), "candidates": 2, "width": 2}
+    assert "placebo" not in agent.replace(model="copy").describe() and agent.replace(model=None).model is None
 
 
 def test_what_placebo_arms_are_of() -> None:
@@ -111,23 +187,43 @@ def test_what_placebo_arms_are_of() -> None:
         "heuristic+placebo-shuffled": AgentRecipe("heuristic", "oracle", horizon=7, placebo="shuffled"),
         "placebo-shuffled:Mine": AgentRecipe("matcher", "a/b.py:Mine", horizon=7, placebo="shuffled"),
     }
-    assert AgentRecipe(**made["placebo-shuffled"].to_json()) == made["placebo-shuffled"]
+    assert AgentRecipe.from_json(made["placebo-shuffled"].to_json()) == made["placebo-shuffled"]
     assert arm_recipes(AgentRecipe("matcher"), ["placebo-swapped"])["placebo-swapped"].model == "warp"
-    built = arm_recipes(wiw.Agent("matcher", "copy"), ["placebo-shuffled"])["placebo-shuffled"].build({})
-    assert built.placebo == "shuffled" and type(built.model).__name__ == "Copy"
+    built = arm_recipes(wiw.Agent("matcher", "copy"), ["placebo-shuffled"])["placebo-shuffled"].build(NOWHERE)
+    assert built.describe()["placebo"] == "shuffled" and type(built.model.unwrapped).__name__ == "Copy"
     assert absolute("placebo-shuffled:a.py:Mine").startswith("placebo-shuffled:/")
     for wrong in ("placebo-odd", "placebo-shuffled:none"):
         with pytest.raises(ArgumentError, match="placebo-shuffled"):
             arm_recipes(agent, [wrong])
-    with pytest.raises(ArgumentError, match="with a world model"):
-        wiw.Agent("matcher", placebo="shuffled")
+    with pytest.raises(ArgumentError, match="placebo='shuffled' needs a world model"):
+        AgentRecipe("matcher", placebo="shuffled").build(NOWHERE)
+    with pytest.raises(ArgumentError, match="expected placebo shuffled or swapped, got 'odd'"):
+        AgentRecipe("matcher", "copy", placebo="odd").build(NOWHERE)
+
+
+def test_a_placebo_of_poses_is_refused_when_it_is_composed() -> None:
+    context = RunContext(Manipulation("push_buttons"))
+    with pytest.raises(ArgumentError, match="deals primitives anew, and these plans are made of none; use 'swapped'"):
+        AgentRecipe(Pressing(), "copy", placebo="shuffled").build(context)
+
+
+def test_a_swapped_placebo_is_of_the_runs_next_episode(two_rooms) -> None:
+    task = ImageNav(scenes=two_rooms)
+    episodes = task.episodes(3)
+    moments = NextEpisodes(RunContext(task, episodes), ModelImaginer(Seen()))
+    env = task.environment()
+    for episode in (0, 2):
+        shown = moments.of(Key(0, episode, 5))
+        expected = env.begin(episodes[(episode + 1) % 3])
+        np.testing.assert_array_equal(shown.observation.panorama, expected.panorama)
+        assert shown.simulator is None and shown.semantic is None and moments.of(Key(0, episode, 6)) is shown
 
 
 @pytest.fixture(scope="module")
 def run(two_rooms, tmp_path_factory):
     """The same arms with one worker and several episodes live, and with two workers."""
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = AgentRecipe("heuristic", "copy", revision="matcher")
+    agent = AgentRecipe("heuristic", "copy", reviser="matcher")
     arms = ["copy", "placebo-shuffled", "placebo-swapped", "placebo-swapped:oracle"]
 
     def made(workers, live):

@@ -17,16 +17,16 @@ import pytest
 from browser import COMMAND, WHY, Browser
 from PIL import Image, ImageSequence
 from pressing_policy import Pressing
-from test_evaluation_report import Page
 from test_export import contents_of
+from test_report import Page
 
 import wiw
 from wiw.errors import ArgumentError
 from wiw.report.page import render
 from wiw.report.site import write_view
 from wiw.report.stage import SIDE, Stage, signs, stage_of
-from wiw.runs.films import film, keep_films
-from wiw.runs.rows import decode_jpeg, kept_frames
+from wiw.runs.films import film, film_episodes
+from wiw.runs.rows import decode_jpeg, select_frames
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
 from wiw.tasks.manipulation import Manipulation
@@ -84,8 +84,8 @@ def test_plans_are_drawn_where_the_camera_sees_them() -> None:
 
 
 def test_many_frames_are_thinned_with_the_last_kept() -> None:
-    assert kept_frames(5).tolist() == [0, 1, 2, 3, 4]
-    kept = kept_frames(50)
+    assert select_frames(5).tolist() == [0, 1, 2, 3, 4]
+    kept = select_frames(50)
     assert len(kept) == 20 and kept[-1] == 49 and (np.diff(kept) >= 2).all()
 
 
@@ -109,18 +109,21 @@ def test_films_show_what_truly_happened(log: Any, html: str) -> None:
             seen = cv2.resize(decode_jpeg(kept), frame.shape[:2], interpolation=cv2.INTER_AREA).astype(float)
             assert np.abs(frame - seen).mean() < 4
         assert 8 < len(frames) < 60 and np.abs(frames[0] - frames[len(frames) // 2]).mean() > 1
-    assert html.count("data:image/webp") == len(log.episodes)
+    assert html.count('<img class="film moving"') == len(log.episodes)
 
 
 def test_arms_that_did_the_same_are_filmed_once(log: Any) -> None:
-    films = [log.store.film("none", 0), film(Manipulation().table(log.store.episodes()[0]).bench, [pose(*HERE)] * 2)]
+    films = [
+        log.store.film("none", 0),
+        film(Manipulation().set_table(log.store.episodes()[0]).bench, [pose(*HERE)] * 2),
+    ]
     assert films[0] != films[1] and len(films[1]) < len(films[0])
     with pytest.raises(ArgumentError, match="finite pose"):
-        film(Manipulation().table(log.store.episodes()[0]).bench, [[np.nan] * 7])
+        film(Manipulation().set_table(log.store.episodes()[0]).bench, [[np.nan] * 7])
 
 
 def test_failures_that_are_run_again_are_not_filmed() -> None:
-    keep_films(SimpleNamespace(config={"attributes": {}}), SimpleNamespace(build=Manipulation))  # type: ignore[arg-type]
+    film_episodes(SimpleNamespace(config={"attributes": {}}), SimpleNamespace(build=Manipulation))  # type: ignore[arg-type]
 
 
 def test_the_report_speaks_of_the_table(log: Any, html: str) -> None:
@@ -142,9 +145,10 @@ def test_the_report_shows_plans_beside_their_ends(log: Any, html: str) -> None:
     )
     assert classes.count("imagined") == classes.count("true") == imagined
     assert classes.count("tick") == decisions and classes.count("best") >= imagined // PLANS
-    shared = {attributes["id"] for tag, attributes in tags if tag == "image"}
+    shared = {attributes["id"] for tag, attributes in tags if tag == "symbol"}
     used = {attributes["href"][1:] for tag, attributes in tags if tag == "use" and "href" in attributes}
-    assert used == shared and len(shared) == decisions + 2 * len(ARMS)
+    ends = 2 * len(ARMS)  # two episodes of each; equal pictures are stored once
+    assert used == shared and PLANS < len(shared) < decisions + ends + 2 * imagined
 
 
 def test_exports_hold_poses_and_pictures(log: Any, tmp_path: Path) -> None:
@@ -172,7 +176,7 @@ def test_success_is_told_by_kind(log: Any) -> None:
 def test_the_view_steps_through_imagined_ways(log: Any, tmp_path: Path) -> None:
     site = write_view(log, tmp_path / "view")
     index, page = site.index.read_text(), (site.index.parent / "episodes" / "0001.html").read_text()
-    assert "Way" not in index and "push buttons" in index and " m<" not in index
+    assert "Path" not in index and "push buttons" in index and " m<" not in index
     assert log.store.episodes()[1].info["instruction"] in index
     assert page.count('type="range" min="1" max="3"') == 2 and "metres" not in page
     if COMMAND is None:

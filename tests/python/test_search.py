@@ -16,8 +16,8 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
-from wiw.loop.agent import Query
-from wiw.loop.beam import moved
+from wiw.loop.memory import Query
+from wiw.loop.search import move
 from wiw.types import Goal, Key, Observation, Proposal
 
 CANDIDATES, HORIZON = 3, 4
@@ -124,7 +124,7 @@ def brute_force(asked: Query, width: int, depth: int):
             there = Observation(
                 np.full((72, 128, 3), shown, np.uint8),
                 np.full((48, 48, 3), shown, np.uint8),
-                moved(here.odometry, plan),
+                move(here.odometry, plan),
             )
             named = Key(core.fold_key([key.seed, number, c]), key.episode, key.decision)
             for p in Wanderer.plans(there, named, 2, CANDIDATES, HORIZON):
@@ -138,7 +138,9 @@ def brute_force(asked: Query, width: int, depth: int):
 @pytest.mark.parametrize(("depth", "width"), [(1, None), (2, None), (2, 1), (3, 2), (3, 100)])
 def test_it_finds_what_brute_force_finds(causal: bool, frames: int, depth: int, width: int | None) -> None:
     queries = [query(episode, state) for episode, state in enumerate((3, 90, 77, 200))]
-    agent = wiw.Agent(Wanderer(), model_of(causal, frames), None, CANDIDATES, HORIZON, depth=depth, width=width)
+    agent = wiw.Agent(
+        Wanderer(), model_of(causal, frames), candidates=CANDIDATES, horizon=HORIZON, depth=depth, width=width
+    )
     for asked, decision in zip(queries, agent.decide_batch(queries), strict=True):
         level, scores = brute_force(asked, width or CANDIDATES, depth)
         assert [p.actions.tolist() for p in decision.proposals] == [plan for plan, _ in level]
@@ -157,7 +159,7 @@ def test_a_wide_beam_is_exhaustive_search() -> None:
         def propose(self, situations, candidates, horizon):
             return [[Proposal(p) for p in ([FORWARD], [FORWARD, TURN_LEFT], [TURN_RIGHT, FORWARD])] for _ in situations]
 
-    agent = wiw.Agent(Fixed(), model_of(), None, 3, 4, depth=2, width=3)
+    agent = wiw.Agent(Fixed(), model_of(), candidates=3, horizon=4, depth=2, width=3)
     decision = agent.decide_batch([query(0, 42)])[0]
     plans = [p.actions.tolist() for p in Fixed().propose([0], 3, 4)[0]]
     every = {(*a, *b): shown_after(42, [*a, *b]) for a in plans for b in plans}
@@ -167,9 +169,9 @@ def test_a_wide_beam_is_exhaustive_search() -> None:
 
 def test_imagining_deeper_leaves_the_real_memory_alone_and_keeps_seeds() -> None:
     model = model_of()
-    agent = wiw.Agent(Wanderer(), model, None, CANDIDATES, HORIZON, depth=3)
+    agent = wiw.Agent(Wanderer(), model, candidates=CANDIDATES, horizon=HORIZON, depth=3)
     decision = agent.decide_batch([query(0, 90)])[0]
-    memory = agent._lives[5, 0].proposer
+    memory = agent.components.memories.recall([query(0, 90)], agent.components.imaginer)[0][0].memory
     assert memory.observed == [90]
     assert model.seeds <= {core.fold_key([5, 0, 2, c]) for c in range(CANDIDATES)}
     assert len(decision.proposals) > CANDIDATES and decision.calls["rows"] > len(decision.proposals)
@@ -177,7 +179,7 @@ def test_imagining_deeper_leaves_the_real_memory_alone_and_keeps_seeds() -> None
 
 def test_results_do_not_depend_on_what_else_is_live() -> None:
     queries = [query(episode, 31 * episode) for episode in range(4)]
-    make = lambda: wiw.Agent(Wanderer(), model_of(True), None, CANDIDATES, HORIZON, depth=2)  # noqa: E731
+    make = lambda: wiw.Agent(Wanderer(), model_of(True), candidates=CANDIDATES, horizon=HORIZON, depth=2)  # noqa: E731
     together = make().decide_batch(queries)
     for asked, decision in zip(queries, together, strict=True):
         alone = make().decide_batch([asked])[0]
@@ -200,17 +202,17 @@ def test_models_that_need_depth_or_the_simulator_look_ahead_from_the_real_place(
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 2.9, -1.3])
-def test_moved_is_the_trajectory_from_where_one_stands(azimuth: float) -> None:
+def test_moving_follows_the_trajectory_from_where_one_stands(azimuth: float) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         first, second = (rng.integers(1, 4, 6).astype(np.int8) for _ in range(2))
         np.testing.assert_allclose(
-            np.cos(moved(to_trajectory(first)[-1], second) - to_trajectory([*first, *second])[-1])[2], 1
+            np.cos(move(to_trajectory(first)[-1], second) - to_trajectory([*first, *second])[-1])[2], 1
         )
         np.testing.assert_allclose(
-            moved(to_trajectory(first)[-1], second)[:2], to_trajectory([*first, *second])[-1, :2], atol=1e-12
+            move(to_trajectory(first)[-1], second)[:2], to_trajectory([*first, *second])[-1, :2], atol=1e-12
         )
-        assert abs(moved(np.array([0, 0, azimuth]), first)[2]) <= np.pi
+        assert abs(move(np.array([0, 0, azimuth]), first)[2]) <= np.pi
 
 
 def test_what_cannot_be_searched_deeper_says_so() -> None:
@@ -225,10 +227,10 @@ def test_what_cannot_be_searched_deeper_says_so() -> None:
     with pytest.raises(ArgumentError, match=r"Seeing needs it; write its `extend`"):
         wiw.Agent(type("Seeing", (Wanderer,), {"needs": ("depth",)})(), "copy", depth=2)
     extending = type("Extending", (Wanderer,), {"needs": ("depth",), "extend": Wanderer.propose})
-    assert wiw.Agent(extending(), "copy", depth=2).depth == 2
-    for wrong in ({"depth": 0}, {"width": 0}):
-        with pytest.raises(ArgumentError, match="depth and width >= 1"):
-            wiw.Agent(Wanderer(), "copy", **wrong)
+    assert wiw.Agent(extending(), "copy", depth=2).config.depth == 2
+    for name in ("depth", "width"):
+        with pytest.raises(ArgumentError, match=f"expected {name} of at least 1, got 0"):
+            wiw.Agent(Wanderer(), "copy", **{name: 0})
     assert wiw.Agent(Wanderer(), depth=2).decide_batch([query(0, 9)])[0].rollouts is None  # nothing is imagined
     with pytest.raises(ArgumentError, match="needs depth"):
-        wiw.Agent(Wanderer(), model_of(frames=3, needs=("depth",)), None, 3, 4, depth=2)
+        wiw.Agent(Wanderer(), model_of(frames=3, needs=("depth",)), candidates=3, horizon=4, depth=2)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from wiw.datasets import ar
 from wiw.datasets.visibility import visible_share
 from wiw.datasets.worlds import World, world
+from wiw.envs.episode_state import EpisodeState
 from wiw.envs.pointing import Pointing
-from wiw.envs.trip import Trip
 from wiw.errors import ArgumentError
 from wiw.tasks.navigation import NavigationTask
 from wiw.types import Answer, Episode, Goal, Wording
@@ -66,6 +66,7 @@ class AR(NavigationTask):
     default_policy = "recogniser"
     metrics = ("success", "mean_trajectory")
     rules_class = ARRules
+    generator_class = ar.EpisodeRules
     wording = Wording(
         succeeded="recognised the target",
         won="recognised",
@@ -80,9 +81,9 @@ class AR(NavigationTask):
         if categories is not None and not _different_names(categories):
             raise ArgumentError(f"ar: categories: expected different names, got {categories!r}")
         self.choices = tuple(categories or ar.CATEGORIES)
-        self._named = categories
+        self._categories = categories
         if self.episode_file:
-            self._episodes = self.of_file()
+            self._read_file()  # the file may name the choices
 
     @property
     def defaults(self) -> dict[str, Any]:
@@ -91,80 +92,87 @@ class AR(NavigationTask):
         return {**super().defaults, "execute": execute, "revision": "recogniser"}
 
     @property
+    def file_header(self) -> dict[str, Any]:
+        """Header of a file of its episodes."""
+        return {**super().file_header, "categories": list(self.choices)}
+
+    @property
     def pointing(self) -> Pointing:
         """How the target is boxed."""
         return Pointing(self.rules.box_scale, self.rules.box_part, self.rules.lost)
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity: what must be equal for two runs to be comparable."""
+        """Return the JSON-able identity: what must be equal for two runs to be comparable."""
         return {**super().describe(), "categories": list(self.choices)}
 
-    def goal(self, place: World, episode: Episode) -> Goal:
-        """The choices; what is to be recognised is pointed out in the observations."""
+    def make_goal(self, place: World, episode: Episode) -> Goal:
+        """Return the choices; what is to be recognised is pointed out in the observations."""
         return Goal(self.name, choices=self.choices)
 
-    def goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
-        """Beside the target: the nearest place to its centre where an agent can stand, if there is one near by."""
+    def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
+        """Return the place nearest to the target's centre where an agent can stand; below the centre without one."""
         centre = ar.centre_of(place, int(episode.info["target"]), f"episode {episode.episode_id}")
         below = np.array([centre[0], episode.start_position[1], centre[2]])
         nearest = place.navmesh.snap(below)
         return np.asarray(below if nearest is None or not np.isfinite(nearest).all() else nearest, np.float64)
 
-    def sure(self, trip: Trip) -> bool:
-        """Whether the last answer is above the confidence that ends the episode."""
-        return trip.answers[-1].confidence > self.rules.confidence
+    def is_sure(self, state: EpisodeState) -> bool:
+        """Return whether the last answer is above the confidence that ends the episode."""
+        return state.answers[-1].confidence > self.rules.confidence
 
-    def succeeded(self, trip: Trip) -> bool:
-        """Whether the episode has ended with the right answer."""
-        final = self.final(trip)
-        return trip.ended and final is not None and final.label == trip.episode.info["category"]
+    def is_success(self, state: EpisodeState) -> bool:
+        """Return whether the episode has ended with the right answer."""
+        final = self.final_answer(state)
+        return state.ended and final is not None and final.label == state.episode.info["category"]
 
-    def destination(self, trip: Trip) -> NDArray[np.float64]:
-        """Where the target is seen best."""
-        return ar.best_place(trip.world, trip.episode)
+    def find_destination(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Return where the target is seen best."""
+        return ar.find_best_place(state.world, state.episode)
 
-    def progress(self, trip: Trip, fork: Any, left: float) -> float:
-        """How well the target is truly seen, 0 to 1; where that is equal, the way to the best view decides."""
-        return ar.clarity(trip.world, fork.position, int(trip.episode.info["target"])) - 0.001 * left
+    def measure_progress(self, state: EpisodeState, fork: Any, primitives_left: float) -> float:
+        """Return how well the target is truly seen, 0 to 1; where that is equal, the way to the best view decides."""
+        return (
+            ar.measure_clarity(state.world, fork.position, int(state.episode.info["target"])) - 0.001 * primitives_left
+        )
 
-    def final(self, trip: Trip) -> Answer | None:
-        """The answer that counts, of those given so far."""
-        if not trip.answers:
+    def final_answer(self, state: EpisodeState) -> Answer | None:
+        """Return the answer that counts, of those given so far."""
+        if not state.answers:
             return None
-        surest = max(trip.answers, key=lambda answer: answer.confidence)
-        return surest if self.rules.prediction == "surest" else trip.answers[-1]
+        surest = max(state.answers, key=lambda answer: answer.confidence)
+        return surest if self.rules.prediction == "surest" else state.answers[-1]
 
-    def result(self, trip: Trip) -> dict[str, float]:
-        """Metrics of one finished episode.
+    def measure(self, state: EpisodeState) -> dict[str, float]:
+        """Return the metrics of one finished episode.
 
         `success` 0 or 1; `actions` carried out before the final answer; its `confidence` (0 without an answer);
         `visible_start` and `visible_end`, the shares of the target in sight there; `category` and `predicted`, numbers
         of the choices (`predicted` is -1 without an answer).
         """
-        final, target = self.final(trip), int(trip.episode.info["target"])
-        category = trip.episode.info["category"]
+        final, target = self.final_answer(state), int(state.episode.info["target"])
+        category = state.episode.info["category"]
         return {
             "success": float(final is not None and final.label == category),
-            "actions": float(trip.actions),
+            "actions": float(state.actions),
             "confidence": 0.0 if final is None else final.confidence,
-            "visible_start": visible_share(trip.world, trip.positions[0], target),
-            "visible_end": visible_share(trip.world, trip.positions[-1], target),
+            "visible_start": visible_share(state.world, state.positions[0], target),
+            "visible_end": visible_share(state.world, state.positions[-1], target),
             "category": float(self.choices.index(category)),
             "predicted": -1.0 if final is None else float(self.choices.index(final.label)),
         }
 
-    def of_file(self) -> list[Episode]:
-        """The file's episodes; where it gives no place of the target, the scene does."""
+    def load_episodes(self) -> list[Episode]:
+        """Return the file's episodes; where it gives no place of the target, the scene does."""
         assert self.episode_file is not None
-        loaded, self.choices = ar.load(self.episode_file, self.scene_folder, self._named)
-        return [self._placed(episode, f"{self.episode_file}: episode {i}") for i, episode in enumerate(loaded)]
+        loaded, self.choices = ar.load(self.episode_file, self.scene_folder, self._categories)
+        return [self._place_goal(episode, f"{self.episode_file}: episode {i}") for i, episode in enumerate(loaded)]
 
-    def of_scene(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
-        """Targets hardly seen at the start, of the categories that are rarest so far."""
+    def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
+        """Return episodes with targets hardly seen at the start, of the categories that are rarest so far."""
         taken = [episode.info["category"] for episode in before]
-        return ar.generate(place, self.per_scene, self.seed, self.choices, first=first, before=taken)
+        return ar.generate(place, self.per_scene, self.seed, self.choices, self.generator, first=first, before=taken)
 
-    def _placed(self, episode: Episode, where: str) -> Episode:
+    def _place_goal(self, episode: Episode, where: str) -> Episode:
         if np.isfinite(episode.goal_position).all():
             return episode
         centre = ar.centre_of(world(episode.scene, self.backend), int(episode.info["target"]), where)

@@ -12,19 +12,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.envs.manipulation import ManipulationEnv
+from wiw.envs.manipulation_spec import ManipulationSpec
 from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.errors import ArgumentError
 from wiw.render import resolve_backend
-from wiw.tabletop.base import TableSetup, TabletopTask, derive_key
-from wiw.tabletop.robot import Robot, load_panda, load_robot
+from wiw.tabletop.base import derive_key
+from wiw.tabletop.robot import load_panda, load_robot
+from wiw.tabletop.table import Table
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
-from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Goal, Wording, checked_seed
+from wiw.tasks.base import Task
+from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Wording, checked_seed
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
-HOPELESS = -1000.0
+UNREACHABLE = -1000.0
 """Progress where nothing helps any more, such as after a wrong button."""
 
 
@@ -48,7 +51,7 @@ class ManipulationRules:
             raise ArgumentError(f"manipulation: actions, candidates, horizon and episodes must be positive, got {self}")
 
 
-class Manipulation:
+class Manipulation(ManipulationSpec, Task):
     """Push buttons, slide a block, put a ring on a peg, stack cups; told in words, done by gripper poses.
 
     Args:
@@ -63,8 +66,9 @@ class Manipulation:
     name = "manipulation"
     metrics = ("success", "mean_trajectory")
     default_policy = "scripted"
-    senses = ("size", "cameras", "ids", "cloud", "grid")
-    """Options of `wiw.make` that are the environment's."""
+    space = GRIPPER_POSES
+    has_guide = True
+    sensor_options = ("size", "cameras", "ids", "cloud", "grid")
     wording = Wording("did what it was told", "done", "not done", "what is left", asked="Told", steps="decisions")
 
     def __init__(
@@ -84,15 +88,15 @@ class Manipulation:
                 f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
                 "tables are set by `tasks` and `seed`"
             )
-        self.tasks, self.seed, self.backend = _named(tasks), checked_seed(seed), backend
+        self.tasks, self.seed, self.backend = _parse_tasks(tasks), checked_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
-        self.rules = presets.rules(ManipulationRules, self.name, preset, rules)
+        self.rules = presets.load_rules(ManipulationRules, presets.find_owner(type(self)), preset, rules)
 
     @staticmethod
-    def portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """The same options, with paths that mean the same in any folder and the renderer of "auto"."""
+    def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the same options, with paths that mean the same in any folder and the renderer of "auto"."""
         ways: dict[str, Callable[[Any], str]] = {
-            "preset": presets.absolute,
+            "preset": presets.make_absolute,
             "backend": resolve_backend,
             "robot": lambda file: str(Path(file).expanduser().absolute()),
         }
@@ -105,7 +109,13 @@ class Manipulation:
         return self.rules.actions
 
     @property
-    def usual(self) -> int:
+    def decisions(self) -> int:
+        """Decisions that an episode may take, where all that is planned for one is carried out."""
+        execute = self.rules.execute
+        return -(-self.rules.actions // (execute if execute > 0 else max(1, self.rules.horizon + execute)))
+
+    @property
+    def default_episodes(self) -> int:
         """Episodes of a run that is not told how many."""
         return self.rules.episodes * len(self.tasks)
 
@@ -114,7 +124,7 @@ class Manipulation:
         """Options for `wiw.Agent` that the task prescribes."""
         rules = self.rules
         numbers = {"candidates": rules.candidates, "horizon": rules.horizon, "execute": rules.execute}
-        return {**numbers, "space": GRIPPER_POSES}
+        return {**numbers, "space": self.space}
 
     @property
     def stage(self) -> dict[str, Any]:
@@ -122,7 +132,7 @@ class Manipulation:
         return {"camera": asdict(CAMERAS["front"]), "ground": TABLE}
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity: what must be equal for two runs to be comparable."""
+        """Return the JSON-able identity: what must be equal for two runs to be comparable."""
         backend = resolve_backend(self.backend)
         return {
             "task": self.name, "tasks": list(self.tasks), "seed": self.seed, "backend": backend,
@@ -130,19 +140,19 @@ class Manipulation:
         }  # fmt: skip
 
     def environment(self, depth: bool = False, **sensors: Any) -> ManipulationEnv:
-        """An environment for the task's episodes; `ManipulationEnv` documents what it can be given to sense."""
+        """Return an environment for the task's episodes; `ManipulationEnv` documents what it can be given to sense."""
         return ManipulationEnv(self, depth, **sensors)
 
     def vector_environment(self, num_envs: int, depth: bool = False, **sensors: Any) -> ManipulationVectorEnv:
-        """A gymnasium vector environment of this task, with `num_envs` tables at a time."""
+        """Return a gymnasium vector environment of this task, with `num_envs` tables at a time."""
         return ManipulationVectorEnv(self, num_envs, depth, **sensors)
 
     def episodes(self, count: int) -> list[Episode]:
-        """The first so many."""
+        """Return the first `count` episodes."""
         return [self.episode(index) for index in range(count)]
 
     def episode(self, index: int) -> Episode:
-        """A table of its own for each; variations are drawn by the seed.
+        """Return an episode by its number, each with a table of its own; variations are drawn by the seed.
 
         Raises:
             ArgumentError: a number below 0.
@@ -157,21 +167,21 @@ class Manipulation:
         info["instruction"] = TABLETOP_TASKS[name].create_setup(seed, variation).instruction
         return Episode(f"{index:04d}", f"{name}/{seed}", here, 0.0, here, 0.0, float("nan"), info)
 
-    def table(self, episode: Episode) -> Table:
-        """An episode's table, at rest."""
+    def set_table(self, episode: Episode) -> Table:
+        """Return an episode's table, at rest."""
         kind = TABLETOP_TASKS[episode.info["task"]]
         return Table(
             kind, kind.create_setup(int(episode.info["seed"]), int(episode.info["variation"])), self.backend, self.robot
         )
 
-    def progress(self, table: Table, bench: Workbench) -> float:
-        """0 where what is asked for is done, else less by each pose that an expert would need."""
+    def measure_progress(self, table: Table, bench: Workbench) -> float:
+        """Return 0 where what is asked for is done, else less by each pose that an expert would need."""
         if table.kind.is_success(bench, table.setup):
             return 0.0
-        return float(-len(self.expert(table, bench)) or HOPELESS)
+        return float(-len(self.plan_expert(table, bench)) or UNREACHABLE)
 
-    def expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
-        """float64 [K, 7]: what is left to do, as a bench stands; nothing where nothing helps."""
+    def plan_expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
+        """Return what is left to do as a bench stands, float64 [K, 7]; nothing where nothing helps."""
         kind, setup = table.kind, table.setup
         places = bench.get_poses(setup.objects)
         front = bench.render_view(arm=False)["color"]
@@ -179,8 +189,8 @@ class Manipulation:
         return np.empty((0, 7)) if left is None else kind.plan_expert(places, left, bench.pose)
 
 
-def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
-    """The tasks that "all", "a,b" or ["a", "b"] mean.
+def _parse_tasks(tasks: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the tasks that "all", "a,b" or ["a", "b"] mean.
 
     Raises:
         ArgumentError: none, one twice, or one that is not known.
@@ -193,23 +203,3 @@ def _named(tasks: str | Sequence[str]) -> tuple[str, ...]:
             f"manipulation: expected tasks as all, or different ones of {known}, got {', '.join(names)}"
         )
     return names
-
-
-class Table:
-    """One episode's table in the course of time."""
-
-    def __init__(
-        self,
-        kind: TabletopTask,
-        setup: TableSetup,
-        backend: Literal["auto", "cpu", "gpu"] = "auto",
-        robot: Robot | None = None,
-    ) -> None:
-        self.kind, self.setup = kind, setup
-        self.bench = setup.build_workbench(backend, robot)
-        self.goal = Goal(Manipulation.name, text=setup.instruction)
-        self.objects = setup.objects
-
-    def succeeded(self) -> bool:
-        """Whether what is asked for is done."""
-        return self.kind.is_success(self.bench, self.setup)
