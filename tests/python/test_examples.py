@@ -14,9 +14,10 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "docs/examples"
 
 
-def run(scene: str, tmp_path: Path, policy: str, model: str, seed: int = 0) -> wiw.RunLog:
+def run(scene: str, tmp_path: Path, policy: str, model: str) -> wiw.RunLog:
     agent = wiw.Agent(policy, model, candidates=3)
-    return wiw.evaluate("imagenav", agent, 1, seed, tmp_path / f"run{seed}", progress=False, scenes=scene, decisions=2)
+    options = {"scenes": scene, "decisions": 2}
+    return wiw.evaluate("imagenav", agent, 1, seed=0, out=tmp_path / "run", progress=False, **options)
 
 
 def test_the_world_model_keeps_its_contract() -> None:

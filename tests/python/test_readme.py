@@ -38,7 +38,7 @@ def test_the_readmes_model_is_a_model(blocks: list[str], two_rooms: str, tmp_pat
     (tmp_path / "mymodel.py").write_text(blocks[0] + "\n\n" + still)
     log = wiw.evaluate("imagenav", wiw.Agent("matcher", "mymodel.py:MyModel"), 1, scenes=two_rooms, decisions=2)
     assert [episode["status"] for episode in log.episodes] == ["done"]
-    assert np.isfinite(log.numbers()["MyModel"].estimates["success"].value)
+    assert np.isfinite(log.numbers()["mymodel"].estimates["success"].value)
 
 
 @pytest.mark.parametrize("page", LINKED, ids=lambda page: page.name)
