@@ -57,7 +57,7 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
         (["--width", "2"], "give --depth 2 or more"),
         (["--policy", "recogniser"], "use it with task ar"),
         (["--policy", "matcher", "--revision", "recogniser"], "use it with task ar"),
-        (["--world-model", f"{FAKES}:Nothing"], "fakes.py defines no 'Nothing'; it has Outcome,"),
+        (["--world-model", f"{FAKES}:Nothing"], "fakes.py defines no 'Nothing'; it has LineEnv,"),
     ],
 )
 def test_a_mistake_is_explained_in_one_line(
