@@ -65,7 +65,7 @@ def count_stages_by_cpu() -> None:
 def one(task: TaskRecipe, model: type[wiw.WorldModel], folder: Path, live: int) -> tuple[float, float, Mapping, int]:
     """CPU and wall seconds of a run, its costs, and model calls."""
     Generator.calls, cpu, wall = 0, time.process_time(), time.perf_counter()
-    agent = Agent("heuristic", model(), revision="matcher")
+    agent = Agent("heuristic", model(), reviser="matcher")
     out = Path(tempfile.mkdtemp(dir=folder))
     log = wiw.evaluate(task, agent, EPISODES, out=out, progress=False, live=live, keep_images=0, cache=folder / "cache")
     return time.process_time() - cpu, time.perf_counter() - wall, log.costs()[0], Generator.calls

@@ -63,17 +63,31 @@ def check_needs(model: WorldModel) -> None:
 
 
 def check_proposals(policy: Policy, space: PlanChecker, proposals: Any, episodes: int, most: int, horizon: int) -> None:
-    """Hold `propose` and `extend` to at most `most` plans of 1 to `horizon` actions for each episode.
+    """Hold `propose` to 1 to `most` plans of 1 to `horizon` actions for each episode.
 
     Raises:
         ContractError: another count, length or action.
     """
-    name = f"{type(policy.unwrapped).__name__}.propose"
-    if not isinstance(proposals, Sequence) or len(proposals) != episodes:
-        raise ContractError(f"{name}: expected a list of proposals for each of {episodes} episodes, got {proposals!r}")
-    for plans in proposals:
-        if not 1 <= len(plans) <= most:
-            raise ContractError(f"{name}: expected 1 to {most} plans for an episode, got {len(plans)}")
+    _check_plans(f"{type(policy.unwrapped).__name__}.propose", space, proposals, episodes, (1, most), horizon)
+
+
+def check_continuations(
+    policy: Policy, space: PlanChecker, continuations: Any, places: int, most: int, horizon: int
+) -> None:
+    """Hold `extend` to at most `most` plans of 1 to `horizon` actions for each place; none leaves a plan as it is.
+
+    Raises:
+        ContractError: another count, length or action.
+    """
+    _check_plans(f"{type(policy.unwrapped).__name__}.extend", space, continuations, places, (0, most), horizon)
+
+
+def _check_plans(name: str, space: PlanChecker, made: Any, lists: int, count: tuple[int, int], horizon: int) -> None:
+    if not isinstance(made, Sequence) or len(made) != lists:
+        raise ContractError(f"{name}: expected a list of proposals for each of {lists} episodes, got {made!r}")
+    for plans in made:
+        if not count[0] <= len(plans) <= count[1]:
+            raise ContractError(f"{name}: expected {count[0]} to {count[1]} plans for an episode, got {len(plans)}")
         for plan in plans:
             if not isinstance(plan, Proposal):
                 raise ContractError(f"{name}: expected wiw.types.Proposal, got {type(plan).__name__}")

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import STOP, to_trajectory
 from wiw.loop.config import AgentConfig
-from wiw.loop.contract import check_proposals
+from wiw.loop.contract import check_continuations
 from wiw.loop.imagination import Imagination
 from wiw.loop.plan_space import PlanSpace
 from wiw.policies.base import Policy, Situation
@@ -77,8 +77,7 @@ class Search:
             return {}
         candidates, horizon = self._config.candidates or 1, self._config.horizon or 1
         found = policy.extend(self._at_ends(situations, futures, going), candidates, horizon)
-        made = [plans for plans in found if plans]
-        check_proposals(policy, self._space, made, len(made), candidates, horizon)
+        check_continuations(policy, self._space, found, len(going), candidates, horizon)
         return dict(zip(going, found, strict=True))
 
     def _replace(self, episode: int, pairs: Sequence[tuple[int, Proposal]]) -> None:

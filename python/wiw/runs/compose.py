@@ -12,7 +12,7 @@ from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
 from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
-from wiw.experiments.semantics import Labelled
+from wiw.experiments.semantics import SIMULATOR, Labelled
 from wiw.loop.agent import Agent
 from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
@@ -60,7 +60,7 @@ def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunCo
     model = make_for_space("oracle" if "imagination" in stages else parts.model, policy.space, limits.deadline)
     imaginer = _wrap_model(model, policy.space, placebo, experiment, limits, context)
     reviser = parts.reviser
-    if reviser is None and policy.default_revision is not None:
+    if reviser is None and not policy.can_revise:
         reviser = context.task.defaults.get("revision")
     if "scoring" in stages or "proposals" in stages:
         reviser = Parts(policy, imaginer, reviser, config, ()).build().reviser
@@ -134,6 +134,7 @@ class NextEpisodes:
             )
         self._context, self._needs = context, imaginer.accepts.needs
         self._depth = "depth" in imaginer.needs
+        self._labels = isinstance(imaginer, Labelled) and imaginer.source == SIMULATOR and "semantic" in self._needs
         self._env: Any = None
         self._moments: dict[tuple[int, int], ModelInput] = {}
 
@@ -153,5 +154,5 @@ class NextEpisodes:
             self._env = self._context.task.environment(depth=self._depth)
         observation = self._env.begin(self._context.episodes[index])
         simulator = self._env.fork() if "simulator" in self._needs else None
-        semantic = self._env.semantic() if "semantic" in self._needs else None
+        semantic = self._env.semantic() if self._labels else None
         return ModelInput(observation, simulator, semantic)

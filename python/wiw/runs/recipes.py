@@ -302,7 +302,7 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     """
     if isinstance(agent, AgentRecipe):
         return agent
-    if isinstance(agent, Agent):
+    if type(agent) is Agent:  # a subclass may decide otherwise, and is taken as it is
         parts = agent.parts
         return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
     if isinstance(agent, BaseAgent):

@@ -17,7 +17,7 @@ from wiw.runs.config import RunConfig, take_settings
 from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
-from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
+from wiw.runs.recipes import TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
 from wiw.runs.store import RunStore, removed_if_empty
 from wiw.studies.run_log import RunLog
 
@@ -59,7 +59,7 @@ def evaluate(
         WeightsError: those of LPIPS are not there; says which, and how to get them.
     """
     own, task_options = take_settings(config, settings, episodes)
-    return _run(task_recipe(env_or_task, task_options), arm_recipes(agent, arms), own)
+    return _run(_find_task(env_or_task, task_options, own), arm_recipes(agent, arms), own)
 
 
 def run_arms(
@@ -73,7 +73,14 @@ def run_arms(
     """Run several named agents on the same episodes; see `evaluate` for the rest."""
     own, task_options = take_settings(config, settings, episodes)
     recipes = {name: agent_recipe(agent) for name, agent in agents.items()}
-    return _run(task_recipe(env_or_task, task_options), recipes, own)
+    return _run(_find_task(env_or_task, task_options, own), recipes, own)
+
+
+def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -> TaskRecipe | TaskInMemory:
+    """Return the task; one by name takes its episodes from the run's seed, as on the command line."""
+    if isinstance(env_or_task, str) and settings.seed is not None:
+        options = {"seed": settings.seed, **options}
+    return task_recipe(env_or_task, options)
 
 
 def resume_run(

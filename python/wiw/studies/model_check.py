@@ -175,6 +175,8 @@ def examine_model(
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
+        if made.accepts.space not in PLANS:
+            raise ArgumentError(f"check-model knows plans in {', '.join(PLANS)}, and the model takes others")
         plan_space(made.accepts.space).check_model(made, LENGTH)
     except ArgumentError as error:
         return _only(Finding("needs", f"{error}."))

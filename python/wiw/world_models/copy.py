@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.errors import ArgumentError
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel, accepts
 
@@ -35,4 +36,9 @@ class CopyFront(Copy):
 
 def make_copy(space: str = PRIMITIVES) -> Copy:
     """Return the floor, which predicts that every future frame equals the observation."""
-    return CopyFront() if space == GRIPPER_POSES else Copy()
+    made = {PRIMITIVES: Copy, GRIPPER_POSES: CopyFront}.get(space)
+    if made is None:
+        raise ArgumentError(
+            f"copy: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
+        )
+    return made()

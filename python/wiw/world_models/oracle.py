@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.errors import ArgumentError
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel, accepts
 
@@ -68,4 +69,9 @@ def make_oracle(space: str = PRIMITIVES) -> Oracle:
 
     Return the model for plans of a space.
     """
-    return ArmOracle() if space == GRIPPER_POSES else Oracle()
+    made = {PRIMITIVES: Oracle, GRIPPER_POSES: ArmOracle}.get(space)
+    if made is None:
+        raise ArgumentError(
+            f"oracle: expected plans in {PRIMITIVES} or {GRIPPER_POSES}, got '{space}'; write one for yours"
+        )
+    return made()
