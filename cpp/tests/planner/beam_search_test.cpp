@@ -8,7 +8,8 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
-using enum Action;
+using namespace wiw::planner;
+using enum action::Action;
 
 TEST_CASE("the best are kept in order, ties go to the lower index") {
   BeamSearch search(2);
@@ -16,7 +17,7 @@ TEST_CASE("the best are kept in order, ties go to the lower index") {
   const auto kept = search.tell({{1, 3, 3}, {-std::numeric_limits<double>::infinity()}, {}});
   CHECK(kept == std::vector<std::vector<int>>{{1, 2}, {0}, {}});
   CHECK(search.done());
-  CHECK(search.beams()[0][0].plan == ActionSequence{kTurnLeft});
+  CHECK(search.beams()[0][0].plan == action::ActionSequence{kTurnLeft});
   CHECK(search.beams()[2].empty());
 }
 

@@ -8,7 +8,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 BeamSearch::BeamSearch(int width, int depth) : width_(width), depth_(depth) {
   if (width < 1 || depth < 1) {
@@ -58,7 +58,7 @@ const Plans& BeamSearch::ask(const std::vector<Plans>& continuations) {
                           std::to_string(continuations[episode].size()));
     }
     for (std::size_t i = 0; i < beams_[episode].size(); ++i) {
-      for (const ActionSequence& more : continuations[episode][i]) {
+      for (const action::ActionSequence& more : continuations[episode][i]) {
         Entry entry = beams_[episode][i];
         entry.plan.insert(entry.plan.end(), more.begin(), more.end());
         candidates_[episode].push_back(std::move(entry));
@@ -107,4 +107,4 @@ std::vector<std::vector<int>> BeamSearch::tell(const std::vector<std::vector<dou
   return kept;
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -5,7 +5,7 @@
 
 #include "wiw/planner/batch.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 /// Policy-guided beam search over the plans of many episodes (the paper's "Unified Strategy for Closed-Loop Online
 /// Planning"): ask for the plans to score, tell their scores; each level keeps the best `width` plans of an episode and
@@ -16,7 +16,7 @@ class BeamSearch {
   BeamSearch(int width, int depth = 1);
 
   struct Entry {
-    ActionSequence plan;
+    action::ActionSequence plan;
     double score = 0;
     int origin = 0;  // first-level proposal that the plan began as
   };
@@ -49,4 +49,4 @@ class BeamSearch {
   Plans plans_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::planner
