@@ -25,7 +25,7 @@ def save(name: str, pipeline: Any, folder: Path, **config: Any) -> Path:
     for place in model.denoisers:
         width = embedding_width(getattr(pipeline, place))
         values = {
-            "base": model.base,
+            "base": model.unwrapped,
             "weights": str(folder.parent),
             "stride": model.generator_class.stride,
             "width": width,

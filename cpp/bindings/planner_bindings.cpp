@@ -7,7 +7,6 @@
 
 #include "actions.hpp"
 #include "wiw/planner/assemble.hpp"
-#include "wiw/planner/beam_search.hpp"
 
 namespace py = pybind11;
 using namespace wiw;
@@ -48,16 +47,6 @@ Plans plans_of(const py::sequence& episodes) {
       candidates.push_back(to_plan(to_array(plan)));
   }
   return plans;
-}
-
-py::list plans_list(const Plans& plans) {
-  py::list episodes;
-  for (const auto& candidates : plans) {
-    py::list list;
-    for (const action::ActionSequence& plan : candidates) list.append(to_ids(plan));
-    episodes.append(list);
-  }
-  return episodes;
 }
 
 template <class T, class Items, class Get>
@@ -416,60 +405,10 @@ void bind_batch(py::module_& module) {
            "uint8 [n, (4,) h, w, 3]: what each of the named candidates (counted over all episodes) ends with.");
 }
 
-void bind_beam(py::module_& module) {
-  py::class_<BeamSearch>(module, "BeamSearch",
-                         "Keeps the best `width` plans of each episode over `depth` levels: ask(), score, tell().")
-      .def(py::init<int, int>(), py::arg("width"), py::arg("depth") = 1)
-      .def(
-          "ask",
-          [](BeamSearch& self, const py::sequence& proposals) {
-            if (self.level() == 0) return plans_list(self.ask(plans_of(proposals)));
-            std::vector<Plans> continuations;
-            for (const py::handle& episode : proposals) {
-              continuations.push_back(plans_of(py::reinterpret_borrow<py::sequence>(episode)));
-            }
-            return plans_list(self.ask(continuations));
-          },
-          py::arg("proposals"),
-          "Plans to score, [episode][candidate]. First level: proposals[episode][candidate]; deeper: "
-          "continuations[episode][kept plan][continuation], to be appended.")
-      .def(
-          "tell",
-          [](BeamSearch& self, const py::sequence& scores) {
-            std::vector<std::vector<double>> values;
-            for (const py::handle& episode : scores) {
-              const Array<double> row = Array<double>::ensure(py::reinterpret_borrow<py::object>(episode));
-              if (!row || row.ndim() != 1) throw ArgumentError("scores: expected numbers [M] for each episode");
-              values.emplace_back(row.data(), row.data() + row.size());
-            }
-            py::list kept;
-            for (const auto& order : self.tell(values)) kept.append(integers(order));
-            return kept;
-          },
-          py::arg("scores"), "int64 [k] an episode: kept candidates, best first, equal scores in their order.")
-      .def_property_readonly("level", &BeamSearch::level)
-      .def_property_readonly("done", &BeamSearch::done)
-      .def_property_readonly(
-          "beams",
-          [](const BeamSearch& self) {
-            py::list episodes;
-            for (const auto& beam : self.beams()) {
-              py::list entries;
-              for (const auto& entry : beam) {
-                entries.append(py::make_tuple(to_ids(entry.plan), entry.score, entry.origin));
-              }
-              episodes.append(entries);
-            }
-            return episodes;
-          },
-          "Kept plans [episode]: (actions int8 [K], score, index of the proposal it began as).");
-}
-
 }  // namespace
 
 void bind_planner(py::module_& module) {
   bind_spec(module);
   bind_views(module);
   bind_batch(module);
-  bind_beam(module);
 }

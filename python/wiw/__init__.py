@@ -11,20 +11,25 @@ Names are imported when first used, so that `import wiw` stays fast and needs ne
 from __future__ import annotations
 
 import importlib
+import warnings
 from typing import TYPE_CHECKING, Any
+
+from wiw.gymnasium_ids import register_environments
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Accepts",
     "Agent",
-    "Headline",
+    "Env",
+    "Metric",
     "Policy",
+    "Task",
     "WorldModel",
     "accepts",
     "action",
     "annotate",
-    "attribute",
+    "blame",
     "check_model",
     "collect",
     "compare",
@@ -54,11 +59,13 @@ __all__ = [
 _HOME = {
     "Accepts": "wiw.world_models.base",
     "Agent": "wiw.loop.agent",
-    "Headline": "wiw.metrics.headlines",
+    "Env": "wiw.envs.base",
+    "Metric": "wiw.metrics.metric",
     "Policy": "wiw.policies.base",
+    "Task": "wiw.tasks.base",
     "WorldModel": "wiw.world_models.base",
     "accepts": "wiw.world_models.base",
-    "attribute": "wiw.studies.attribute",
+    "blame": "wiw.studies.blame",
     "check_model": "wiw.studies.model_check",
     "collect": "wiw.training.collect",
     "compare": "wiw.studies.compare",
@@ -75,8 +82,16 @@ _HOME = {
 }
 """Where a public name lives; the others in `__all__` are modules."""
 
+_DEPRECATED = {"Headline": "Metric", "attribute": "blame"}
+"""Old public names and what replaces them; they go with the next version."""
+
 
 def __getattr__(name: str) -> Any:
+    if name in _DEPRECATED:
+        replacement = _DEPRECATED[name]
+        message = f"wiw.{name} is now called wiw.{replacement}; the old name will be removed in the next version"
+        warnings.warn(message, DeprecationWarning, stacklevel=2)
+        name = replacement
     if name in _HOME:
         return getattr(importlib.import_module(_HOME[name]), name)
     if name in __all__:
@@ -87,6 +102,8 @@ def __getattr__(name: str) -> Any:
 def __dir__() -> list[str]:
     return sorted(__all__)
 
+
+register_environments()
 
 if TYPE_CHECKING:
     from wiw import (
@@ -105,17 +122,19 @@ if TYPE_CHECKING:
         types,
     )
     from wiw.analysis.power import power
+    from wiw.envs.base import Env
     from wiw.loop.agent import Agent
-    from wiw.metrics.headlines import Headline
+    from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
     from wiw.registry import make, make_vec, policy, world_model
     from wiw.runs.verify import verify
-    from wiw.studies.attribute import attribute
+    from wiw.studies.blame import blame
     from wiw.studies.compare import compare
     from wiw.studies.evaluate import evaluate
     from wiw.studies.model_check import check_model
     from wiw.studies.run_log import load_run
     from wiw.studies.scale import scale
+    from wiw.tasks.base import Task
     from wiw.training.collect import collect
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts

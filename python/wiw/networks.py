@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where networks run, and what to do where the weights of those that others have trained cannot be had."""
+"""Devices for networks, and clear errors when pretrained weights cannot be downloaded."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from contextlib import contextmanager
 
 from wiw.errors import ArgumentError, DeviceMemoryError, WeightsError
 
-UNREACHABLE = {"ConnectionError", "TransportError"}
-"""Names of the errors of a network in `requests` and `httpx`, of which the hub's client has had either."""
+NETWORK_ERRORS = {"ConnectionError", "TransportError"}
+"""Names of network errors in `requests` and `httpx`; the hub's client has used either."""
 
 
-def device(name: str | None) -> str:
-    """The device asked for; "cuda" where there is one if none is.
+def resolve_device(name: str | None) -> str:
+    """Return the requested device; "cuda" if available where none is requested.
 
     Raises:
-        ArgumentError: torch does not know it, or has none.
+        ArgumentError: torch does not know it, or the machine lacks it.
     """
     import torch
 
@@ -34,13 +34,13 @@ def device(name: str | None) -> str:
     return name
 
 
-FULL = ("out of memory", "ALLOC_FAILED")
-"""What CUDA and its libraries say of a full GPU where they take memory themselves, past torch's allocator."""
+OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED")
+"""Error texts of CUDA and its libraries for a full GPU, where they allocate memory past torch's allocator."""
 
 
 @contextmanager
 def memory_guard(what: str, cures: str) -> Iterator[None]:
-    """Turns the errors of a full GPU into one that says what needs less.
+    """Turn the errors of a full GPU into one that says how to use less memory.
 
     Raises:
         DeviceMemoryError: there is no memory left.
@@ -50,22 +50,24 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        if not isinstance(error, torch.OutOfMemoryError) and not any(said in str(error) for said in FULL):
+        if not isinstance(error, torch.OutOfMemoryError) and not any(
+            said in str(error) for said in OUT_OF_MEMORY_WORDS
+        ):
             raise
         torch.cuda.empty_cache()
         raise DeviceMemoryError(f"{what} does not fit on the device ({str(error).splitlines()[0]}); {cures}") from error
 
 
 def is_path(name: str) -> bool:
-    """Whether a name is a path and not a hub repository, OWNER/NAME."""
+    """Return whether a name is a path rather than a hub repository, OWNER/NAME."""
     return name.startswith(("/", ".", "~")) or name.count("/") != 1
 
 
-def explained(error: BaseException, name: str, revision: str | None) -> WeightsError:
-    """What an error of the hub's client means for the user."""
+def explain_hub_error(error: BaseException, name: str, revision: str | None) -> WeightsError:
+    """Return a `WeightsError` that tells the user what an error of the hub's client means."""
     from huggingface_hub import errors
 
-    chain = list(_chain(error))
+    chain = list(_walk_causes(error))
 
     def met(*kinds: type[BaseException]) -> bool:
         return any(isinstance(link, kinds) for link in chain)
@@ -83,15 +85,15 @@ def explained(error: BaseException, name: str, revision: str | None) -> WeightsE
             "weights= also takes a folder"
         )
         return WeightsError(text, "missing")
-    unreachable = any(kind.__name__ in UNREACHABLE for link in chain for kind in type(link).__mro__)
+    unreachable = any(kind.__name__ in NETWORK_ERRORS for link in chain for kind in type(link).__mro__)
     if unreachable or met(errors.OfflineModeIsEnabled, errors.LocalEntryNotFoundError):
         text = f"'{name}' is not on this machine and the hub is out of reach: connect (unset HF_HUB_OFFLINE), {by_hand}"
         return WeightsError(text, "network")
     return WeightsError(f"'{name}' cannot be downloaded: {error}; try again, {by_hand}")
 
 
-def _chain(error: BaseException | None) -> Iterator[BaseException]:
-    """An error and what it was raised from or while handling, the last one first."""
+def _walk_causes(error: BaseException | None) -> Iterator[BaseException]:
+    """Yield an error and those it was raised from or while handling, the last one first."""
     seen: set[int] = set()
     pending = [error]
     while pending:
@@ -103,8 +105,10 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Of torch: faster for small networks, above all on a busy machine, and rounds alike on any number of cores."""
+def single_thread() -> Iterator[None]:
+    """Run torch on one thread: faster for small networks, above all on a busy machine, and rounding alike on any number
+    of cores.
+    """
     import torch
 
     before = torch.get_num_threads()

@@ -11,14 +11,13 @@ wiw.world_model(MyModel)                 the class itself, or an instance
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import inspect
 import sys
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2b
 from importlib.machinery import SourceFileLoader
@@ -27,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
+from wiw.suggestions import did_you_mean
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,22 @@ class Registry:
     """Name to `module:attribute`. A name that ends with a colon takes what is written after it as first argument."""
     base: str = ""
     """`module:class` that things of this kind derive from, if they have to."""
+    registered: dict[str, Any] = field(default_factory=dict)
+    """What programs have added under names of their own (`register`)."""
 
     def names(self) -> list[str]:
         """All registered names, built-in ones first."""
-        return [*self.built_in, *sorted(set(self._plugins()) - set(self.built_in))]
+        return [*self.built_in, *sorted(({*self._plugins(), *self.registered}) - set(self.built_in))]
+
+    def register(self, name: str, thing: Any) -> None:
+        """Add a class or factory under a name, in this process.
+
+        Raises:
+            RegistryError: the name is taken, or the class is of another kind.
+        """
+        if name in self.names():
+            raise RegistryError(f"the {self.kind} '{name}' is there already; choose another name")
+        self.registered[name] = self._checked(name, thing)
 
     def find(self, name: str) -> Any:
         """The class or factory behind a name or path.
@@ -53,6 +65,8 @@ class Registry:
             RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
                 cause); a class of another kind.
         """
+        if name in self.registered:
+            return self.registered[name]
         if name in self.built_in:
             return self._load(name, partial(_attribute, self.built_in[name]))
         plugins = self._plugins()
@@ -63,8 +77,7 @@ class Registry:
             return partial(self.find(prefix + colon), argument)
         if colon:
             return self._load(name, partial(_attribute, name))
-        near = difflib.get_close_matches(name, self.names(), n=3)
-        hint = f" Did you mean {' or '.join(near)}?" if near else ""
+        hint = did_you_mean(name, self.names())
         raise RegistryError(
             f"no {self.kind} is named '{name}'.{hint} Known: {', '.join(self.names())}; "
             + "or give path.py:Class, package.module:Class"
@@ -141,8 +154,13 @@ def _makes(thing: Any) -> bool:
 def _attribute(path: str) -> Any:
     """What `path.py:Name` or `package.module:Name` names."""
     module_name, _, attribute = path.rpartition(":")
-    file = module_name.endswith(".py")
-    return getattr(_import_file(Path(module_name)) if file else importlib.import_module(module_name), attribute)
+    if not module_name.endswith(".py"):
+        return getattr(importlib.import_module(module_name), attribute)
+    module = _import_file(Path(module_name))
+    if not hasattr(module, attribute):
+        own = [name for name, thing in vars(module).items() if getattr(thing, "__module__", "") == module.__name__]
+        raise AttributeError(f"{module_name} defines no '{attribute}'" + (f"; it has {', '.join(own)}" if own else ""))
+    return getattr(module, attribute)
 
 
 def _import_file(path: Path) -> Any:
@@ -184,9 +202,9 @@ WORLD_MODELS = Registry(
     "wiw.world_models",
     {
         "none": "wiw.world_models.none:none",
-        "copy": "wiw.world_models.copy:Copy",
+        "copy": "wiw.world_models.copy:make_copy",
         "warp": "wiw.world_models.warp:Warp",
-        "oracle": "wiw.world_models.oracle:Oracle",
+        "oracle": "wiw.world_models.oracle:make_oracle",
         "svd": "wiw.world_models.video.svd:SVD",
         "ltx": "wiw.world_models.video.ltx:LTX",
         "hunyuan": "wiw.world_models.video.hunyuan:Hunyuan",
@@ -222,7 +240,7 @@ POLICIES = Registry(
         "climber": "wiw.policies.matcher.climber:Climber",
         "geometric": "wiw.policies.geometric:Geometric",
         "recogniser": "wiw.policies.recogniser:Recognition",
-        "vlm": "wiw.policies.vlm:VLM",
+        "vlm": "wiw.policies.vlm.make:make_vlm",
         "scripted": "wiw.policies.scripted:Scripted",
         "diffuser": "wiw.policies.diffuser:Diffuser",
     },
@@ -236,6 +254,7 @@ TASKS = Registry(
         "ar": "wiw.tasks.ar:AR",
         "manipulation": "wiw.tasks.manipulation:Manipulation",
     },
+    "wiw.tasks.base:Task",
 )
 TRACKERS = Registry(
     "tracker",
@@ -270,12 +289,23 @@ METRICS = Registry(
     "metric",
     "wiw.metrics",
     {
-        "success": "wiw.metrics.headlines:SUCCESS",
-        "spl": "wiw.metrics.headlines:SPL",
-        "mean_trajectory": "wiw.metrics.headlines:MEAN_TRAJECTORY",
-        "refused": "wiw.metrics.headlines:REFUSED",
+        "success": "wiw.metrics.metric:SUCCESS",
+        "spl": "wiw.metrics.metric:SPL",
+        "mean_trajectory": "wiw.metrics.metric:MEAN_TRAJECTORY",
+        "refused": "wiw.metrics.metric:REFUSED",
     },
-    "wiw.metrics.headlines:Headline",
+    "wiw.metrics.metric:Metric",
+)
+
+
+PLAN_SPACES = Registry(
+    "plan space",
+    "wiw.plan_spaces",
+    {
+        "discrete": "wiw.loop.primitives:Primitives",
+        "pose7": "wiw.loop.gripper_poses:GripperPoses",
+    },
+    "wiw.loop.plan_space:PlanSpace",
 )
 
 
@@ -349,9 +379,15 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
 def _task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
     """The task, and those of the options that are its environments'."""
     name = task_name(task_id)
-    senses = getattr(TASKS.find(name), "senses", ())
-    task = TASKS.make(name, **{key: value for key, value in options.items() if key not in senses})
-    return task, {key: value for key, value in options.items() if key in senses}
+    sensors = task_class(name).sensor_options
+    task = TASKS.make(name, **{key: value for key, value in options.items() if key not in sensors})
+    return task, {key: value for key, value in options.items() if key in sensors}
+
+
+def task_class(name: str) -> Any:
+    """Return the class behind a task's name; `wiw.Task` for a factory, which says nothing before it is called."""
+    found = TASKS.find(name)
+    return found if inspect.isclass(found) else _attribute(TASKS.base)
 
 
 def task_name(task_id: str) -> str:

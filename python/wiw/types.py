@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,10 @@ from wiw.errors import ArgumentError
 
 ControlKind = Literal["image", "text", "trajectory", "viewpoint", "action"]
 View = Literal["perspective", "panorama"]
-Space = Literal["discrete", "pose7"]
-"""What plans are made of: primitives, or poses of a gripper (x, y, z, roll, pitch, yaw, gripper)."""
+PRIMITIVES: Final = "discrete"
+"""Plans are ids of `wiw.action`, int8 [K]."""
+GRIPPER_POSES: Final = "pose7"
+"""Plans are poses of a gripper (x, y, z, roll, pitch, yaw, gripper), float64 [K, 7]."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,8 @@ class Proposal:
 
     def __post_init__(self) -> None:
         actions = np.asarray(self.actions)
-        object.__setattr__(self, "actions", actions.astype(np.float64 if actions.ndim == 2 else np.int8, copy=False))
+        whole = actions.ndim == 1 and actions.dtype.kind in "biu"
+        object.__setattr__(self, "actions", actions.astype(np.int8 if whole else np.float64, copy=False))
 
 
 @dataclass(frozen=True)
@@ -213,6 +216,67 @@ class Control:
 
 
 @dataclass(frozen=True)
+class History:
+    """What was observed before each row's rollout begins: N frames, oldest first, of which the last is frame 0.
+
+    The frames are those of the decisions so far, as the agent observes once per decision, and so a varying number of
+    actions apart. Where a plan begins with turns, frame 0 is the present observation after them, and the present
+    observation itself is the frame before. Where a plan is longer than the model's rollout, each further call is shown
+    the latest frames of all, one action apart where they are imagined.
+    """
+
+    images: NDArray[np.uint8]
+    """uint8 [B, N, H, W, 3] in the model's view and size; `images[:, -1]` is `Conditioning.image`."""
+    poses: NDArray[np.float64]
+    """float64 [B, N, 3]: where each frame was taken, in the frame of frame 0 (x forward, y left, azimuth), so that
+    `poses[:, -1]` is 0. In plans of gripper poses [B, N, 7], in the world's frame like `Control.ids`."""
+    actions: NDArray[Any]
+    """int8 [B, N - 1, L]: the primitives carried out between neighbours, padded at the end with null tokens, L being
+    the most in the batch, at least 1. In plans of gripper poses float64 [B, N - 1, L, 7], padded with the last pose."""
+    lengths: NDArray[np.int64]
+    """int64 [B, N - 1]: how many actions were carried out between neighbours; the rest of `actions` is padding."""
+    count: NDArray[np.int64]
+    """int64 [B], from 1 to N: how many of the frames are not padding. Where an episode has fewer, its first one is
+    repeated in front, with no action between the copies."""
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Whether each frame is none of the padding, bool [B, N]."""
+        most = self.images.shape[1]
+        return np.arange(most) >= most - self.count[:, None]
+
+    def rows(self, rows: Sequence[int]) -> History:
+        """Return some rows, with no more padding of actions than they need."""
+        index = np.asarray(rows, np.int64)
+        lengths = self.lengths[index]
+        longest = max(1, int(lengths.max(initial=0)))
+        actions = self.actions[index][:, :, :longest]
+        return History(self.images[index], self.poses[index], actions, lengths, self.count[index])
+
+    @staticmethod
+    def concatenate(parts: Sequence[History]) -> History:
+        """Return the rows of several histories of equal N, with actions padded to the longest."""
+        longest = max(part.actions.shape[2] for part in parts)
+        return History(
+            np.concatenate([part.images for part in parts]),
+            np.concatenate([part.poses for part in parts]),
+            np.concatenate([_pad_actions(part.actions, longest) for part in parts]),
+            np.concatenate([part.lengths for part in parts]),
+            np.concatenate([part.count for part in parts]),
+        )
+
+
+def _pad_actions(actions: NDArray[Any], longest: int) -> NDArray[Any]:
+    more = longest - actions.shape[2]
+    if actions.ndim == 3:
+        return np.pad(actions, ((0, 0), (0, 0), (0, more)))  # null tokens are 0
+    return np.pad(actions, ((0, 0), (0, 0), (0, more), (0, 0)), mode="edge")
+
+
+@dataclass(frozen=True)
 class Conditioning:
     """What a world model sees, batched over candidates and episodes. Only what `accepts.needs` names is set."""
 
@@ -222,7 +286,8 @@ class Conditioning:
     """float32 [B, H, W], in the model's view and size: planar z in a perspective view, distance in a panorama."""
     semantic: NDArray[np.uint32] | None = None
     """uint32 [B, H, W]: ids of `wiw.perception.semantics.CATEGORIES`."""
-    history: Sequence[NDArray[np.uint8]] | None = None
+    history: History | None = None
+    """The latest observations up to this one, with poses and actions between them."""
     simulators: Sequence[Any] | None = None
     """Forks of the environment, one a row; given to `oracle` alone."""
 
@@ -376,12 +441,12 @@ class DecisionRecord:
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The end of one episode. `status` is "failed" when infrastructure failed, and then nothing counts as a score."""
+    """The end of one episode. `status` is "error" where something broke; it then counts in no score."""
 
     episode: int
     episode_id: str
     scene: str
-    status: Literal["done", "failed"]
+    status: Literal["done", "error"]
     metrics: Mapping[str, float] = field(default_factory=dict)
     """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
     AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of

@@ -21,7 +21,7 @@ def main() -> None:
     peer.reset()
     for place, env in enumerate(peer.envs):  # gymnasium hands the same options to all
         env.reset(options={"episode": place})
-    turn = np.ones(PLACES, np.int64)
+    turn = np.full(PLACES, int(wiw.action.TURN_LEFT))
     cases = {"wiw.envs.VectorEnv": lambda: ours.step(turn), "SyncVectorEnv of single ones": lambda: peer.step(turn)}
     title = f"a step of {PLACES} environments: panorama, front view and depth"
     report(title, cases, measure(cases, 20), "wiw.envs.VectorEnv")

@@ -51,15 +51,13 @@ class Decision:
         ]
 
     def __call__(self) -> np.ndarray:
-        search = planner.BeamSearch(1)
-        batch = planner.Batch.build(search.ask([self.plans]), self.spec)
+        batch = planner.Batch.build([self.plans], self.spec)
         seeds = [core.fold_key([0, 0, 0, candidate]) for candidate in batch.row_owner.tolist()]
         observations = batch.observations(self.panoramas, self.conditioning)
         assert len(seeds) == len(observations)
         assert all(len(part.trajectories) == len(part.rows) for part in batch.parts)
         views = batch.views(self.panoramas, self.rollouts, self.maker)
-        best = search.tell(self.scores)[0]
-        return views[best[0]]
+        return views[int(np.argmax(self.scores[0]))]
 
 
 def whole_decision(decision: Decision):

@@ -13,26 +13,26 @@ from __future__ import annotations
 import argparse
 
 from wiw.action import PoseGrid
-from wiw.tabletop.kind import Kind
-from wiw.tabletop.robot import Robot, robot_of
-from wiw.tasks.manipulation import KINDS
+from wiw.tabletop.base import TabletopTask
+from wiw.tabletop.robot import Robot, load_robot
+from wiw.tasks.manipulation import TABLETOP_TASKS
 
 POSES = 15
 GRID = PoseGrid()
 
 
-def solved(kind: Kind, seed: int, on_grid: bool, robot: Robot | None) -> bool:
+def solved(kind: TabletopTask, seed: int, on_grid: bool, robot: Robot | None) -> bool:
     """Whether the expert does what the table of a seed asks."""
-    setup = kind.setup(seed, seed % kind.variations)
-    bench, left = setup.bench(robot=robot), POSES
-    while left and not kind.succeeded(bench, setup):
-        plan = kind.expert(bench.places(setup.objects), setup.target)
+    setup = kind.create_setup(seed, seed % kind.variations)
+    bench, left = setup.build_workbench(robot=robot), POSES
+    while left and not kind.is_success(bench, setup):
+        plan = kind.plan_expert(bench.get_poses(setup.objects), setup.target)
         for pose in (GRID.decode(GRID.encode(plan)) if on_grid else plan)[:left]:
-            bench.go(pose)
+            bench.move_to(pose)
             left -= 1
-            if kind.succeeded(bench, setup):
+            if kind.is_success(bench, setup):
                 break
-    return kind.succeeded(bench, setup)
+    return kind.is_success(bench, setup)
 
 
 def main() -> None:
@@ -40,12 +40,14 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("count", type=int, nargs="?", default=200)
     parser.add_argument("first", type=int, nargs="?", default=50000)
-    parser.add_argument("tasks", nargs="*", default=list(KINDS))
+    parser.add_argument("tasks", nargs="*", default=list(TABLETOP_TASKS))
     parser.add_argument("--robot")
     given = parser.parse_args()
-    robot, seeds = given.robot and robot_of(given.robot), range(given.first, given.first + given.count)
+    robot, seeds = given.robot and load_robot(given.robot), range(given.first, given.first + given.count)
     for name in given.tasks:
-        free, grid = (sum(solved(KINDS[name], seed, on_grid, robot) for seed in seeds) for on_grid in (False, True))
+        free, grid = (
+            sum(solved(TABLETOP_TASKS[name], seed, on_grid, robot) for seed in seeds) for on_grid in (False, True)
+        )
         print(f"{name:14}{free:5} of {given.count} as they are {grid:5} on the grid", flush=True)
 
 

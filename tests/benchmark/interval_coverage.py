@@ -61,7 +61,7 @@ def slow(shares: list[float], values: list[float], scenes: int, correlation: flo
 
 
 def utilities(scenes: int, correlation: float) -> tuple[float, float]:
-    """Share of runs in which U of warp is identifiable, and of those the share whose interval holds it."""
+    """Share of runs in which U of warp is defined, and of those the share whose interval holds it."""
     copy, warp, oracle = (np.arange(8) >> bit & 1 for bit in range(3))
     labels = np.repeat(np.arange(scenes), PER_SCENE)
     truth = TRIPLES @ (warp - copy) / (TRIPLES @ (oracle - copy))
@@ -99,8 +99,8 @@ def main() -> None:
         line("SR 35 %, bootstrap over scenes", [f"{bootstrap:.1f}" for bootstrap, _ in both])
         line("SR 35 %, episodes as if independent", [f"{independent:.1f}" for _, independent in both])
         found = [utilities(scenes, correlation) for scenes in SCENES]
-        line("U of warp, where identifiable", [f"{true:.1f}" for _, true in found])
-        line("runs in which it is, %", [f"{identifiable:.0f}" for identifiable, _ in found])
+        line("U of warp, where defined", [f"{true:.1f}" for _, true in found])
+        line("runs in which it is, %", [f"{share:.0f}" for share, _ in found])
 
 
 if __name__ == "__main__":

@@ -22,11 +22,11 @@ import wiw
 from recognition_file import CHOICES, a_file
 from wiw import panorama
 from wiw.errors import ArgumentError
-from wiw.policies.vlm import VLM
-from wiw.policies.vlm.looks import VIEW
+from wiw.policies.vlm.prompt_images import VIEW
+from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import served
 from wiw.serving.vlm_server import VlmServer
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 NAMES = wiw.registry.list_world_models()
@@ -88,12 +88,14 @@ def run(server: VlmServer, options: Any, tmp_path: Path) -> Callable[[str, Any],
     """One episode of a task with a world model."""
 
     def run(task: str, model: Any) -> Any:
-        server.client.asked.clear()
-        policy = VLM(server.url, "scripted", dialect="vllm", proposals="listed", cache="off")
-        labels = {"semantics": "simulator"} if model is not None and "semantic" in model.accepts.needs else {}
-        space: Any = {"space": "pose7"} if task == "manipulation" else {}
-        agent = wiw.Agent(policy, model, candidates=2, horizon=2, cache="off", **space, **labels)
-        return wiw.evaluate(task, agent, 1, 0, tmp_path / "run", progress=False, keep_images=0, **options(task))
+        server.client.calls.clear()
+        space = "pose7" if task == "manipulation" else "discrete"
+        asked: Any = {"model": "scripted", "dialect": "vllm", "proposals": "listed", "cache": "off"}
+        policy = wiw.policy("vlm", vlm=server.url, space=space, **asked)
+        labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
+        agent = AgentRecipe(policy, model, semantics=labels, candidates=2, horizon=2)
+        how: Any = {"progress": False, "keep_images": 0, "cache": "off"}
+        return wiw.evaluate(task, agent, 1, seed=0, out=tmp_path / "run", **how, **options(task))
 
     return run
 
@@ -141,7 +143,7 @@ def test_an_episode_with_every_world_model(name: str, task: str, run: Any, made:
     assert episode["status"] == "done", episode["error"]
     decisions = list(log.store.decisions(episode["arm"]))
     assert len(decisions) == 2 and all(row["exchanges"] for row in decisions)
-    shown = [strips(call) for call in server.client.asked if strips(call)]
+    shown = [strips(call) for call in server.client.calls if strips(call)]
     if name == "none":
         assert not shown
         return
@@ -163,7 +165,7 @@ def test_an_arm_with_every_world_model(name: str, run: Any, made: Any, server: V
     assert episode["status"] == "done", episode["error"]
     decisions = list(log.store.decisions(episode["arm"]))
     assert len(decisions) == 2 and all(row["exchanges"] for row in decisions)
-    shown = [strips(call) for call in server.client.asked if strips(call)]
+    shown = [strips(call) for call in server.client.calls if strips(call)]
     assert [len(call) for call in shown] == ([] if name == "none" else [2, 2])
     for strip, plan in ((strip, plan) for call in shown for strip, plan in zip(call, POSES, strict=True)):
         assert strip.shape[1] // VIEW == len(plan)
@@ -229,12 +231,12 @@ def test_every_kind_is_handed_its_views_and_its_own_become_the_tasks(
     assert rows.keys() == {2, 1}, "the turn that the second plan begins with is real"
     for row, turn in ((rows[2], 0), (rows[1], 22.5)):
         check_handed(row, turn, env, model.accepts)
-    for call in filter(strips, server.client.asked):
+    for call in filter(strips, server.client.calls):
         ahead, turned = map(views, strips(call))
         for view in (*ahead, turned[1]):
             check_front(view, model.accepts)
     if task == "ar" and kind[0] == "panorama":
-        answering = next(call for call in server.client.asked if len(call.labels) == len(CHOICES))
+        answering = next(call for call in server.client.calls if len(call.labels) == len(CHOICES))
         check_target(views(pictures(answering)[1][1]), rows[2][0], made.episode(0))
 
 

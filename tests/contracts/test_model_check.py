@@ -87,6 +87,22 @@ def moving_the_plan(frames, observations, controls, seeds):
     controls[0].viewpoints[:] = 0
 
 
+def forgetting(frames, observations, controls, seeds):
+    observations.history.images[:, :-1] = 0
+
+
+def counting_padding(frames, observations, controls, seeds):
+    frames[:, 1:] += np.uint8(30 * observations.history.actions.shape[2])
+
+
+def needing_a_past(frames, observations, controls, seeds):
+    for images, valid in zip(observations.history.images, observations.history.valid, strict=True):
+        images[valid][-2].mean()
+
+
+PAST = {"needs": ("history",), "history": 3}
+
+
 def reusing():
     memory = np.zeros((4, 5, *DECLARED["size"], 3), np.uint8)
 
@@ -197,11 +213,23 @@ BROKEN = {
     "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),
     "inputs": (overwriting, {}, "It changes what it is given: observations.image"),
     "inputs, plan": (moving_the_plan, {}, r"It changes what it is given: control\.viewpoints"),
+    "inputs, history": (forgetting, PAST, r"It changes what it is given: observations\.history\.images"),
+    "batch, history": (counting_padding, PAST, "alone, 1 of 2 rows differ"),
+    "raised, young": (needing_a_past, PAST, "IndexError"),
     "memory": (reusing(), {}, "An answer lies in the memory of an earlier one"),
     "memory, written to": (rewriting(), {}, "An answer was written to after it was returned"),
-    "needs": (dark, {"needs": ("history",)}, "needs history, but a model can be given"),
+    "needs": (dark, {"needs": ("simulator",)}, "needs the simulator, which is handed to the oracle alone"),
     "needs, poses": (dark, {"space": "pose7"}, "poses of a gripper move none"),
 }
+
+
+def recalling(frames, observations, controls, seeds):
+    """Adds where the agent was before, as far as that is known."""
+    history = observations.history
+    for row, valid in enumerate(history.valid):
+        assert (history.images[row, -1] == observations.image[row]).all()
+        shade = 40 * np.abs(history.poses[row, valid]).sum() + history.images[row, valid, 0, 0].sum()
+        frames[row, 1:] += np.uint8(int(shade) % 256)
 
 
 def found(model, scene, **options):
@@ -215,7 +243,7 @@ def test_each_breach_is_found_and_told(name, two_rooms):
     kind = name.partition(",")[0]
     assert findings[kind].serious, findings
     assert re.search(text, str(findings[kind])), str(findings[kind])
-    assert set(findings) <= {kind, "frame 0"}
+    assert set(findings) - {kind, "frame 0"} <= ({"history"} if declared is PAST else set())
 
 
 @pytest.mark.parametrize(
@@ -224,6 +252,17 @@ def test_each_breach_is_found_and_told(name, two_rooms):
 def test_an_honest_model_is_left_in_peace(declared, two_rooms):
     assert found(spoilt(lambda *_: None, **declared), two_rooms) == {}
     assert found(Honest, two_rooms) == {}
+
+
+@pytest.mark.parametrize("declared", [{}, {"frames": 3}, {"best_batch": 1}, {"history": 1}, {"history": 9}])
+def test_an_honest_model_with_a_memory_is_left_in_peace(declared, two_rooms):
+    assert found(spoilt(recalling, **{**PAST, **declared}), two_rooms) == {}
+
+
+def test_a_past_that_is_not_looked_at_is_noted(two_rooms):
+    findings = found(spoilt(lambda *_: None, **PAST), two_rooms)
+    assert set(findings) == {"history"} and not findings["history"].serious
+    assert "What was observed before makes no difference" in str(findings["history"])
 
 
 GRIPPER = {"control": "action", "space": "pose7", "view": "perspective", "size": (48, 48), "best_batch": 4}
@@ -238,6 +277,10 @@ class Arm(wiw.WorldModel):
         frames = np.repeat(observations.image[:, None], len(controls[0].ids), 1)
         for row, control in enumerate(controls):
             way = np.abs(control.ids[1:, :3] - control.ids[0, :3]).sum(1) + self.later(control.ids)
+            if observations.history is not None:
+                past = observations.history.poses[row]
+                np.testing.assert_array_equal(past[-1], control.ids[0])
+                way += 10 * np.abs(past[0] - past[-1]).sum()
             frames[row, 1:] = frames[row, 1:] // 2 + (50 * way).astype(np.uint8)[:, None, None, None]
         return frames
 
@@ -250,7 +293,9 @@ class Foreseeing(Arm):
         return poses[-1, :3] @ (1, 2, 1)
 
 
-@pytest.mark.parametrize("declared", [{}, {"frames": 5}, {"frames": 14}, {"best_batch": 1}, {"needs": ("depth",)}])
+@pytest.mark.parametrize(
+    "declared", [{}, {"frames": 5}, {"frames": 14}, {"best_batch": 1}, {"needs": ("depth",)}, PAST]
+)
 def test_models_of_grippers_are_asked_about_poses(declared):
     class Asked(Arm):
         accepts = wiw.accepts(**{**GRIPPER, "causal": True, **declared})

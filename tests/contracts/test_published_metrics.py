@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import wiw
-from wiw.analysis.summary import headlines, shown_headlines, summarise
+from wiw.analysis.summary import list_columns, load_metrics, summarise
 from wiw.cli import main
 from wiw.errors import ContractError
 from wiw.registry import METRICS
@@ -19,10 +19,10 @@ from wiw.runs.recipes import AgentRecipe
 STRANGER = """
 import wiw
 
-NEAR = wiw.Headline(
+NEAR = wiw.Metric(
     "near", "Near", "rate", True, of=lambda metrics: metrics["distance_to_goal"] < 1e9, about="Whether it came near."
 )
-ELSEWHERE = wiw.Headline("elsewhere", "Elsewhere", "length", False, of=lambda metrics: metrics["nobody_measures"])
+ELSEWHERE = wiw.Metric("elsewhere", "Elsewhere", "length", False, of=lambda metrics: metrics["nobody_measures"])
 """
 
 
@@ -49,11 +49,11 @@ def outcomes(**more: float) -> list[dict]:
 @pytest.mark.parametrize("name", METRICS.names())
 def test_it_is_a_column_with_a_name(name: str) -> None:
     metric = METRICS.make(name)
-    assert isinstance(metric, wiw.Headline) and metric.label and metric.about
-    assert metric.kind in ("rate", "length") and metric in headlines()
+    assert isinstance(metric, wiw.Metric) and metric.label and metric.about
+    assert metric.kind in ("rate", "length") and metric in load_metrics()
     summary = summarise(["none", "warp"], outcomes(), 6)
-    assert metric in shown_headlines(summary) and metric.metric in summary["warp"].estimates
-    assert summary.difference("warp", "none", metric.metric).estimate.value == 0
+    assert metric in list_columns(summary) and metric.name in summary["warp"].estimates
+    assert summary.difference("warp", "none", metric.name).estimate.value == 0
 
 
 def test_a_strangers_metric_is_a_column_of_every_table(
@@ -70,7 +70,7 @@ def test_a_strangers_metric_is_a_column_of_every_table(
     assert summary.difference("copy", "none", "near").wins == 0
     assert "Near % ↑" in str(summary) and log.table()[0]["near"] == 100.0
     assert "Near" in log.report().read_text()
-    assert "near" not in log.episodes[0]["metrics"]  # told from what was measured, not kept
+    assert "near" not in log.episodes[0]["metrics"]  # computed from what was measured, not stored
     assert main(["list"]) == 0 and "Whether it came near." in capsys.readouterr().out
 
 
@@ -78,14 +78,20 @@ def test_a_strangers_metric_is_a_column_of_every_table(
     ("value", "message"), [(1.5, "a number from 0 to 1, got 1.5"), (float("nan"), "a number from 0 to 1, got nan")]
 )
 def test_values_that_are_none_of_its_kind_are_refused(value: float, message: str) -> None:
-    metric = wiw.Headline("odd", "Odd", "rate", True, of=lambda metrics: metrics["success"] * value)
+    metric = wiw.Metric("odd", "Odd", "rate", True, of=lambda metrics: metrics["success"] * value)
     with pytest.raises(ContractError, match=f"metric 'odd': expected {message}"):
-        metric.added({"success": 1.0})
-    assert metric.added({}) == {} and metric.added({"odd": 7.0}) == {"odd": 7.0}
+        metric.add_to({"success": 1.0})
+    assert metric.add_to({}) == {} and metric.add_to({"odd": 7.0}) == {"odd": 7.0}
 
 
 def test_what_it_raises_is_named() -> None:
-    metric = wiw.Headline("odd", "Odd", "length", True, of=lambda metrics: 1 / metrics["actions"])
-    assert metric.added({"actions": 4.0})["odd"] == 0.25
+    metric = wiw.Metric("odd", "Odd", "length", True, of=lambda metrics: 1 / metrics["actions"])
+    assert metric.add_to({"actions": 4.0})["odd"] == 0.25
     with pytest.raises(ContractError, match="metric 'odd': ZeroDivisionError"):
-        metric.added({"actions": 0.0})
+        metric.add_to({"actions": 0.0})
+
+
+def test_the_old_name_warns_and_is_the_same_class() -> None:
+    with pytest.warns(DeprecationWarning, match="wiw.Headline is now called wiw.Metric"):
+        assert wiw.Headline is wiw.Metric
+    assert "Headline" not in dir(wiw)

@@ -13,13 +13,13 @@ import pytest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import RegistryError
-from wiw.loop.agent import Query
-from wiw.loop.attempts import Attempts
+from wiw.loop.attempts import Attempted
 from wiw.loop.clock import Clock
-from wiw.loop.imagine import imagine
+from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.plan_space import plan_space
 from wiw.policies.base import FrameSpec
 from wiw.tasks.imagenav import ImageNav
-from wiw.types import Proposal
+from wiw.types import Key, Proposal
 
 NAMES = [name for name in wiw.registry.list_world_models() if name != "none" and not name.endswith(":")]
 FOLDER = Path(wiw.__file__).with_name("world_models")
@@ -30,21 +30,24 @@ PLANS = [[FORWARD] * 3, [TURN_LEFT, FORWARD], [FORWARD, TURN_LEFT, FORWARD, FORW
 def imagined(name_or_model, two_rooms: str, episodes: int = 2, plans=PLANS, first: int = 0, **options):
     """Rollouts of the plans, whose seeds are those of candidates `first`, `first` + 1, ..."""
     task = ImageNav(scenes=two_rooms)
-    queries = []
+    observations, inputs = [], []
     for index in range(episodes):
         env = task.environment(depth=True)
         observation = env.begin(task.episode(index))
-        queries.append(Query(observation, env.goal, wiw.types.Key(0, index), env.fork()))
-    model = wiw.world_model(name_or_model, **options)
-    proposals = [[Proposal(plan) for plan in plans] for _ in queries]
-    return imagine(
-        Attempts(model),
-        queries,
-        proposals,
-        [range(first, first + len(plans)) for plans in proposals],
+        observations.append(observation)
+        inputs.append(ModelInput(observation, env.fork()))
+    model, space = wiw.world_model(name_or_model, **options), plan_space("discrete")
+    request = Request(
+        space,
+        [Key(0, index) for index in range(episodes)],
+        observations,
+        inputs,
+        [[Proposal(plan) for plan in plans]] * episodes,
+        [range(first, first + len(plans))] * episodes,
         FrameSpec("panorama", (144, 256)),
         Clock(),
-    ).rollouts
+    )
+    return space.imagine(Attempted(model), request).rollouts
 
 
 @pytest.mark.parametrize("name", NAMES)

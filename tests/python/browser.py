@@ -55,6 +55,12 @@ class Browser:
         while not any(event["method"] == "Page.loadEventFired" for event in self._events):
             self._events.append(self._message())
 
+    def resize(self, width, height):
+        """Give the page a window of so many CSS pixels; below 600 it is a phone's."""
+        self._call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
+        )
+
     def ask(self, script):
         """The value of JavaScript, of a promise what comes of it."""
         answer = self._call("Runtime.evaluate", expression=script, awaitPromise=True, returnByValue=True)

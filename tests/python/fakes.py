@@ -9,31 +9,27 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from wiw._core import core
+from wiw.envs.base import Env, Segment
+from wiw.loop.agent import Agent
+from wiw.loop.base import BaseAgent
 from wiw.policies.base import Policy
+from wiw.runs.compose import Limits, RunContext
+from wiw.runs.recipes import agent_recipe
+from wiw.tasks.base import Task
 from wiw.types import Answer, Decision, Episode, Goal, Observation, Proposal, Rollout, Truth
 
 FORWARD, LEFT = 1, 2
 STEP = 0.2
 
 
-@dataclass
-class Outcome:
-    observation: Observation
-    executed: Any
-    path: Any
-    terminated: bool
-    truncated: bool
-
-
-class LineEnv:
+class LineEnv(Env):
     def __init__(self, task: LineTask) -> None:
         self.task = task
 
@@ -41,10 +37,13 @@ class LineEnv:
         if episode.episode_id in self.task.broken:
             raise OSError(f"no such scene: {episode.scene}")
         self.episode, self.x, self.actions = episode, 0.0, 0
-        self.goal = Goal("line", image=np.full((48, 48, 3), 200, np.uint8))
-        return self._observe()
+        return self.observation
 
-    def run(self, actions: Any) -> Outcome:
+    @property
+    def goal(self) -> Goal:
+        return Goal("line", image=np.full((48, 48, 3), 200, np.uint8))
+
+    def run(self, actions: Any, answer: Answer | None = None) -> Segment:
         path = [self._position()]
         for action in actions:
             self.x += STEP * (action == FORWARD)
@@ -52,8 +51,8 @@ class LineEnv:
             path.append(self._position())
         done = self._left() < 0.5
         time.sleep(self.task.delay)
-        return Outcome(
-            self._observe(), np.asarray(actions), np.array(path), done, not done and self.actions >= self.task.budget
+        return Segment(
+            self.observation, np.asarray(actions), np.array(path), done, not done and self.actions >= self.task.budget
         )
 
     def truth(self) -> Truth:
@@ -71,22 +70,20 @@ class LineEnv:
             "distance_to_goal": self._left(),
         }
 
-    def close(self) -> None:
-        pass
-
     def _left(self) -> float:
         return abs(self.episode.geodesic - self.x)
 
     def _position(self) -> Any:
         return np.array([self.x, 0.0, 0.0])
 
-    def _observe(self) -> Observation:
+    @property
+    def observation(self) -> Observation:
         panorama = np.full((32, 64, 3), min(255, int(20 * self.x)), np.uint8)
         return Observation(panorama, panorama[:32, :32], np.array([self.x, 0.0, 0.0]))
 
 
 @dataclass
-class LineTask:
+class LineTask(Task):
     """Goals from 1 to 3 m ahead, two episodes a scene."""
 
     seed: int = 0
@@ -94,10 +91,14 @@ class LineTask:
     broken: tuple[str, ...] = ()
     delay: float = 0.0
     name: str = "line"
-    defaults: dict[str, int] = field(default_factory=lambda: {"candidates": 2, "horizon": 5, "execute": 3})
+    decisions: int = 8
+
+    @property
+    def defaults(self) -> dict[str, int]:
+        return {"candidates": 2, "horizon": 5, "execute": 3}
 
     def describe(self) -> dict[str, Any]:
-        return {"task": self.name, "seed": self.seed, "budget": self.budget, "decisions": 8}
+        return {"task": self.name, "seed": self.seed, "budget": self.budget, "decisions": self.decisions}
 
     def environment(self, depth: bool = False) -> LineEnv:
         return LineEnv(self)
@@ -111,7 +112,7 @@ class LineTask:
 
 
 @dataclass
-class LineAgent:
+class LineAgent(BaseAgent):
     """Goes forward with probability `drive`; `kill` names episodes that kill their process at decision 1."""
 
     drive: float = 0.7
@@ -126,12 +127,6 @@ class LineAgent:
 
     def decide_batch(self, queries: Any) -> list[Decision]:
         return [self._decide(query) for query in queries]
-
-    def forget(self, key: Any) -> None:
-        pass
-
-    def meter(self) -> Counter[str]:
-        return Counter()
 
     def _decide(self, query: Any) -> Decision:
         key = query.key
@@ -164,6 +159,11 @@ class LineAgent:
                 return
             Path(self.marker).touch()
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def agent_for(task: Any, agent: Any, **limits: Any) -> Agent:
+    """The agent with everything that a run of the task adds: its numbers, its reviser, limits."""
+    return agent_recipe(agent).build(RunContext(task), Limits(**limits))
 
 
 def line_task(scenes: str = "", seed: int = 0, preset: str = "paper", backend: str = "auto", **rules: Any) -> LineTask:

@@ -10,7 +10,7 @@ import numpy as np
 import wiw
 from wiw._core import core
 from wiw.policies.base import FrameSpec
-from wiw.tabletop.kind import above
+from wiw.tabletop.base import make_action
 from wiw.types import Proposal
 
 
@@ -26,7 +26,7 @@ class Pressing(wiw.Policy):
         draws = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), 3)
         name = list(places)[int(draws[0] * len(places))]
         x, y = places[name][:2, 3] + 0.02 * (draws[1:] - 0.5)
-        down = [above(x, y, height, 0.0) for height in (0.12, 0.028, 0.12)]
+        down = [make_action(x, y, height, 0.0) for height in (0.12, 0.028, 0.12)]
         return Proposal(np.array(down[:horizon]), text=f"press the {name} thing")
 
     def score(self, situations: Any, proposals: Any, rollouts: Any) -> Any:

@@ -181,7 +181,7 @@ def test_checkpoints_come_back_as_they_went(name: str, made, tmp_path: Path) -> 
         tmp_path / "again", model.conditioning.encoders, model.generator.pipeline, lora=model._lora
     )
     assert (written / "pytorch_lora_weights.safetensors").is_file() == model._lora
-    assert json.loads((written / "config.json").read_text())["base"] == model.base
+    assert json.loads((written / "config.json").read_text())["base"] == model.unwrapped
     again = made(name, checkpoint=str(written))
     np.testing.assert_array_equal(rollout(again, [FORWARD, TURN_LEFT]), frames)
     same = pickle.loads(pickle.dumps(model))

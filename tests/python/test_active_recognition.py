@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fakes import SizeReader
+from fakes import SizeReader, agent_for
 from gymnasium.utils.env_checker import check_env
 
 import wiw
 from recognition_file import CHOICES, a_file
-from wiw.action import FORWARD, TURN_LEFT
+from wiw.action import FORWARD, STOP, TURN_LEFT
 from wiw.cli import main
 from wiw.datasets import ar
 from wiw.datasets.worlds import world
@@ -51,7 +51,7 @@ def test_gymnasium_accepts_it(file: Path) -> None:
 def test_the_target_is_what_the_renderer_says(file: Path, two_rooms: str) -> None:
     env = wiw.make("AR-v0", episode_file=file)
     env.reset(options={"episode": 0})
-    name, place = env.trip.episode.info["target"], world(two_rooms)
+    name, place = env.state.episode.info["target"], world(two_rooms)
     pose = env.fork().T_world_camera
     ids = place.renderer.panorama(pose[None], outputs=("instance",))["instance"][0]
     front = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("instance",))["instance"][0]
@@ -67,7 +67,7 @@ def test_the_box_follows_a_turn_and_goes_across_the_seam(file: Path) -> None:
     env.reset(options={"episode": 0})
     masks, boxes = [env.observation.target.mask], []
     for _ in range(16):
-        shown, *_ = env.step(1)
+        shown, *_ = env.step(TURN_LEFT)
         target = env.observation.target
         masks.append(target.mask)
         boxes.append(target.panorama_box)
@@ -95,7 +95,7 @@ def test_ids_reach_neither_policies_nor_world_models_and_boxes_no_world_model(fi
             return np.repeat(observations.image[:, None], len(controls[0].actions) + 1, axis=1)
 
     task = AR(episode_file=file)
-    agent = wiw.Agent(Spy(), Watcher()).settled(task.defaults)
+    agent = agent_for(task, wiw.Agent(Spy(), Watcher()))
     run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     observations, situation = seen[0], seen[1]
     env = task.environment()
@@ -136,7 +136,7 @@ class Sink:
 @pytest.mark.parametrize(("execute", "carried_out"), [("primitive", 1), ("sequence", 2)])
 def test_the_budget_ends_an_episode_after_the_last_answer(file: Path, execute: str, carried_out: int) -> None:
     task, sink = AR(episode_file=file, execute=execute, decisions=4), Sink()
-    agent = wiw.Agent(SizeReader(0.5, (TURN_LEFT, TURN_LEFT))).settled(task.defaults)
+    agent = agent_for(task, wiw.Agent(SizeReader(0.5, (TURN_LEFT, TURN_LEFT))))
     run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=sink)
     assert [len(record.executed) for record in sink.decisions] == [carried_out] * 3 + [0]
     metrics = sink.results[0].metrics
@@ -184,12 +184,12 @@ def test_an_answer_is_a_step_of_gymnasiums_too(file: Path) -> None:
     env = wiw.make("AR-v0", episode_file=file)
     for choice, reward in ((CHOICES.index("table"), 1.0), (CHOICES.index("chest"), 0.0)):
         env.reset(options={"episode": 0})
-        env.step(0)
-        _, got, terminated, _, info = env.step(4 + choice)
+        env.step(FORWARD)
+        _, got, terminated, _, info = env.step(STOP + 1 + choice)
         assert (got, terminated) == (reward, True)
         assert (info["result"]["success"], info["result"]["actions"]) == (reward, 1)
-    with pytest.raises(ArgumentError, match="0 to 7"):
-        env.step(8)
+    with pytest.raises(ArgumentError, match="1 to 8"):
+        env.step(9)
 
 
 def test_many_at_a_time_are_as_one_by_one(file: Path) -> None:
@@ -200,8 +200,8 @@ def test_many_at_a_time_are_as_one_by_one(file: Path) -> None:
     assert many.observation_space.contains(shown)
     for name, value in alone.items():
         np.testing.assert_array_equal(shown[name][1], value)
-    shown, rewards, terminated, _, _ = many.step(np.array([1, 4 + CHOICES.index("table")]))
-    alone, *_ = one.step(1)
+    shown, rewards, terminated, _, _ = many.step(np.array([TURN_LEFT, STOP + 1 + CHOICES.index("table")]))
+    alone, *_ = one.step(TURN_LEFT)
     assert terminated.tolist() == [False, True]
     assert rewards.tolist() == [0, 1]
     for name, value in alone.items():
@@ -210,13 +210,13 @@ def test_many_at_a_time_are_as_one_by_one(file: Path) -> None:
 
 def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
     task = AR(episode_file=file)
-    for model, revision in ((None, "heuristic"), ("copy", "matcher")):
-        agent = wiw.Agent("heuristic", model, revision).settled(task.defaults)
-        with pytest.raises(ContractError, match=r"gives no answer, .* one of 4 choices.*revision="):
+    for model, reviser in ((None, "heuristic"), ("copy", "matcher")):
+        agent = agent_for(task, wiw.Agent("heuristic", model, reviser))
+        with pytest.raises(ContractError, match=r"gives no answer, .* one of 4 choices.*reviser="):
             run_episodes(task, agent, list(enumerate(task.episodes(1))), seed=0, sink=Sink())
     env = task.environment()
     shown, info = env.reset(options={"episode": 0})
-    with pytest.raises(ArgumentError, match=r"run\(actions, answer\)"):
+    with pytest.raises(ArgumentError, match=r"run\(plan, answer\)"):
         env.run([FORWARD])
     with pytest.raises(ArgumentError, match=r"env\.observation"):
         wiw.Agent(SizeReader()).decide(shown, env.goal, info["key"])
@@ -224,8 +224,8 @@ def test_an_agent_that_gives_no_answer_is_told_so(file: Path) -> None:
 
 def test_a_single_primitive_is_carried_out_at_any_horizon(two_rooms: str) -> None:
     for execute, expected in (("primitive", 1), ("sequence", 0)):
-        defaults = AR(two_rooms, execute=execute).defaults
-        assert wiw.Agent(SizeReader(), horizon=6).settled(defaults).execute == expected
+        task = AR(two_rooms, execute=execute)
+        assert agent_for(task, wiw.Agent(SizeReader(), horizon=6)).config.execute == expected
 
 
 def test_the_official_box_is_around_the_largest_piece_and_larger() -> None:
@@ -290,4 +290,4 @@ def test_the_report_speaks_of_answers(file: Path, tmp_path: Path) -> None:
     )
     outcome = {"status": "done", "metrics": {"success": 0.0, "predicted": 2.0}}
     missed = Attempt("none", outcome, (), None, task.wording, CHOICES)
-    assert missed.text == "taken for shelf in 0 decisions"
+    assert missed.text == "answered shelf after 0 decisions"

@@ -4,11 +4,11 @@ import pytest
 from scipy import stats
 
 import wiw
-from wiw.analysis.power import simulated_power
+from wiw.analysis.power import simulate_power
 from wiw.analysis.statistics import estimate_difference, holm, mcnemar
 from wiw.cli import main
 from wiw.errors import ArgumentError
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 
 
 def test_mcnemars_power_is_the_exact_sum():
@@ -19,7 +19,7 @@ def test_mcnemars_power_is_the_exact_sum():
         for losses in range(min(wins, n - wins + 1)):
             if stats.binomtest(wins, wins + losses).pvalue <= 0.05:
                 exact += stats.multinomial.pmf([wins, losses, n - wins - losses], n, [won, lost, 1 - won - lost])
-    _, by_test = simulated_power(won, lost, n, 1, 0.0, 0.95, np.random.default_rng(0))
+    _, by_test = simulate_power(won, lost, n, 1, 0.0, 0.95, np.random.default_rng(0))
     assert by_test == pytest.approx(exact, abs=0.02)
 
 

@@ -12,11 +12,11 @@ from scipy import stats
 
 from wiw.analysis.intervals import agresti_min, clustered_bootstrap, clustered_t, student, wilson
 from wiw.analysis.statistics import compare, estimate_difference, estimate_mean, holm, mcnemar
-from wiw.analysis.summary import headlines, notes, show_estimate, summarise
+from wiw.analysis.summary import load_metrics, notes, show_estimate, summarise
 from wiw.errors import ArgumentError
 from wiw.report.tables import SummaryTable
 
-SR, SPL, TRAJ = headlines()[:3]
+SR, SPL, TRAJ = load_metrics()[:3]
 
 
 @pytest.mark.parametrize(("successes", "n"), [(0, 6), (3, 7), (40, 164), (12, 12)])
@@ -141,27 +141,27 @@ def shown(summary, width=100):
 def test_the_table_claims_the_same_episodes_only_where_they_are():
     rows = [outcome(arm, i, 1) for arm in ("none", "warp") for i in range(3)]
     assert "on the same episodes" in shown(SummaryTable.of(summarise(["none", "warp"], rows, 3)))
-    rows[-1] = outcome("warp", 2, 0, status="failed")
-    assert "each on the episodes that it has finished" in shown(SummaryTable.of(summarise(["none", "warp"], rows, 3)))
+    rows[-1] = outcome("warp", 2, 0, status="error")
+    assert "each on the episodes scored in it" in shown(SummaryTable.of(summarise(["none", "warp"], rows, 3)))
 
 
 def test_episodes_that_were_not_judged_are_counted_and_said():
     outcomes = [outcome("none", i, 0.0) for i in range(4)] + [outcome("warp", i, 1.0) for i in range(3)]
-    outcomes.append(outcome("warp", 3, 0.0, status="failed"))
+    outcomes.append(outcome("warp", 3, 0.0, status="error"))
     summary = summarise(["none", "warp"], outcomes, episodes=5)
-    assert (summary["warp"].done, summary["warp"].failed, summary["warp"].pending) == (3, 1, 1)
+    assert (summary["warp"].done, summary["warp"].errors, summary["warp"].pending) == (3, 1, 1)
     assert summary["warp"].estimates["success"].value == 100.0
     difference = summary.difference("warp", "none")
     assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
     assert (summary["warp"].asked, summary["warp"].judged, summary["none"].judged) == (5, "3/5", "4/5")
     said = " ".join(notes(summary))
-    assert "warp: 3 of 5 episodes asked were judged, 1 failed for infrastructure, 1 still to run" in said
-    assert "over all 5, SR would lie between 60.0 and 100.0 %" in said
+    assert "warp: 3 of 5 episodes are scored; 1 infrastructure error is excluded from scores; 1 still to run" in said
+    assert "Over all 5, SR would be between 60.0 and 100.0 %" in said
 
 
-@pytest.mark.parametrize(("failed", "invalid"), [(0, False), (2, False), (3, True)])
-def test_a_run_is_invalid_where_over_one_percent_of_an_arm_failed(failed, invalid):
-    outcomes = [outcome("warp", i, 1.0, status="failed" if i < failed else "done") for i in range(200)]
+@pytest.mark.parametrize(("errors", "invalid"), [(0, False), (2, False), (3, True)])
+def test_a_run_is_invalid_where_over_one_percent_of_an_arm_are_errors(errors, invalid):
+    outcomes = [outcome("warp", i, 1.0, status="error" if i < errors else "done") for i in range(200)]
     summary = summarise(["warp"], outcomes, episodes=200)
     assert bool(summary.invalid) == invalid
     assert any("INVALID RUN" in note and "3 of 200" in note for note in notes(summary)) == invalid
@@ -207,7 +207,7 @@ def test_a_terminal_table_keeps_every_number(width):
 def test_arms_say_what_they_are():
     summary = summarise(["none", "geometric", "warp"], [], episodes=3, policies=["none", "geometric"])
     roles = [line.role for line in summary.arms]
-    assert roles == ["the policy alone", "another policy, alone", "world model"]
+    assert roles == ["policy without a world model", "another policy without a world model", "world model"]
 
 
 def test_t_over_scenes_is_the_cluster_robust_interval_of_statsmodels():
@@ -259,7 +259,7 @@ def test_few_scenes_that_happen_to_be_alike_do_not_make_an_interval_narrow():
 
 def test_intervals_of_means_end_where_values_do():
     actions, scenes = [3, 60, 60, 60], ["a", "a", "b", "b"]
-    found, plain = (estimate_mean(actions, scenes, headline) for headline in (TRAJ, replace(TRAJ, least=-math.inf)))
+    found, plain = (estimate_mean(actions, scenes, metric) for metric in (TRAJ, replace(TRAJ, least=-math.inf)))
     assert plain.low < 0 and found.low == 0 and found.high == plain.high
     worse = estimate_difference([0, 0, 50, 50], [3, 60, 60, 60], scenes, TRAJ)
     assert worse.low < 0

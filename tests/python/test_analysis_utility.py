@@ -12,8 +12,9 @@ from scipy import stats
 from wiw.analysis.statistics import estimate_difference
 from wiw.analysis.summary import notes, role_of, summarise
 from wiw.analysis.utility import ratio
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html
+from wiw.report.tables import SummaryTable
 from wiw.studies.evaluate import run_arms
 
 RATES = {"none": 0.2, "copy": 0.2, "warp": 0.5, "placebo-shuffled:mine": 0.2, "mine": 0.6, "oracle": 0.8}
@@ -47,7 +48,7 @@ def test_utility_by_hand():
         one = found.utility(arm)
         assert one.value == pytest.approx((rate[arm] - rate["copy"]) / (rate["oracle"] - rate["copy"]))
         assert one.low < one.value < one.high and (one.n, one.scenes) == (60, 12)
-    with pytest.raises(KeyError, match="needs episodes that arm, copy and oracle"):
+    with pytest.raises(KeyError, match="needs episodes that are scored in the arm, copy and oracle"):
         found.utility("copy")
 
 
@@ -64,7 +65,7 @@ def test_the_report_shows_utilities_on_one_scale():
 def test_only_the_world_model_under_test_is_no_reference():
     assert {one.arm for one in summary().utilities if not one.reference} == {"mine"}
     for arm in ("placebo-shuffled:mine", "placebo-swapped", "heuristic+placebo-swapped:mine"):
-        assert role_of(arm).startswith("placebo")
+        assert role_of(arm).startswith("control: same compute")
     assert role_of("mine") == role_of("placebo") == "world model"
 
 
@@ -79,14 +80,16 @@ def test_interval_holds_the_quotients_that_a_t_test_does_not_reject():
     assert stats.ttest_1samp(gains - value * spans, 0).pvalue == pytest.approx(1)
 
 
-def test_not_identifiable_where_the_interval_of_ceiling_minus_floor_holds_zero():
+def test_utility_is_undefined_where_the_interval_of_ceiling_minus_floor_includes_zero():
     for rates in ({**RATES, "oracle": 0.22}, {**RATES, "oracle": 0.1}):
         found = summary(rates)
         assert found.difference("oracle", "copy").estimate.low <= 0
         one = found.utility("mine")
-        assert not one.identifiable and all(map(math.isnan, (one.value, one.low, one.high)))
-        assert any("Not identifiable" in note for note in notes(found)) and "not identifiable" in summary_html(found)
-    assert summary().difference("oracle", "copy").estimate.low > 0 and summary().utility("mine").identifiable
+        assert not one.is_defined and all(map(math.isnan, (one.value, one.low, one.high)))
+        assert any(
+            note == "Utility undefined: the interval for oracle - copy includes 0." for note in notes(found)
+        ) and "<small>undefined</small>" in summary_html(found)
+    assert summary().difference("oracle", "copy").estimate.low > 0 and summary().utility("mine").is_defined
 
 
 def test_only_episodes_that_all_three_have_finished_count():
@@ -109,7 +112,7 @@ def test_an_arm_that_does_as_the_ceiling_is_not_certain_to_be_its_equal():
 
 def test_one_scene_counts_its_episodes():
     one = summary(scenes=1, per_scene=60).utility("mine")
-    assert one.identifiable and one.scenes == 1
+    assert one.is_defined and one.scenes == 1
 
 
 def test_identifiability_is_the_sign_of_the_difference_shown():
@@ -119,13 +122,13 @@ def test_identifiability_is_the_sign_of_the_difference_shown():
         success = {arm: [r["metrics"]["success"] for r in rows if r["arm"] == arm] for arm in RATES}
         scenes = [r["scene"] for r in rows if r["arm"] == "copy"]
         shown = estimate_difference(success["oracle"], success["copy"], scenes, SUCCESS)
-        assert found.utility("mine").identifiable == (shown.low > 0)
+        assert found.utility("mine").is_defined == (shown.low > 0)
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_terminal_shows_every_utility(width):
     with Console(width=width, file=io.StringIO(), record=True) as console:
-        console.print(summary())
+        console.print(SummaryTable.of(summary()))
     shown = console.export_text()
     assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
     for one in summary().utilities:

@@ -35,16 +35,18 @@ def only(scene: Any, instance: int) -> Scene:
 def test_alone_is_what_a_scene_of_that_instance_alone_shows(two_rooms: str) -> None:
     place = world(two_rooms, "cpu")
     points = place.ground.put_down(place.navmesh.sample(6, 3)).astype(float)
-    before = visibility.seen(place, points)
+    before = visibility.measure_sizes(place, points)
     for instance in (7, 8, 10):
         bare = Renderer(only(place.scene, instance), "cpu")
         poses = [visibility.camera_pose(point, 0.0) for point in points]
         ids = bare.panorama(np.stack(poses), visibility.SIZE, outputs=("instance",))["instance"]
         sine = np.sin(np.linspace(np.pi / 2, -np.pi / 2, visibility.SIZE[0] + 1))
         expected = ((ids > 0).sum(axis=2) * -np.diff(sine)).sum(axis=1) * 2 * np.pi / visibility.SIZE[1]
-        np.testing.assert_allclose(visibility.alone(place, points, instance), expected, rtol=0.02, atol=2e-4)
+        np.testing.assert_allclose(
+            visibility.measure_unhidden_sizes(place, points, instance), expected, rtol=0.02, atol=2e-4
+        )
         assert (before[:, instance] <= expected * 1.02 + 2e-4).all()
-    np.testing.assert_array_equal(visibility.seen(place, points), before)  # all is back in its place
+    np.testing.assert_array_equal(visibility.measure_sizes(place, points), before)  # all is back in its place
     np.testing.assert_allclose(before.sum(axis=1), 4 * np.pi)
 
 
@@ -81,7 +83,7 @@ def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> Non
         assert share == pytest.approx(info["visible"], abs=1e-3)
         assert info["difficulty"] == (share < 0.4) + (share < 0.2)
         best = np.asarray(info["best_position"])
-        now, then = visibility.seen(place, np.stack([start, best]))[:, info["target"]]
+        now, then = visibility.measure_sizes(place, np.stack([start, best]))[:, info["target"]]
         assert now >= RULES.seen
         assert then >= max(RULES.large, RULES.gain * now)
         assert share <= RULES.hidden or now <= RULES.small * then

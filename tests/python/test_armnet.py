@@ -16,9 +16,9 @@ import pytest
 import wiw
 from wiw.errors import DependencyError, WeightsError
 from wiw.physics import Sphere, place
-from wiw.tabletop.kind import above
+from wiw.tabletop.base import make_action
 from wiw.tabletop.workbench import TABLE, Thing, Workbench
-from wiw.tasks.manipulation import KINDS
+from wiw.tasks.manipulation import TABLETOP_TASKS
 from wiw.types import Conditioning, Control
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
@@ -47,7 +47,9 @@ from wiw.world_models.armnet.weights import load, save  # noqa: E402
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 SMALL = (8, 8, 8)
-PLAN = np.array([above(0.15, -0.1, 0.2, 1.0), above(0.2, 0.1, 0.1, 0.0, 0.3), above(0.1, 0.15, 0.25, 0.0)])
+PLAN = np.array(
+    [make_action(0.15, -0.1, 0.2, 1.0), make_action(0.2, 0.1, 0.1, 0.0, 0.3), make_action(0.1, 0.15, 0.25, 0.0)]
+)
 
 
 def untrained(seed: int = 0) -> ArmNet:
@@ -77,7 +79,7 @@ def arm_of(sight: Any) -> Arm:
 @pytest.fixture(scope="module")
 def table() -> Workbench:
     """Cups, with the arm as it waits."""
-    return KINDS["stack_cups"].setup(4, 1).bench()
+    return TABLETOP_TASKS["stack_cups"].create_setup(4, 1).build_workbench()
 
 
 # -- what is known of the arm ------------------------------------------------------------------------------------------
@@ -87,8 +89,8 @@ def table() -> Workbench:
 def test_finger_tips_are_where_a_marker_at_their_place_is_seen(spot: tuple[float, float, float]) -> None:
     x, y, height = spot
     at = (x, y, TABLE + height)
-    marker = Thing("marker", ((Sphere(0.02), np.eye(4)),), (1.0, 0.0, 1.0), touched=False)
-    seen = Workbench([(marker, place(*at))]).picture("front", FRONT, ("color", "depth"), arm=False)
+    marker = Thing("marker", ((Sphere(0.02), np.eye(4)),), (1.0, 0.0, 1.0), has_body=False)
+    seen = Workbench([(marker, place(*at))]).render_view("front", FRONT, ("color", "depth"), arm=False)
     pink = (seen["color"].astype(int) @ [1, -2, 1]) > 150
     rows, columns = np.argwhere(pink).mean(axis=0) + 0.5 - (WINDOW[0].start, WINDOW[1].start)
     pose = np.array([[*at, np.pi, 0, 0, 1.0]])
@@ -101,8 +103,8 @@ def test_the_arm_is_drawn_as_it_is_seen_and_moves_nothing_else(table: Workbench)
     bench = table.fork()
     poses = np.stack([bench.pose, *PLAN])
     for pose, sight in zip(poses, sights(poses, FRONT), strict=True):
-        bench.go(pose)
-        seen = bench.picture("front", FRONT, ("color",))["color"]
+        bench.move_to(pose)
+        seen = bench.render_view("front", FRONT, ("color",))["color"]
         np.testing.assert_allclose(sight.pose, bench.pose, atol=1e-3)
         assert sight.arm.mean() > 0.03
         off = np.abs(seen.astype(int) - sight.color).max(axis=-1)
@@ -121,9 +123,9 @@ def test_without_things_that_move_the_next_view_is_known(table: Workbench) -> No
     """What is seen, with the arm's shadow taken away and the new one laid on, and the arm: within noise the truth."""
     bench = table.fork()
     here = bench.pose
-    before = bench.picture("front", FRONT)["color"]
-    bench.go(PLAN[0])
-    after = bench.picture("front", FRONT)["color"]
+    before = bench.render_view("front", FRONT)["color"]
+    bench.move_to(PLAN[0])
+    after = bench.render_view("front", FRONT)["color"]
     bare = image(plate(FRONT).color)
     old, new = (arm_of(sight) for sight in sights(np.stack([here, PLAN[0]]), FRONT))
     canvas = clear_arm(image(before), old, in_sight(image(before), old), bare, bare)
@@ -135,8 +137,8 @@ def test_without_things_that_move_the_next_view_is_known(table: Workbench) -> No
 
 def test_the_canvas_is_the_table_without_the_arm(table: Workbench) -> None:
     bench = table.fork()
-    bench.go(PLAN[0])
-    seen, clear = (image(bench.picture("front", FRONT, arm=arm)["color"]) for arm in (True, False))
+    bench.move_to(PLAN[0])
+    seen, clear = (image(bench.render_view("front", FRONT, arm=arm)["color"]) for arm in (True, False))
     *_, sight = sights(np.stack([PLAN[0]]), FRONT)
     bare = image(plate(FRONT).color)
     canvas = clear_arm(seen, arm_of(sight), in_sight(seen, arm_of(sight)), bare, bare)
@@ -197,7 +199,7 @@ def test_a_network_shares_out_every_pixel() -> None:
 
 @pytest.fixture(scope="module")
 def front(table: Workbench) -> Any:
-    return table.picture("front", SIZE)["color"]
+    return table.render_view("front", SIZE)["color"]
 
 
 def test_rows_do_not_depend_on_each_other(table: Workbench, front: Any) -> None:
@@ -280,13 +282,13 @@ def test_torch_is_not_loaded_before_it_is_needed() -> None:
 
 def test_the_weights_that_come_with_it_know_what_is_carried() -> None:
     """A cup that is taken by its wall and lifted: nearer to the truth than one who leaves it on the table."""
-    setup = KINDS["stack_cups"].setup(11, 1)
-    bench = setup.bench()
-    plan = KINDS["stack_cups"].expert(bench.places(setup.objects), setup.target)[:3]
+    setup = TABLETOP_TASKS["stack_cups"].create_setup(11, 1)
+    bench = setup.build_workbench()
+    plan = TABLETOP_TASKS["stack_cups"].plan_expert(bench.get_poses(setup.objects), setup.target)[:3]
     ids = np.concatenate([bench.pose[None], plan])
-    seen = bench.picture("front", SIZE)["color"]
+    seen = bench.render_view("front", SIZE)["color"]
     made = rollout(wiw.world_model("armnet"), seen[None], [control(ids)])[0, -1]
-    truth = bench.fronts_after(plan, SIZE)[-1]
+    truth = bench.render_fronts_after(plan, SIZE)[-1]
     bare = image(plate(SIZE).color)
     first, *_, last = (arm_of(sight) for sight in sights(ids, SIZE))
     canvas = clear_arm(image(seen), first, in_sight(image(seen), first), bare, bare)

@@ -16,7 +16,10 @@ import wiw
 from wiw.action import FORWARD
 from wiw.errors import ArgumentError, ConstructionError, RolloutError
 from wiw.loop import attempts
-from wiw.loop.attempts import TRIES, Attempts, make_model
+from wiw.loop.attempts import TRIES, Attempted, make_model
+from wiw.runs.compose import Limits, RunContext
+from wiw.runs.recipes import AgentRecipe
+from wiw.tasks.imagenav import ImageNav
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Requirements
 
@@ -47,7 +50,7 @@ class Scripted(wiw.WorldModel):
 
 
 def ask(model, deadline=5.0):
-    return Attempts(model, deadline)(OBSERVATIONS, CONTROLS, SEEDS)
+    return Attempted(model, deadline).rollout(OBSERVATIONS, CONTROLS, SEEDS)
 
 
 @pytest.fixture(autouse=True)
@@ -58,9 +61,10 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("failures", [0, 1, 2])
 def test_a_call_that_fails_is_made_again(failures: int) -> None:
     model = Scripted(*[ConnectionError("gone")] * failures, GOOD)
-    asked = Attempts(model, 5.0)
-    np.testing.assert_array_equal(asked(OBSERVATIONS, CONTROLS, SEEDS), GOOD)
-    assert (model.calls, asked.tally["retries"], asked.tally["rows"]) == (failures + 1, failures, 2 * (failures + 1))
+    asked = Attempted(model, 5.0)
+    np.testing.assert_array_equal(asked.rollout(OBSERVATIONS, CONTROLS, SEEDS), GOOD)
+    spent = asked.spent
+    assert (model.calls, spent.get("retries", 0), spent["rows"]) == (failures + 1, failures, 2 * (failures + 1))
 
 
 @pytest.mark.parametrize(
@@ -126,12 +130,12 @@ def test_a_slow_model_is_never_entered_twice_at_a_time() -> None:
 
 def test_one_thread_serves_all_calls_and_ends_with_its_owner() -> None:
     model = Scripted(GOOD)
-    asked = Attempts(model, 5.0)
+    asked = Attempted(model, 5.0)
     before = threading.active_count()
     for _ in range(5):
-        asked(OBSERVATIONS, CONTROLS, SEEDS)
+        asked.rollout(OBSERVATIONS, CONTROLS, SEEDS)
     assert len(model.threads) == 1 and threading.get_ident() not in model.threads
-    assert pickle.loads(pickle.dumps(Attempts(Scripted(None), 3.0))).deadline == 3.0
+    assert pickle.loads(pickle.dumps(Attempted(Scripted(None), 3.0))).deadline == 3.0
     del asked
     gc.collect()
     deadline = time.monotonic() + 5
@@ -145,7 +149,7 @@ def test_without_a_deadline_a_call_stays_in_its_thread() -> None:
     ask(model, float("inf"))
     assert model.threads == {threading.get_ident()}
     with pytest.raises(ArgumentError, match="deadline"):
-        Attempts(model, 0)
+        Attempted(model, 0)
 
 
 def test_torch_finds_the_state_of_the_thread_that_asks() -> None:
@@ -207,7 +211,7 @@ def test_a_constructor_is_held_to_the_deadline_and_its_errors_have_a_type(two_ro
         make_model(Slow, 0.1)
     assert caught.value.kind == "deadline"
     with pytest.raises(ConstructionError, match=r"within 0\.1 s"):
-        wiw.Agent("matcher", Slow, deadline=0.1)
+        AgentRecipe("matcher", Slow).build(RunContext(ImageNav(scenes=two_rooms)), Limits(deadline=0.1))
     assert isinstance(make_model(Fetching, 0.05), Fetching)
     for error in (OSError("no weights"), SystemExit(3)):
         with pytest.raises(ConstructionError, match=r"cannot be made: (OSError: no weights|SystemExit: 3)") as caught:

@@ -15,7 +15,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
-from wiw.analysis.blame import SWAPS, VERDICTS, EpisodeBlame
+from wiw.analysis.blame import RERUNS, VERDICTS, EpisodeBlame
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -51,7 +51,7 @@ def fresh(two_rooms: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def blamed(fresh: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("blamed") / "run"
     shutil.copytree(fresh, folder)
-    return wiw.attribute(folder, progress=False)
+    return wiw.blame(folder, progress=False)
 
 
 @pytest.fixture
@@ -76,30 +76,30 @@ def again(run: Path) -> dict[tuple[str, int], Any]:
 
 def test_all_three_swaps_are_the_ceiling(blamed: Any) -> None:
     for line in blamed.arms:
-        assert line.mended["all"].value == 100 and line.verdicts["beyond"] == 0
+        assert line.recovery["all"].value == 100 and line.verdicts["beyond"] == 0
 
 
 def test_a_world_model_that_lies_is_to_blame(blamed: Any) -> None:
     with_truth, line = succeeded(blamed.run, "oracle"), blamed["liar"]
-    assert line.failed and sum(with_truth.values())
+    assert line.failures and sum(with_truth.values())
     for one in line.episodes:  # the very run of the arm "oracle"
-        assert one.mended["imagination"] == with_truth[one.episode]
+        assert one.success["imagination"] == with_truth[one.episode]
         assert (one.verdict == "imagination") == with_truth[one.episode]
 
 
 def test_a_scorer_of_noise_is_to_blame(blamed: Any) -> None:
     line = blamed["noise"]
-    assert line.failed and line.verdicts["scoring"] == line.failed
+    assert line.failures and line.verdicts["scoring"] == line.failures
 
 
 def test_a_proposer_that_only_turns_is_to_blame(blamed: Any) -> None:
     line = blamed["spinner"]
-    assert line.failed == line.verdicts["proposals"] == EPISODES
-    assert line.mended["scoring"].value == line.mended["imagination"].value == 0
+    assert line.failures == line.verdicts["proposals"] == EPISODES
+    assert line.recovery["scoring"].value == line.recovery["imagination"].value == 0
 
 
 def test_the_oracle_is_not_told_the_truth_twice(blamed: Any) -> None:
-    assert set(blamed["oracle"].mended) == {*SWAPS} - {"imagination"}
+    assert set(blamed["oracle"].recovery) == {*RERUNS} - {"imagination"}
     assert not any(arm == "oracle/imagination" for arm, _ in again(blamed.run))
 
 
@@ -112,7 +112,7 @@ def test_every_failure_and_only_failures_are_run_again(blamed: Any) -> None:
 
 
 def test_it_comes_out_the_same_in_workers_and_again(blamed: Any, run: Path) -> None:
-    assert wiw.attribute(run, ["spinner"], workers=2, progress=False)["spinner"] == blamed["spinner"]
+    assert wiw.blame(run, ["spinner"], workers=2, progress=False)["spinner"] == blamed["spinner"]
     assert wiw.verify(run / "blame", episodes=1).same
 
 
@@ -127,21 +127,21 @@ def test_a_stopped_attribution_goes_on_where_it_was(blamed: Any, run: Path, monk
     with monkeypatch.context() as patch:
         patch.setattr(RunStore, "write", stop)
         with pytest.raises(KeyboardInterrupt):
-            wiw.attribute(run, "spinner", progress=False)
+            wiw.blame(run, "spinner", progress=False)
     kept = again(run)
     assert len(kept) == 3
-    assert wiw.attribute(run, "spinner", progress=False)["spinner"] == blamed["spinner"]
+    assert wiw.blame(run, "spinner", progress=False)["spinner"] == blamed["spinner"]
     assert {key: row["seconds"] for key, row in kept.items()}.items() <= {
         key: row["seconds"] for key, row in again(run).items()
     }.items()
 
 
 def test_some_episodes_then_more_and_nothing_twice(run: Path, blamed: Any) -> None:
-    found = wiw.attribute(run, "spinner", episodes=1, progress=False)
+    found = wiw.blame(run, "spinner", episodes=1, progress=False)
     some, before = found["spinner"], again(run)
-    assert (len(some.episodes), some.open) == (1, EPISODES - 1)
-    assert f"{EPISODES - 1} of {EPISODES} failed episodes were not examined" in found.notes()[0]
-    whole = wiw.attribute(run, "spinner", progress=False)["spinner"]
+    assert (len(some.episodes), some.remaining) == (1, EPISODES - 1)
+    assert f"{EPISODES - 1} of {EPISODES} failures have not been rerun" in found.notes()[0]
+    whole = wiw.blame(run, "spinner", progress=False)["spinner"]
     assert {one.episode for one in some.episodes} < {one.episode for one in whole.episodes}
     assert whole == blamed["spinner"] and before.items() <= again(run).items()
 
@@ -155,18 +155,21 @@ def test_infrastructure_is_not_blamed_but_named(
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 2, "backend": "cpu"})
     run = tmp_path / "run"
     evaluate(task, AgentRecipe(part("Spinner"), part("Frail")), 3, out=run, progress=False, keep_images=0).close()
-    change(run, "UPDATE outcome SET status = 'failed', metrics = '{}' WHERE episode = 1")
+    change(run, "UPDATE outcome SET status = 'error', metrics = '{}' WHERE episode = 1")
     broken.touch()
     assert main(["blame", str(run)]) == 1
     shown = capsys.readouterr()
-    assert "1 episode failed for infrastructure, so nothing is blamed for them: 1." in shown.out.replace("\n", " ")
-    assert "--retry-failed" in shown.err
+    assert (
+        "1 episode ended with an infrastructure error in the run, so no stage is blamed for them: 1."
+        in shown.out.replace("\n", " ")
+    )
+    assert "--retry-errors" in shown.err
     (line,) = wiw.load_run(run).blame()
-    assert line["infrastructure"] == [1] and line["examined"] == 0 and set(line["broken"]) == {0, 2}
-    assert "no server" in line["broken"][0]
+    assert line["errors"] == [1] and line["examined"] == 0 and set(line["rerun_errors"]) == {0, 2}
+    assert "no server" in line["rerun_errors"][0]
     broken.unlink()
-    found = wiw.attribute(run, progress=False, retry_failed=True)["Frail"]
-    assert not found.broken and len(found.episodes) == 2
+    found = wiw.blame(run, progress=False, retry_errors=True)["Frail"]
+    assert not found.rerun_errors and len(found.episodes) == 2
 
 
 @pytest.mark.parametrize(
@@ -186,18 +189,18 @@ def test_the_least_that_mends_is_to_blame(mended: dict[str, bool], verdict: str)
 def test_what_is_shown_and_kept(blamed: Any, capsys: Any, tmp_path: Path) -> None:
     assert main(["blame", str(blamed.run), "--arm", "noise,liar"]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in (*SWAPS, *VERDICTS, "noise", "liar"))
+    assert all(word in shown for word in (*RERUNS, *VERDICTS, "noise", "liar"))
     kept = json.loads((blamed.run / "blame.json").read_text())
     assert {line["arm"] for line in kept["arms"]} == {"noise", "liar"}
     assert all(one["verdict"] in VERDICTS for one in kept["episodes"])
     log = wiw.load_run(blamed.run)
     lines = {line["arm"]: line for line in log.blame()}
-    assert lines["noise"]["mended_all"] == 100 and lines["noise"]["blame_scoring"] == blamed["noise"].failed
+    assert lines["noise"]["mended_all"] == 100 and lines["noise"]["blame_scoring"] == blamed["noise"].failures
     page = log.report(tmp_path / "report.html").read_text()
-    assert 'id="blame"' in page and "by the stage that has to be told the truth" in page
+    assert 'id="blame"' in page and "Failures by the stage whose ground truth" in page
     view = log.view(tmp_path / "view")
-    told = "".join(path.read_text() for path in (view.parent / "episodes").glob("*.html"))
-    assert len(re.findall("to blame: scoring", told)) >= blamed["noise"].failed
+    pages = "".join(path.read_text() for path in (view.parent / "episodes").glob("*.html"))
+    assert len(re.findall("to blame: scoring", pages)) >= blamed["noise"].failures
 
 
 def test_a_run_without_it_shows_nothing_of_it(run: Path, tmp_path: Path) -> None:
@@ -207,18 +210,18 @@ def test_a_run_without_it_shows_nothing_of_it(run: Path, tmp_path: Path) -> None
 
 def test_what_cannot_be_attributed_says_why(run: Path, two_rooms: str, tmp_path: Path, capsys: Any) -> None:
     with pytest.raises(ArgumentError, match=r"no arm 'wrap' in .*; it has liar, oracle"):
-        wiw.attribute(run, "wrap")
+        wiw.blame(run, "wrap")
     assert main(["blame", str(run), "--arm", "wrap"]) == 2 and "no arm 'wrap'" in capsys.readouterr().err
     with pytest.raises(ArgumentError, match="episodes of at least 1, got 0"):
-        wiw.attribute(run, episodes=0)
+        wiw.blame(run, episodes=0)
     with pytest.raises(StoreError, match="no run at"):
-        wiw.attribute(tmp_path / "nothing")
+        wiw.blame(tmp_path / "nothing")
     change(run, "UPDATE outcome SET metrics = json_set(metrics, '$.success', 1.0) WHERE arm = 'noise'")
-    with pytest.raises(ArgumentError, match=r"no episode of noise in .* was judged and failed"):
-        wiw.attribute(run, "noise")
+    with pytest.raises(ArgumentError, match=r"noise in .* has no failure to explain"):
+        wiw.blame(run, "noise")
     change(run, "UPDATE run SET wiw_version = '0.0.1'")
     with pytest.raises(StoreError, match=r"was begun by wiw 0\.0\.1"):
-        wiw.attribute(run, "liar")
+        wiw.blame(run, "liar")
     assert not (run / "blame").exists()
 
 
@@ -229,29 +232,29 @@ def test_a_scene_that_is_gone_and_objects_in_memory(two_rooms: str, tmp_path: Pa
     evaluate(task, AgentRecipe(part("Spinner")), 1, out=tmp_path / "run", progress=False).close()
     scene.unlink()
     with pytest.raises(FileError, match=r"rooms\.obj"):
-        wiw.attribute(tmp_path / "run", progress=False)
+        wiw.blame(tmp_path / "run", progress=False)
     assert not (tmp_path / "run/blame").exists()
     run_arms(LineTask(budget=1), {"none": LineAgent(0.0)}, 1, out=tmp_path / "memory", progress=False).close()
     with pytest.raises(StoreError, match="objects in memory"):
-        wiw.attribute(tmp_path / "memory")
+        wiw.blame(tmp_path / "memory")
 
 
 def test_a_task_must_say_what_progress_is(tmp_path: Path) -> None:
     fake = f"{Path(__file__).with_name('fakes.py')}:line_task"
     task = TaskRecipe(fake, {})
     evaluate(task, AgentRecipe("heuristic", horizon=1), 6, out=tmp_path / "run", progress=False).close()
-    with pytest.raises(ArgumentError, match="does not say what a plan is truly worth"):
-        wiw.attribute(tmp_path / "run")
+    with pytest.raises(ArgumentError, match="does not define the true value of a plan"):
+        wiw.blame(tmp_path / "run")
 
 
 def test_another_run_in_the_same_folder_and_resume(run: Path) -> None:
-    wiw.attribute(run, "spinner", episodes=1, progress=False)
+    wiw.blame(run, "spinner", episodes=1, progress=False)
     with pytest.raises(StoreError, match="wiw blame"):
         resume_run(run / "blame")
     change(run, "UPDATE run SET created = '2001-01-01T00:00:00+00:00'")
     assert wiw.load_run(run).blame() == []
     with pytest.raises(StoreError, match="attributes"):
-        wiw.attribute(run, "spinner")
+        wiw.blame(run, "spinner")
 
 
 def test_an_agent_that_has_changed_is_refused(run: Path) -> None:
@@ -259,11 +262,11 @@ def test_an_agent_that_has_changed_is_refused(run: Path) -> None:
     info["built"]["spinner"]["horizon"] = 99
     change(run, "UPDATE run SET info = ?", json.dumps(info))
     with pytest.raises(StoreError, match=r"horizon: the run has 99, now 5"):
-        wiw.attribute(run, "spinner", progress=False)
+        wiw.blame(run, "spinner", progress=False)
 
 
 def test_the_summary_reads_well(blamed: Any) -> None:
     assert "noise: " in str(blamed) and "scoring" in str(blamed)
     with pytest.raises(KeyError, match="were"):
         blamed["nobody"]
-    assert np.isfinite(blamed["noise"].mended["all"].low)
+    assert np.isfinite(blamed["noise"].recovery["all"].low)

@@ -72,7 +72,7 @@ def test_list_names_everything_with_a_line(capsys):
         "imagenav",
         "spl",
         "wiw.world_models",
-        "Predicts that every future frame",
+        "predicts that every",
     ):
         assert name in shown
 
@@ -97,12 +97,14 @@ def test_report_and_resume_of_a_finished_run(tmp_path, capsys):
     assert list(load_run(tmp_path / "run").episodes) == before
 
 
-def test_failed_episodes_are_said_aloud_and_can_be_retried(tmp_path, capsys):
+def test_errors_are_printed_and_can_be_retried(tmp_path, capsys):
     assert run("--scenes", "broken", "--episodes", 3, "--out", tmp_path / "run", "--no-report") == 1
     shown = capsys.readouterr()
-    assert "1 episode failed for infrastructure" in shown.err
+    assert "1 infrastructure error, excluded from scores" in shown.err
     assert "INVALID RUN" in shown.out and "2/3" in shown.out
-    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 1
+    assert main(["resume", str(tmp_path / "run"), "--retry-errors", "--no-report"]) == 1
+    assert "no such scene" in capsys.readouterr().err
+    assert main(["resume", str(tmp_path / "run"), "--retry-failed", "--no-report"]) == 1  # the old name
     assert "no such scene" in capsys.readouterr().err
 
 
@@ -404,7 +406,7 @@ def test_each_task_names_the_policy_that_runs_it():
 
     found = [default_policy(name) for name in ("imagenav", "ar", "manipulation")]
     assert found == ["matcher", "recogniser", "scripted"]
-    named = [name for name in TASKS.names() if hasattr(TASKS.find(name), "default_policy")]
+    named = [name for name in TASKS.names() if TASKS.find(name).default_policy]
     assert {default_policy(name) for name in named} <= set(POLICIES.names())
     with pytest.raises(ArgumentError, match="names no default"):
         default_policy(f"{Path(__file__).parent / 'fakes.py'}:LineTask")
@@ -447,7 +449,7 @@ def test_a_model_that_calls_exit_ends_no_command(tmp_path, two_rooms, short, cap
         return code, capsys.readouterr().err
 
     code, said = ends("Quits")
-    assert code == 1 and "1 episode failed for infrastructure" in said and "SystemExit(0)" in said
+    assert code == 1 and "1 infrastructure error, excluded from scores" in said and "SystemExit(0)" in said
     code, said = ends("Unmade")
     assert code == 2 and "cannot be made: SystemExit: 0 (leaving.py, line 17)" in said and "Traceback" not in said
     code, said = ends("Endless", "--deadline", "0.2")

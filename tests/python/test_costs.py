@@ -42,7 +42,7 @@ def log(two_rooms, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(attempts, "PAUSES", (0.0, 0.0))
         cache = tmp_path_factory.mktemp("cache")
-        agent = wiw.Agent("heuristic", Counted(), revision="matcher", candidates=3)
+        agent = wiw.Agent("heuristic", Counted(), reviser="matcher", candidates=3)
         agents = {"none": wiw.Agent("heuristic"), "asked": agent, "cached": agent}
         task = wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
         options = {"progress": False, "live": 2, "cache": cache}
@@ -88,14 +88,14 @@ class Moody(wiw.WorldModel):
 def test_what_failed_attempts_took_is_booked_apart(two_rooms, tmp_path, monkeypatch, capsys, live) -> None:
     monkeypatch.setattr("wiw.loop.attempts.PAUSES", (0.0, 0.0))
     model, task = Moody(), wiw.make("ImageNav-v0", scenes=two_rooms, decisions=2)
-    agent = wiw.Agent("heuristic", model, revision="matcher", candidates=3)
+    agent = wiw.Agent("heuristic", model, reviser="matcher", candidates=3)
 
     def run(**options):
         log = wiw.evaluate(task, agent, 3, out=tmp_path / "run", progress=False, live=live, **options)
         (line,) = log.costs()
         assert line["spent_calls"] + line["lost_calls"] == pytest.approx(len(model._asked))
         assert line["spent_rows"] + line["lost_rows"] == pytest.approx(sum(model._asked))
-        return line, [row["episode"] for row in log.episodes if row["status"] == "failed"]
+        return line, [row["episode"] for row in log.episodes if row["status"] == "error"]
 
     line, failed = run()
     assert len(failed) == (live == 1)  # more at a time: each is run again by itself
@@ -131,7 +131,7 @@ def test_tokens_of_a_policy_are_counted(two_rooms, tmp_path) -> None:
 def test_table_and_report_show_the_ledger(log, capsys) -> None:
     assert main(["report", str(log.path)]) == 0
     shown = capsys.readouterr().out
-    assert "Costs, an episode" in shown and "rollouts / success" in shown and "100 %" in shown
+    assert "Costs per episode" in shown and "rollouts / success" in shown and "100 %" in shown
     assert "lost calls" not in shown
     page = (log.path / "report.html").read_text()
     assert '<section id="costs">' in page and "rollouts / success" in page

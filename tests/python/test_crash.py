@@ -74,7 +74,7 @@ def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference,
                 whole_time *= 0.9  # the machine has become faster
                 break
             kills, here = kills + 1, here + 1
-            kept = whole(out) if RunStore.begun(out) else set()
+            kept = whole(out) if RunStore.exists(out) else set()
             told = {(a, int(e)) for a, e in map(str.split, reported.read_text().splitlines())} if kept else set()
             assert told <= kept
             left = max(0.15, 1 - len(kept) / (2 * EPISODES))
@@ -135,7 +135,7 @@ def test_a_full_disk_at_each_write_in_turn_is_said_and_mended(victims, tmp_path)
         if victims.run("evaluate", out, **small, most_bytes=limit) == 0:
             break
         assert victims.said.startswith("StoreError: ") and str(out) in victims.said and "make room" in victims.said
-        if RunStore.begun(out):
+        if RunStore.exists(out):
             told.add(len(whole(out)))
         assert victims.run("evaluate", out, **small) == 0
         assert facts(out) == expected
@@ -257,4 +257,4 @@ def test_sigterm_ends_a_run_within_5_seconds_whatever_it_is_doing(tmp_path):
     _, shown = process.communicate(timeout=30)
     assert process.returncode == 75 and time.monotonic() - begin < 5.5, shown
     assert "wiw resume" in shown and "Traceback" not in shown
-    assert whole(out) == set() and RunStore.begun(out)
+    assert whole(out) == set() and RunStore.exists(out)

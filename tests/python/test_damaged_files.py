@@ -25,7 +25,7 @@ from wiw import scenes
 from wiw.errors import Error, FileError, InfrastructureError
 from wiw.physics import Articulation, read_surface
 from wiw.scenes import child, isolated
-from wiw.tabletop.robot import robot_of
+from wiw.tabletop.robot import load_robot
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 TWO = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
@@ -227,7 +227,7 @@ def test_a_robot_that_ends_its_reader_is_an_error_here(tmp_path: Path, monkeypat
     fake.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(fake))
     with pytest.raises(FileError, match=r"robot\.urdf: the importer crashed on it with SIGSEGV"):
-        robot_of(robot)
+        load_robot(robot)
 
 
 def test_a_robot_from_another_process_is_the_same_to_the_last_bit(tmp_path: Path) -> None:
@@ -240,7 +240,7 @@ def test_a_robot_from_another_process_is_the_same_to_the_last_bit(tmp_path: Path
     end = "</joint>\n</robot>"
     mimic = '<mimic joint="panda_finger_joint1" multiplier="0.9" offset="0.001"/>'
     robot.write_text(text.strip().removesuffix(end) + mimic + end)
-    here, there = Articulation(robot), robot_of(robot).description
+    here, there = Articulation(robot), load_robot(robot).description
     assert here.to_parts() == there.to_parts() == json.loads(json.dumps(here.to_parts()))
     assert "panda_finger_joint1" in [joint["mimics"] for joint in there.tree]
     assert list(map(str, there.meshes)) == [str(tmp_path / "cube.obj")]

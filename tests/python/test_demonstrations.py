@@ -30,13 +30,13 @@ from wiw.datasets.demonstrations import (
     shard_range,
 )
 from wiw.errors import ArgumentError, DependencyError, FileError, InfrastructureError
-from wiw.tabletop.kind import above
-from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.base import make_action
 from wiw.tabletop.slide_block import SlideBlock
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE
 from wiw.tasks.manipulation import Manipulation
-from wiw.training import demonstrate
-from wiw.training.demonstrate import FIRST_SEED, end_frames, table_seed
+from wiw.training import recording
+from wiw.training.recording import FIRST_SEED, choose_end_frames, table_seed
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="needs wiw[export]")
 
@@ -63,24 +63,24 @@ def contents(folder: Path) -> dict[str, bytes]:
 def test_a_demonstration_is_what_happens_at_its_table(collected: Path, task: str) -> None:
     """Going to its actions again, one after another, leads through its key frames to the last bit."""
     (each,) = Demonstrations(collected, task)
-    kind = KINDS[task]
-    setup = kind.setup(each.seed, each.variation)
-    bench = setup.bench("cpu")
+    kind = TABLETOP_TASKS[task]
+    setup = kind.create_setup(each.seed, each.variation)
+    bench = setup.build_workbench("cpu")
     assert each.task == task and each.instruction == setup.instruction and each.success
-    for name, pose in bench.places(setup.objects).items():
+    for name, pose in bench.get_poses(setup.objects).items():
         np.testing.assert_array_equal(each.places[name], pose)
     frames = [0, *np.flatnonzero(each.ended)]
     assert frames[-1] == len(each) - 1 == 15
     for number, frame in enumerate(frames):
         if number:
-            bench.go(each.actions[frame])
+            bench.move_to(each.actions[frame])
         assert each.keys[frame] == number
         np.testing.assert_array_equal(each.poses[frame], bench.pose)
-        seen = bench.picture("front", (64, 64), ("color", "depth"))
+        seen = bench.render_view("front", (64, 64), ("color", "depth"))
         np.testing.assert_array_equal(each.images[frame], seen["color"])
         assert each.depths is not None
         np.testing.assert_allclose(each.depths[frame], seen["depth"], atol=0.51 / DEPTH_UNITS)
-    assert kind.succeeded(bench, setup)
+    assert kind.is_success(bench, setup)
 
 
 def test_frames_are_spread_over_its_time(collected: Path) -> None:
@@ -165,7 +165,7 @@ def made_up(rng: np.random.Generator, frames: int, episode: int, depth: bool, ki
 @given(st.lists(st.integers(0, 900), min_size=1, max_size=15), st.integers(16, 200))
 def test_each_action_ends_in_a_frame_of_its_own(lengths: list[int], frames: int) -> None:
     ends = np.cumsum([0, *lengths])
-    at = end_frames(ends, frames)
+    at = choose_end_frames(ends, frames)
     assert at[0] == 0 and at[-1] == frames - 1 and (np.diff(at) >= 1).all()
     if ends[-1] and min(lengths) > 3 * ends[-1] / frames:
         assert np.abs(at - ends / ends[-1] * (frames - 1)).max() <= 0.5
@@ -188,20 +188,20 @@ class _Clumsy(SlideBlock):
 
     clumsy = False
 
-    def setup(self, seed: int, variation: int) -> Any:
+    def create_setup(self, seed: int, variation: int) -> Any:
         self.clumsy = seed % 2 == 0
-        return super().setup(seed, variation)
+        return super().create_setup(seed, variation)
 
-    def expert(self, places: Any, target: Any) -> Any:
-        return np.array([above(0.15, 0.0, 0.45 if self.clumsy else 0.3, 1.0)])
+    def plan_expert(self, places: Any, target: Any) -> Any:
+        return np.array([make_action(0.15, 0.0, 0.45 if self.clumsy else 0.3, 1.0)])
 
-    def succeeded(self, bench: Any, setup: Any) -> bool:
+    def is_success(self, bench: Any, setup: Any) -> bool:
         return bool(bench.pose[2] < TABLE + 0.35)
 
 
 def test_failures_are_counted_and_kept_where_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(KINDS, "slide_block", _Clumsy())
-    monkeypatch.setattr(demonstrate, "POSES", 2)
+    monkeypatch.setitem(TABLETOP_TASKS, "slide_block", _Clumsy())
+    monkeypatch.setattr(recording, "POSES", 2)
     asked = {**SMALL, "episodes": 4}
     kept = wiw.collect(tmp_path / "kept", "slide_block", **asked)
     assert len(kept) == 4 and all(each.success and each.seed % 2 for each in kept)
@@ -211,7 +211,7 @@ def test_failures_are_counted_and_kept_where_asked(tmp_path: Path, monkeypatch: 
     assert [each.seed for each in every] == [table_seed(5, episode, 0) for episode in range(4)]
     assert [each.success for each in every] == [attempt == 0 for attempt in attempts]
     assert every.failed == {"slide_block": sum(not each.success for each in every)}
-    monkeypatch.setattr(demonstrate, "ATTEMPTS", 1)
+    monkeypatch.setattr(recording, "ATTEMPTS", 1)
     with pytest.raises(InfrastructureError, match="slide_block failed at 1 tables in a row"):
         wiw.collect(tmp_path / "none", "slide_block", **asked)
 

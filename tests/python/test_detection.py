@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from wiw.errors import ArgumentError, ContractError, RemoteError
-from wiw.perception.boxes import box_of
-from wiw.perception.detection import Detections, Detector, overlaps, without_duplicates
+from wiw.perception.boxes import find_box
+from wiw.perception.detection import Detections, Detector, compute_iou, suppress_duplicates
 from wiw.perception.segmentation import Segmenter
-from wiw.perception.semantics import CATEGORIES, OTHER, TrueSemantics, category_id
-from wiw.perception.simulator import categories_of
+from wiw.perception.semantics import CATEGORIES, OTHER_CATEGORY, TrueSemantics, find_category_id
+from wiw.perception.simulator import read_categories
 from wiw.registry import DETECTORS, SEGMENTERS, SEMANTICS
 
 IMAGES = np.zeros((2, 20, 30, 3), np.uint8)
@@ -82,10 +82,10 @@ def test_questions_are_checked(images: Any, names: Any, message: str) -> None:
 def test_duplicates_go_within_a_name_only() -> None:
     boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 8], [0, 0, 10, 9], [20, 0, 30, 10]], np.float32)
     found = Detections(boxes, np.array([0.5, 0.9, 0.7, 0.1], np.float32), ("a", "a", "b", "a"))
-    assert without_duplicates(found, 0.5).take(np.arange(3)).labels == ("a", "b", "a")
-    np.testing.assert_allclose(without_duplicates(found, 0.5).scores, [0.9, 0.7, 0.1])
-    assert len(without_duplicates(found, 0.8)) == 4
-    np.testing.assert_allclose(overlaps(boxes[0], boxes), [1, 0.8, 0.9, 0])
+    assert suppress_duplicates(found, 0.5).take(np.arange(3)).labels == ("a", "b", "a")
+    np.testing.assert_allclose(suppress_duplicates(found, 0.5).scores, [0.9, 0.7, 0.1])
+    assert len(suppress_duplicates(found, 0.8)) == 4
+    np.testing.assert_allclose(compute_iou(boxes[0], boxes), [1, 0.8, 0.9, 0])
 
 
 def test_the_simulator_finds_what_is_visible() -> None:
@@ -118,7 +118,7 @@ def test_the_simulator_fills_boxes() -> None:
 
 def test_masks_of_another_shape_break_the_contract() -> None:
     class Flat(Segmenter):
-        def masks(self, images: Any, boxes: Any, ids: Any) -> Any:
+        def predict_masks(self, images: Any, boxes: Any, ids: Any) -> Any:
             return [np.zeros((len(given), 3, 3), bool) for given in boxes]
 
     with pytest.raises(ContractError, match=r"Flat: expected masks bool \[\(1, 20, 30\)\]"):
@@ -137,7 +137,7 @@ def test_truth_of_a_rendered_scene_agrees_with_itself() -> None:
     ]
     scene = Scene.from_arrays(meshes)
     shown = Renderer(scene, "cpu").perspective(np.eye(4), (40, 60), 90.0, ("color", "instance"))
-    categories = categories_of(scene)
+    categories = read_categories(scene)
     (found,) = DETECTORS.make("simulator", categories=categories).detect(
         shown["color"], ["bed", "chair"], ids=shown["instance"]
     )
@@ -147,25 +147,25 @@ def test_truth_of_a_rendered_scene_agrees_with_itself() -> None:
         False: "bed",
     }
     for box, mask in zip(found.boxes, masks, strict=True):
-        assert box_of(mask) == tuple(box)
-    true = SEMANTICS.make("simulator", categories=categories).panoramas(shown["color"], ids=shown["instance"])
+        assert find_box(mask) == tuple(box)
+    true = SEMANTICS.make("simulator", categories=categories).label_panoramas(shown["color"], ids=shown["instance"])
     assert set(np.unique(true)) == {0, CATEGORIES.index("chair"), CATEGORIES.index("bed")}
 
 
 def test_words_become_categories() -> None:
-    assert [category_id(word) for word in ("wall", "TV_monitor", "couch", "fridge", "unicorn")] == [
+    assert [find_category_id(word) for word in ("wall", "TV_monitor", "couch", "fridge", "unicorn")] == [
         1,
         22,
         10,
         37,
-        OTHER,
+        OTHER_CATEGORY,
     ]
     assert (len(CATEGORIES), CATEGORIES[16], CATEGORIES[40]) == (41, "stairs", "misc")
     ids = np.array([[[0, 5], [7, 9]]], np.uint32)
-    found = TrueSemantics({5: "sofa", 7: "unicorn"}).panoramas(np.zeros((1, 2, 2, 3), np.uint8), ids=ids)
-    np.testing.assert_array_equal(found, [[[0, 10], [OTHER, OTHER]]])
+    found = TrueSemantics({5: "sofa", 7: "unicorn"}).label_panoramas(np.zeros((1, 2, 2, 3), np.uint8), ids=ids)
+    np.testing.assert_array_equal(found, [[[0, 10], [OTHER_CATEGORY, OTHER_CATEGORY]]])
     with pytest.raises(ArgumentError, match="expected ids"):
-        TrueSemantics({}).panoramas(np.zeros((1, 2, 2, 3), np.uint8))
+        TrueSemantics({}).label_panoramas(np.zeros((1, 2, 2, 3), np.uint8))
 
 
 FAKE = """

@@ -113,7 +113,10 @@ def test_grounding_dino_scores_names_by_their_surest_token(folders: dict[str, Pa
 def test_more_names_than_a_text_holds_are_asked_in_several(folders: dict[str, Path]) -> None:
     """The text of the tiny network has room for 14 tokens: two names of five letters, with their full stops."""
     asked = detector(folders, "grounding-dino")
-    assert [list(text) for text in asked._texts(["chair", "table", "house"])] == [["chair", "table"], ["house"]]
+    assert [list(text) for text in asked._split_into_texts(["chair", "table", "house"])] == [
+        ["chair", "table"],
+        ["house"],
+    ]
     (whole,) = asked.detect(images()[:1], ["chair", "table", "house"])
     parts = [asked.detect(images()[:1], names)[0] for names in (["chair", "table"], ["house"])]
     np.testing.assert_allclose(

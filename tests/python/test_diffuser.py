@@ -23,26 +23,26 @@ from wiw.datasets.demonstrations import Demonstration
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.policies.base import Situation
 from wiw.policies.diffuser import paths
-from wiw.policies.diffuser.sight import CELL, NOWHERE, WORKSPACE, Lens
-from wiw.tabletop.kinds import KINDS
+from wiw.policies.diffuser.workspace import CELL, NOWHERE, WORKSPACE, PinholeCamera
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE
-from wiw.training.demonstrate import Collection, demonstrated
+from wiw.training.recording import Collection, record_demonstration
 from wiw.types import ArmObservation, Goal, Key
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.policies.diffuser import Diffuser  # noqa: E402
-from wiw.policies.diffuser.attention import LONGEST, SHORTEST, UNIT, RelativeAttention  # noqa: E402
-from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised, sampled  # noqa: E402
-from wiw.policies.diffuser.network import Network, Scene, Shape  # noqa: E402
+from wiw.policies.diffuser.attention import LONGEST_WAVE, OFFSET_UNIT, SHORTEST_WAVE, RelativeAttention  # noqa: E402
+from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise, sample_ddim  # noqa: E402
+from wiw.policies.diffuser.network import EncodedScene, Network, Shape  # noqa: E402
 from wiw.policies.diffuser.weights import load, save  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
-from wiw.training.diffuser import Moments, Recipe, moments, train  # noqa: E402
+from wiw.training.diffuser import Recipe, Samples, extract_samples, train  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 SMALL = Shape(width=24, heads=2, layers=2)
-LENS = Lens.of(CAMERAS["front"], (480, 480))
+LENS = PinholeCamera.from_camera(CAMERAS["front"], (480, 480))
 HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
 
 
@@ -50,18 +50,19 @@ HERE = np.array([0.0, 0.05, 1.2, np.pi, 0.0, 0.1, 1.0])
 def shown() -> list[Demonstration]:
     """A block slid, and a ring put on a peg."""
     return [
-        demonstrated(KINDS[name], 3, Collection(frames=16, depth=True))[0] for name in ("slide_block", "insert_peg")
+        record_demonstration(TABLETOP_TASKS[name], 3, Collection(frames=16, depth=True))[0]
+        for name in ("slide_block", "insert_peg")
     ]
 
 
 @pytest.fixture(scope="module")
-def seen(shown: list[Demonstration]) -> Moments:
-    return moments(shown, LENS)
+def seen(shown: list[Demonstration]) -> Samples:
+    return extract_samples(shown, LENS)
 
 
 def untrained(seed: int = 0) -> Diffuser:
     torch.manual_seed(seed)
-    return Diffuser.of(Network(SMALL), steps=4)
+    return Diffuser.from_network(Network(SMALL), steps=4)
 
 
 def situation(each: Demonstration, key: Key, imagines: bool = True) -> Situation:
@@ -74,43 +75,43 @@ def situation(each: Demonstration, key: Key, imagines: bool = True) -> Situation
 
 def test_points_are_where_the_renderer_has_them() -> None:
     """The pixels of a square that lies on the table, by its id, against where it was put; and back into the picture."""
-    setup = KINDS["slide_block"].setup(1, 0)
-    bench = setup.bench()
-    picture = bench.picture("front", (480, 480), ("depth", "instance"))
-    points = LENS.points(picture["depth"])
+    setup = TABLETOP_TASKS["slide_block"].create_setup(1, 0)
+    bench = setup.build_workbench()
+    picture = bench.render_view("front", (480, 480), ("depth", "instance"))
+    points = LENS.unproject(picture["depth"])
     for name in ("green", "blue"):
-        ids = [number for number, other in enumerate(bench.names, 1) if other == name]
+        ids = [number for number, other in enumerate(bench.instance_names, 1) if other == name]
         found = points[np.isin(picture["instance"], ids)]
         assert len(found) > 100
         np.testing.assert_allclose(
-            (found[:, :2].min(0) + found[:, :2].max(0)) / 2, bench.place_of(name)[:2, 3], atol=4e-3
+            (found[:, :2].min(0) + found[:, :2].max(0)) / 2, bench.get_pose(name)[:2, 3], atol=4e-3
         )
         np.testing.assert_allclose(found[:, 2], TABLE + 0.002, atol=2e-3)
     rows, columns = np.nonzero(points[..., 2] > 0)
-    back = CAMERAS["front"].pixels_of(points[rows, columns], (480, 480))
+    back = CAMERAS["front"].project_points(points[rows, columns], (480, 480))
     np.testing.assert_allclose(back, np.stack([columns, rows], axis=1) + 0.5, atol=1e-6)
 
 
 def test_the_window_shows_the_whole_workspace_and_knows_where_it_is() -> None:
-    rows, columns = LENS.window((480, 480))
+    rows, columns = LENS.find_window((480, 480))
     assert all(each.start % CELL == each.stop % CELL == 0 for each in (rows, columns))
     depth = np.full((480, 480), 0.9, np.float32)
     depth[:, :240] = 0
-    points = LENS.points(depth)
+    points = LENS.unproject(depth)
     outside = np.ones((480, 480), bool)
     outside[rows, columns] = False
     assert (points[outside] == NOWHERE).all() and (points[:, :240] == NOWHERE).all()
     assert ((points == NOWHERE) | ((points > WORKSPACE[0]) & (points < WORKSPACE[1]))).all()
     np.testing.assert_allclose(
-        LENS.within(rows, columns).points(depth[rows, columns]), points[rows, columns], atol=1e-9
+        LENS.crop(rows, columns).unproject(depth[rows, columns]), points[rows, columns], atol=1e-9
     )
-    sight = LENS.sight(np.zeros((480, 480, 3), np.uint8), depth)
-    np.testing.assert_allclose(sight.places, points[rows, columns][CELL // 2 :: CELL, CELL // 2 :: CELL], atol=1e-6)
-    assert sight.image.shape[:2] == sight.height.shape == tuple(CELL * side for side in sight.places.shape[:2])
+    view = LENS.view_workspace(np.zeros((480, 480, 3), np.uint8), depth)
+    np.testing.assert_allclose(view.places, points[rows, columns][CELL // 2 :: CELL, CELL // 2 :: CELL], atol=1e-6)
+    assert view.image.shape[:2] == view.height.shape == tuple(CELL * side for side in view.places.shape[:2])
     away = np.eye(4)
     away[2, 3] = 0.5
     with pytest.raises(ArgumentError, match="not in view"):
-        Lens(LENS.intrinsics, away).window((480, 480))
+        PinholeCamera(LENS.intrinsics, away).find_window((480, 480))
 
 
 # -- attention ---------------------------------------------------------------------------------------------------------
@@ -121,7 +122,11 @@ def slow_attention(layer: RelativeAttention, queries: Any, places: Any, context:
     heads, width = layer.heads, queries.shape[-1]
     size = width // heads
     count = size // 6
-    waves = SHORTEST * (LONGEST / SHORTEST) ** (1 - np.arange(count) / max(1, count - 1)) if count > 1 else [LONGEST]
+    waves = (
+        SHORTEST_WAVE * (LONGEST_WAVE / SHORTEST_WAVE) ** (1 - np.arange(count) / max(1, count - 1))
+        if count > 1
+        else [LONGEST_WAVE]
+    )
     query, key, value = (part(each).detach().numpy() for part, each in (
         (layer.query, queries), (layer.key, context), (layer.value, context)
     ))  # fmt: skip
@@ -143,7 +148,7 @@ def slow_attention(layer: RelativeAttention, queries: Any, places: Any, context:
             weights = np.exp(likeness / size**0.5)
             weights /= weights.sum()
             read.append(weights @ value[:, own])
-            off.append(weights @ (others - here) / UNIT)
+            off.append(weights @ (others - here) / OFFSET_UNIT)
         made.append(np.concatenate([np.concatenate([r, o]) for r, o in zip(read, off, strict=True)]))
     return layer.out(torch.tensor(np.array(made), dtype=torch.float32)).detach().numpy()
 
@@ -177,8 +182,10 @@ def test_what_is_denoised_moves_with_the_scene(shift: Any, level: int) -> None:
     there = path.clone()
     there[..., :3] += torch.tensor(shift) / paths.SCALE
     with torch.inference_mode():
-        found, gripper = network.denoise(Scene(tokens, places, hidden, hand), path, levels)
-        moved, gripper_there = network.denoise(Scene(tokens, places + torch.tensor(shift), hidden, hand), there, levels)
+        found, gripper = network.denoise(EncodedScene(tokens, places, hidden, hand), path, levels)
+        moved, gripper_there = network.denoise(
+            EncodedScene(tokens, places + torch.tensor(shift), hidden, hand), there, levels
+        )
     off = (moved - found)[..., :3] * paths.SCALE - torch.tensor(shift)
     assert off.abs().max() < 1e-4
     assert (moved - found)[..., 3:].abs().max() < 1e-3
@@ -189,21 +196,21 @@ def test_what_is_denoised_moves_with_the_scene(shift: Any, level: int) -> None:
 
 
 def test_noise_takes_all_and_can_be_taken_away() -> None:
-    assert (KEPT[1:] <= KEPT[:-1]).all()
-    assert KEPT[0].min() > 0.98 and KEPT[-1].max() < 0.02
+    assert (ALPHA_BARS[1:] <= ALPHA_BARS[:-1]).all()
+    assert ALPHA_BARS[0].min() > 0.98 and ALPHA_BARS[-1].max() < 0.02
     clean, noise = torch.randn(2, 5, 6, 9), torch.randn(2, 5, 6, 9)
-    spread = noised(torch.zeros(2000, 6, 9), torch.randn(2000, 6, 9), torch.full((2000,), 50)).std(dim=0)
-    np.testing.assert_allclose(spread, (1 - KEPT[50]).sqrt().expand(6, 9), rtol=0.1)
-    np.testing.assert_allclose(noised(clean, noise, torch.zeros(2, 5, dtype=torch.long)), clean, atol=0.7)
+    spread = add_noise(torch.zeros(2000, 6, 9), torch.randn(2000, 6, 9), torch.full((2000,), 50)).std(dim=0)
+    np.testing.assert_allclose(spread, (1 - ALPHA_BARS[50]).sqrt().expand(6, 9), rtol=0.1)
+    np.testing.assert_allclose(add_noise(clean, noise, torch.zeros(2, 5, dtype=torch.long)), clean, atol=0.7)
     asked: list[int] = []
 
     def denoise(now: Any, level: Any) -> Any:
         asked.append(int(level[0, 0]))
         return clean, torch.zeros(now.shape[:-1])
 
-    found, gripper = sampled(denoise, noise, 10)
+    found, gripper = sample_ddim(denoise, noise, 10)
     assert torch.equal(found, clean) and (gripper == 0.5).all()
-    assert asked[0] == STEPS - 1 and asked[-1] == 0 and asked == sorted(asked, reverse=True) and len(asked) == 10
+    assert asked[0] == NOISE_LEVELS - 1 and asked[-1] == 0 and asked == sorted(asked, reverse=True) and len(asked) == 10
 
 
 # -- paths -------------------------------------------------------------------------------------------------------------
@@ -225,25 +232,27 @@ def test_vectors_are_poses(poses: Any) -> None:
 
 def test_a_dense_path_leads_through_its_poses_and_is_thinned_to_them() -> None:
     """For each kind's expert; the gripper changes where it gets to, no sooner."""
-    for kind in KINDS.values():
-        setup = kind.setup(5, 1)
-        plan = kind.expert(setup.bench().places(setup.objects), setup.target)[:6]
-        path = paths.dense(HERE, plan, 50)
+    for kind in TABLETOP_TASKS.values():
+        setup = kind.create_setup(5, 1)
+        plan = kind.plan_expert(setup.build_workbench().get_poses(setup.objects), setup.target)[:6]
+        path = paths.densify_path(HERE, plan, 50)
         assert path.shape == (50, 7)
         ends = np.rint(50 * np.arange(1, len(plan) + 1) / len(plan)).astype(int) - 1
         np.testing.assert_allclose(path[ends][:, [0, 1, 2, 6]], plan[:, [0, 1, 2, 6]], atol=1e-9)
         before = np.r_[1.0, plan[:-1, 6]]
         for end, first, grip in zip(ends, np.r_[0, ends[:-1] + 1], before, strict=True):
             assert (path[first:end, 6] == grip).all()
-        thin = paths.thinned(HERE, path, 10)
+        thin = paths.thin_path(HERE, path, 10)
         assert len(thin) == 10
         between = [np.linalg.norm(thin - pose, axis=1).min() for pose in plan[plan[:, 6] != before]]
         assert max(between, default=0) < 1e-6  # where the gripper changes
-        np.testing.assert_array_equal(paths.thinned(HERE, path, 50), path)
-        assert len(paths.thinned(HERE, path, 1)) == 1
-        np.testing.assert_array_equal(paths.thinned(HERE, path, 1)[0], path[-1])
-    np.testing.assert_array_equal(paths.moving(HERE, np.stack([HERE, plan[0], plan[0], plan[0]])), plan[:1])
-    np.testing.assert_array_equal(paths.moving(HERE, HERE[None]), HERE[None])
+        np.testing.assert_array_equal(paths.thin_path(HERE, path, 50), path)
+        assert len(paths.thin_path(HERE, path, 1)) == 1
+        np.testing.assert_array_equal(paths.thin_path(HERE, path, 1)[0], path[-1])
+    np.testing.assert_array_equal(
+        paths.drop_repeated_poses(HERE, np.stack([HERE, plan[0], plan[0], plan[0]])), plan[:1]
+    )
+    np.testing.assert_array_equal(paths.drop_repeated_poses(HERE, HERE[None]), HERE[None])
 
 
 # -- the policy --------------------------------------------------------------------------------------------------------
@@ -293,41 +302,41 @@ def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstra
 # -- training ----------------------------------------------------------------------------------------------------------
 
 
-def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: Moments) -> None:
+def test_moments_are_the_beginnings_of_parts(shown: list[Demonstration], seen: Samples) -> None:
     assert len(seen) == 2 and seen.path.shape == (2, 6, 7)
-    setup = KINDS["slide_block"].setup(shown[0].seed, shown[0].variation)
-    plan = KINDS["slide_block"].expert(shown[0].places, setup.target)
+    setup = TABLETOP_TASKS["slide_block"].create_setup(shown[0].seed, shown[0].variation)
+    plan = TABLETOP_TASKS["slide_block"].plan_expert(shown[0].places, setup.target)
     np.testing.assert_allclose(seen.path[0][[0, 1, 2, 3, 5], :6], plan[[0, 1, 2, 3, 3], :6], atol=1e-6)
     np.testing.assert_array_equal(seen.pose[0], shown[0].poses[0])
-    rows, columns = LENS.window((480, 480))
-    np.testing.assert_array_equal(seen.sight.image[0], shown[0].images[0][rows, columns])
-    pushes, _ = demonstrated(KINDS["push_buttons"], 1, Collection(frames=16, depth=True))
-    two = moments([pushes], LENS)
+    rows, columns = LENS.find_window((480, 480))
+    np.testing.assert_array_equal(seen.view.image[0], shown[0].images[0][rows, columns])
+    pushes, _ = record_demonstration(TABLETOP_TASKS["push_buttons"], 1, Collection(frames=16, depth=True))
+    two = extract_samples([pushes], LENS)
     assert len(two) == 2
     np.testing.assert_allclose(two.path[:, 2:, :2], two.path[:, 1:2, :2].repeat(4, axis=1), atol=1e-9)
     np.testing.assert_allclose(two.path[:, 2, 2], two.path[:, 0, 2], atol=1e-9)  # up again, after the last push too
-    lit = two.sight.image[1].astype(int) - two.sight.image[0]
+    lit = two.view.image[1].astype(int) - two.view.image[0]
     assert np.abs(lit).max() > 60
     with pytest.raises(ArgumentError, match="--depth"):
-        moments([replace(shown[0], encoded_depths=None)], LENS)
+        extract_samples([replace(shown[0], encoded_depths=None)], LENS)
     with pytest.raises(ArgumentError, match="push_buttons"):
-        moments([replace(shown[0], task="juggle")], LENS)
+        extract_samples([replace(shown[0], task="juggle")], LENS)
     with pytest.raises(ArgumentError, match="got none"):
-        moments([], LENS)
+        extract_samples([], LENS)
 
 
-def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Moments) -> None:
+def test_it_learns_two_demonstrations_by_heart(shown: list[Demonstration], seen: Samples) -> None:
     recipe = Recipe(epochs=150, batch=2, levels=8, width=48, layers=2, tilt=0.0, rate=3e-3, average=0.97)
     network, _ = train(seen, recipe)
-    policy = Diffuser.of(network)
+    policy = Diffuser.from_network(network)
     for each, path in zip(shown, seen.path, strict=True):
-        stops = policy._stops(situation(each, Key(0, 0)), [1, 2, 3])
+        stops = policy._sample_poses(situation(each, Key(0, 0)), [1, 2, 3])
         off = np.linalg.norm(stops[..., :3] - path[:, :3], axis=-1)
         assert np.median(off) < 0.03
         assert (stops[..., 6] == path[:, 6]).mean() > 0.8
 
 
-def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_path: Path) -> None:
+def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Samples, tmp_path: Path) -> None:
     recipe = Recipe(epochs=3, batch=1, levels=2, width=24, layers=1)
     whole, _ = train(seen, recipe)
     file = tmp_path / "checkpoint"
@@ -337,17 +346,17 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(seen, recipe, show=stop, checkpoint=Checkpoint(file, {"a": 1}, seconds=0))
+        train(seen, recipe, on_step=stop, checkpoint=Checkpoint(file, {"a": 1}, seconds=0))
     steps: list[int] = []
-    on, _ = train(seen, recipe, show=lambda step, *_: steps.append(step), checkpoint=Checkpoint(file, {"a": 1}))
+    on, _ = train(seen, recipe, on_step=lambda step, *_: steps.append(step), checkpoint=Checkpoint(file, {"a": 1}))
     assert steps == [4, 5, 6]
     for name, value in whole.state_dict().items():
         assert torch.equal(value, on.state_dict()[name])
-    with pytest.raises(ArgumentError, match="another training"):
-        Checkpoint(file, {"a": 2}).stand()
+    with pytest.raises(ArgumentError, match="other data or options"):
+        Checkpoint(file, {"a": 2}).load()
     file.write_bytes(file.read_bytes()[:50])
     with pytest.raises(FileError, match="delete it"):
-        Checkpoint(file, {"a": 1}).stand()
+        Checkpoint(file, {"a": 1}).load()
     with pytest.raises(ArgumentError, match="epochs"):
         Recipe(epochs=0)
 
@@ -355,29 +364,29 @@ def test_training_that_was_stopped_goes_on_to_the_same_end(seen: Moments, tmp_pa
 class _Bytes:
     """What can be kept of a lesson: some numbers."""
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {"values": torch.arange(500.0)}
 
-    def restore(self, state: Any) -> None:
+    def load_state_dict(self, state: Any) -> None:
         pass
 
 
 def test_a_checkpoint_damaged_anyhow_is_told(tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
     checkpoint = Checkpoint(file, {"a": 1}, seconds=0)
-    checkpoint.keep(_Bytes(), 3, 2)
-    assert checkpoint.stand().step == 2
+    checkpoint.save_if_due(_Bytes(), 3, 2)
+    assert checkpoint.load().step == 2
     whole = file.read_bytes()
     rng = np.random.default_rng(0)
     for _ in range(300):
         at, bits = int(rng.integers(len(whole))), int(rng.integers(1, 256))
         file.write_bytes(whole[:at] + bytes([whole[at] ^ bits]) + whole[at + 1 :])
         with suppress(FileError, ArgumentError):
-            checkpoint.stand()
+            checkpoint.load()
     for data in (b"", b"PK", b"\x80\x02]q\x00.", b"\x80\x02X\x01\x00\x00\x00\xff.", whole[:900], rng.bytes(99)):
         file.write_bytes(data)
-        with pytest.raises(FileError, match="delete it to begin anew"):
-            checkpoint.stand()
+        with pytest.raises(FileError, match="delete it to start again"):
+            checkpoint.load()
 
 
 def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
@@ -386,7 +395,7 @@ def test_a_checkpoint_that_finds_no_room_says_so(tmp_path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, kept[1]))
     try:
         with pytest.raises(FileError, match="free space"):
-            Checkpoint(tmp_path / "checkpoint", {}, seconds=0).keep(_Bytes(), 3, 2)
+            Checkpoint(tmp_path / "checkpoint", {}, seconds=0).save_if_due(_Bytes(), 3, 2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, kept)
         signal.signal(signal.SIGXFSZ, handler)
@@ -399,14 +408,22 @@ def test_the_command_says_what_it_needs(tmp_path: Path, capsys: pytest.CaptureFi
     assert "--demonstrations" in capsys.readouterr().err
     assert main(["train", "warpnet", *out, "--demonstrations", str(tmp_path)]) == 2
     assert "leave it out" in capsys.readouterr().err
-    needless = {"scenes": "a.glb", "val": "a.glb", "categories": "bed", "places": "3", "plays": "3", "cache": "c"}
+    needless = {
+        "scenes": "a.glb",
+        "val": "a.glb",
+        "categories": "bed",
+        "places": "3",
+        "plays": "3",
+        "workers": "3",
+        "cache": "c",
+    }
     for flag, value in needless.items():
         assert main(["train", "diffuser", *out, f"--{flag}", value, "--demonstrations", str(tmp_path)]) == 2
         assert f"--{flag}: diffuser " in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["train", "--help"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "armnet or diffuser" in said and "for a night" in said
+    assert "armnet or diffuser" in said and "takes a night" in said
 
 
 def test_the_command_wants_views_as_it_will_see_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

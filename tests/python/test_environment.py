@@ -14,7 +14,6 @@ import wiw.tasks.navigation
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets import episodes as episode_files
 from wiw.datasets.imagenav import camera_pose, ideal_primitives
-from wiw.envs.trip import PRIMITIVES
 from wiw.errors import ArgumentError
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import Episode
@@ -79,7 +78,7 @@ def test_walls_stop_or_deflect(two_rooms: str, motion: str) -> None:
     env.run([FORWARD] * 12)
     position = env.truth().position
     assert position[2] < 2.0
-    path = np.stack(env.trip.positions)
+    path = np.stack(env.state.positions)
     refused = (np.linalg.norm(np.diff(path, axis=0), axis=1) == 0).any()
     assert refused == (motion == "refuse")
 
@@ -128,7 +127,7 @@ def test_the_budget_truncates(env) -> None:
 
 def test_stop_ends_the_episode(env) -> None:
     env.reset(options={"episode": 0})
-    _, reward, terminated, _, info = env.step(PRIMITIVES.index(STOP))
+    _, reward, terminated, _, info = env.step(STOP)
     assert terminated and reward == 0 and info["result"]["success"] == 0
 
 
@@ -235,7 +234,7 @@ def test_every_step_names_the_next_decision(two_rooms: str) -> None:
     _, info = env.reset(options={"episode": 2})
     keys = [info["key"]]
     for _ in range(3):
-        keys.append(env.step(1)[-1]["key"])
+        keys.append(env.step(TURN_LEFT)[-1]["key"])
     assert [(key.episode, key.decision) for key in keys] == [(2, 0), (2, 1), (2, 2), (2, 3)]
 
 
@@ -258,7 +257,7 @@ def test_episodes_are_counted_round(two_rooms: str, tmp_path: Path) -> None:
     file = tmp_path / "three.json"
     episode_files.save(file, task.episodes(3), "imagenav")
     env = wiw.make("ImageNav-v0", episode_file=file)
-    assert env.unwrapped.task.size == 3 and task.size is None
+    assert env.unwrapped.task.episode_count == 3 and task.episode_count is None
     episodes = [env.reset(seed=seed)[1]["key"].episode for seed in range(8)]
     assert set(episodes) <= {0, 1, 2} and len(set(episodes)) > 1
     env.reset(options={"episode": 2})

@@ -14,7 +14,10 @@ from hypothesis import strategies as st
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.loop.fidelity import rank_agreement
+from wiw.experiments.fidelity import FidelityObserver, rank_agreement
+from wiw.experiments.gating import Gated
+from wiw.experiments.ground_truth import TruePlans, TrueScores
+from wiw.experiments.placebos import ShuffledPlacebo
 from wiw.loop.scheduler import run_episodes
 from wiw.tasks.imagenav import ImageNav
 
@@ -44,7 +47,7 @@ def decisions(two_rooms: str, agent: wiw.Agent, decisions: int = 2, live: int = 
 
 
 def test_the_oracle_is_wholly_true(two_rooms: str) -> None:
-    for decision in decisions(two_rooms, wiw.Agent("matcher", "oracle", fidelity=True)):
+    for decision in decisions(two_rooms, wiw.Agent("matcher", "oracle", observers=[FidelityObserver()])):
         truth = decision.fidelity
         np.testing.assert_allclose(truth.scores, decision.scores)
         assert truth.regret(decision.chosen) == 0 and (math.isnan(truth.rank) or truth.rank == 1)
@@ -58,7 +61,7 @@ def test_measuring_changes_no_decision_and_the_better_model_is_truer(two_rooms: 
     means = {}
     for model in ("copy", "warp"):
         plain = decisions(two_rooms, wiw.Agent("matcher", model))
-        measured = decisions(two_rooms, wiw.Agent("matcher", model, fidelity=True))
+        measured = decisions(two_rooms, wiw.Agent("matcher", model, observers=[FidelityObserver()]))
         assert all(decision.fidelity is None for decision in plain)
         for one, other in zip(plain, measured, strict=True):
             np.testing.assert_array_equal(one.scores, other.scores)
@@ -69,16 +72,34 @@ def test_measuring_changes_no_decision_and_the_better_model_is_truer(two_rooms: 
     assert means["warp"] > means["copy"] + 3
 
 
-def test_without_a_model_or_a_simulator() -> None:
-    assert "simulator" not in wiw.Agent("matcher", fidelity=True).needs
-    agent = wiw.Agent("matcher", "copy", fidelity=True)
-    assert "simulator" in agent.needs
+def test_what_is_replayed_are_the_plans_themselves_whatever_the_model_is_asked(two_rooms: str) -> None:
+    """A model that is asked for other plans, or not asked, and policies that are given the truth."""
+    model = Gated(ShuffledPlacebo(wiw.world_model("oracle")), 0.4)
+    policy = wiw.policy("matcher")
+    agent = wiw.Agent(TruePlans(policy), model, reviser=TrueScores(policy), observers=[FidelityObserver()])
+    found = decisions(two_rooms, agent, decisions=3)
+    imagined = [decision for decision in found if decision.rollouts is not None]
+    assert 0 < len(imagined) < len(found)
+    assert all(decision.fidelity is None for decision in found if decision.rollouts is None)
+    errors = np.concatenate([decision.fidelity.psnr for decision in imagined])
+    assert np.nanmin(errors) < 40
+    for decision in imagined:
+        assert [len(true.frames) for true in decision.fidelity.rollouts] == [len(p.actions) for p in decision.proposals]
+
+
+def test_nothing_is_measured_without_a_model(two_rooms: str) -> None:
+    found = decisions(two_rooms, wiw.Agent("matcher", observers=[FidelityObserver()]))
+    assert found and all(decision.fidelity is None and "replay" not in decision.seconds for decision in found)
+
+
+def test_without_a_simulator() -> None:
+    agent = wiw.Agent("matcher", "copy", observers=[FidelityObserver()])
     image = wiw.types.Observation(
         np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), np.zeros(3),
         np.ones((576, 1024), np.float32),
     )  # fmt: skip
     goal = wiw.types.Goal("imagenav", image=np.zeros((480, 480, 3), np.uint8))
-    with pytest.raises(ArgumentError, match="simulator"):
+    with pytest.raises(ArgumentError, match=r"simulator .*fidelity"):
         agent.decide(image, goal, wiw.types.Key(0, 0))
 
 
@@ -104,7 +125,7 @@ def test_a_run_keeps_it_and_reports_it(two_rooms: str, tmp_path: Path) -> None:
     assert len(row["fidelity"]["scores"]) == len(row["proposals"]) and row["seconds"]["replay"] > 0
     assert {"true/0", "imagined/0"} <= set(log.store.images("copy", row["episode"], row["decision"]))
     page = log.report().read_text()
-    assert "How true was imagination?" in page
-    assert "How true" not in wiw.evaluate(
+    assert 'id="fidelity"' in page
+    assert 'id="fidelity"' not in wiw.evaluate(
         task, wiw.Agent("matcher", "copy"), 1, out=tmp_path / "plain", progress=False
     ).report().read_text()  # fmt: skip

@@ -13,8 +13,9 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.loop.agent import Query
-from wiw.loop.attempts import TRIES
+from wiw.loop.attempts import TRIES, Attempted
+from wiw.loop.config import AgentConfig
+from wiw.loop.memory import Query
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.base import FrameSpec
 from wiw.runs.rows import decision_row
@@ -155,7 +156,7 @@ def test_without_a_model_the_policy_takes_its_own_best(task: ImageNav) -> None:
 def test_an_observation_without_the_depth_that_is_needed_is_named(task: ImageNav) -> None:
     env = task.environment()
     observation, info = env.reset()
-    for agent in (wiw.Agent("matcher"), wiw.Agent("heuristic", "warp", revision="matcher")):
+    for agent in (wiw.Agent("matcher"), wiw.Agent("heuristic", "warp", reviser="matcher")):
         with pytest.raises(ArgumentError, match="make the environment with depth=True"):
             agent.decide(observation, env.goal, key=info["key"])
 
@@ -170,9 +171,9 @@ def test_a_failing_model_is_infrastructure_and_the_rest_goes_on(task: ImageNav) 
                 raise ConnectionError("server is gone")
             return super().rollout(observations, controls, seeds)
 
-    recorder = run(task, wiw.Agent(Greedy(), Flaky()), count=3, live=1)
+    recorder = run(task, wiw.Agent(Greedy(), Attempted(Flaky())), count=3, live=1)
     states = {i: r.status for i, r in recorder.results.items()}
-    assert states == {0: "failed", 1: "done", 2: "done"}
+    assert states == {0: "error", 1: "done", 2: "done"}
     assert "server is gone" in recorder.results[0].error and not recorder.results[0].metrics
     assert recorder.results[0].kind == "world_model/raised"
 
@@ -188,9 +189,9 @@ def test_a_model_that_hangs_fails_its_episode_and_the_rest_goes_on(task: ImageNa
                 release.wait(60)
             return super().rollout(observations, controls, seeds)
 
-    recorder = run(task, wiw.Agent(Greedy(), Stuck(), deadline=0.6), count=3, live=3)
+    recorder = run(task, wiw.Agent(Greedy(), Attempted(Stuck(), deadline=0.6)), count=3, live=3)
     release.set()
-    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done"}
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "error", 2: "done"}
     assert recorder.results[1].kind == "world_model/deadline" and "within 0.6 s" in recorder.results[1].error
 
 
@@ -205,8 +206,8 @@ def test_what_fails_does_not_depend_on_what_else_is_live(task: ImageNav, live: i
                 raise RuntimeError("not this one")
             return super().rollout(observations, controls, seeds)
 
-    recorder = run(task, wiw.Agent(Greedy(), Picky()), count=4, live=live)
-    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "failed", 2: "done", 3: "done"}
+    recorder = run(task, wiw.Agent(Greedy(), Attempted(Picky())), count=4, live=live)
+    assert {i: r.status for i, r in recorder.results.items()} == {0: "done", 1: "error", 2: "done", 3: "done"}
     assert "not this one" in recorder.results[1].error
     clean = run(task, wiw.Agent(Greedy(), Stamp()), count=4, live=1)
     for (episode, index), record in recorder.decisions.items():
@@ -261,7 +262,6 @@ def test_models_are_refused_that_ask_for_what_nobody_gives() -> None:
         return type("Odd", (Stamp,), {"accepts": wiw.accepts(**{"control": "trajectory", **declared})})()
 
     for declared, said in [
-        ({"needs": ("history",)}, "needs history"),
         ({"needs": ("depth", "semantic")}, "needs semantic"),
         ({"needs": ("simulator",)}, "oracle alone"),
         ({"space": "pose7"}, "discrete primitives"),
@@ -305,11 +305,13 @@ def test_costs_are_each_episodes_own(task: ImageNav) -> None:
 
 def test_a_task_settles_what_an_agent_leaves_open() -> None:
     agent = wiw.Agent(Greedy(), Stamp(), candidates=2)
-    settled = agent.settled({"candidates": 4, "horizon": 7, "execute": -2})
-    assert (settled.candidates, settled.horizon, settled.execute) == (2, 7, -2)
-    own = wiw.Agent(Greedy(), horizon=9).settled({"candidates": 4, "horizon": 5, "execute": 3})
+    resolved = agent.parts.config.resolve({"candidates": 4, "horizon": 7, "execute": -2})
+    assert (resolved.candidates, resolved.horizon, resolved.execute) == (2, 7, -2)
+    assert agent.replace(config=resolved).config == resolved.complete()
+    own = AgentConfig(horizon=9).resolve({"candidates": 4, "horizon": 5, "execute": 3}).complete()
     assert (own.candidates, own.horizon, own.execute) == (4, 9, 7)
-    assert agent.but(model=None).model is None and agent.but(model=None).candidates == 2
+    bare = agent.replace(model=None)
+    assert bare.model is None and bare.config.candidates == 2 and agent.model is not None
 
 
 def test_a_model_that_breaks_its_contract_fails_the_episode_with_what_was_expected(task: ImageNav) -> None:
@@ -317,9 +319,40 @@ def test_a_model_that_breaks_its_contract_fails_the_episode_with_what_was_expect
         def rollout(self, observations, controls, seeds):
             return super().rollout(observations, controls, seeds)[:, 1:]
 
-    result = run(task, wiw.Agent(Greedy(), Wrong()), count=1).results[0]
-    assert (result.status, result.kind) == ("failed", "world_model/frames")
+    result = run(task, wiw.Agent(Greedy(), Attempted(Wrong())), count=1).results[0]
+    assert (result.status, result.kind) == ("error", "world_model/frames")
     assert re.search(r"expected uint8 .* got uint8", result.error)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "kind"),
+    [
+        (lambda frames: frames[:, 1:], "frames"),
+        (lambda frames: frames[..., :2], "shape"),
+        (lambda frames: frames / 255, "dtype"),
+        (lambda frames: None, "type"),
+    ],
+    ids=["frames", "shape", "dtype", "type"],
+)
+def test_a_bare_model_is_held_to_its_contract_in_its_first_answer(task: ImageNav, spoil, kind: str) -> None:
+    """Without a wrapper that asks again, a broken contract is the caller's to know, not an error of one episode."""
+
+    class Spoiling(Stamp):
+        calls = 0
+
+        def rollout(self, observations, controls, seeds):
+            Spoiling.calls += 1
+            return spoil(super().rollout(observations, controls, seeds))
+
+    env = task.environment()
+    observation = env.begin(task.episode(0))
+    agent = wiw.Agent(Greedy(), Spoiling())
+    with pytest.raises(ContractError, match=r"Spoiling\.rollout: ") as caught:
+        agent.decide(observation, env.goal, Key(0, 0))
+    assert caught.value.kind == kind and Spoiling.calls == 1
+    with pytest.raises(ContractError, match=r"Spoiling\.rollout: "):
+        run(task, agent, count=2)
+    assert Spoiling.calls == 2
 
 
 def test_a_model_of_fixed_length_is_padded_and_chunked(task: ImageNav) -> None:

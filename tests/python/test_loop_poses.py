@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,20 @@ import pytest
 import wiw
 from wiw._core import core
 from wiw.action import NULL, resample
+from wiw.envs.base import Env, Guide, Segment
 from wiw.errors import ArgumentError, ContractError
-from wiw.loop.agent import Query
-from wiw.loop.attempts import Attempts
+from wiw.experiments.ground_truth import TruePlans, TrueScores
+from wiw.experiments.placebos import ShuffledPlacebo
 from wiw.loop.clock import Clock
-from wiw.loop.imagine_poses import imagine_poses
+from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.plan_space import plan_space
+from wiw.loop.privileged import LiveEnvironments
 from wiw.policies.base import FrameSpec
+from wiw.runs.compose import RunContext
+from wiw.runs.recipes import AgentRecipe
 from wiw.studies.evaluate import evaluate
-from wiw.types import ArmObservation, Episode, Goal, Key, Proposal, Truth
+from wiw.tasks.base import Task
+from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Goal, Key, Proposal, Truth
 
 SIDE = 48
 HOME = (0.5, 0.5, 0.5, 0, 0, 0, 1)
@@ -43,38 +49,36 @@ class Fork:
     def fork(self) -> Fork:
         return Fork(self.pose, self.target)
 
-    def fronts_after(self, poses: Any, size: Any) -> Any:
+    def render_fronts_after(self, poses: Any, size: Any) -> Any:
         assert size == (480, 480)
         return np.stack([np.kron(picture(pose, self.target), np.ones((10, 10, 1), np.uint8)) for pose in poses])
 
 
-@dataclass
-class Outcome:
-    observation: ArmObservation
-    executed: Any
-    path: Any
-    terminated: bool
-    truncated: bool
-
-
-class DotEnv:
+class DotEnv(Env):
     def __init__(self, task: DotTask) -> None:
         self.task = task
 
     def begin(self, episode: Episode) -> ArmObservation:
         self.target, self.pose, self.decisions = np.array(episode.goal_position[:2]), np.array(HOME, float), 0
-        self.goal = Goal("dot", text="go to the green square")
-        return self._observe()
+        return self.observation
+
+    @property
+    def goal(self) -> Goal:
+        return Goal("dot", text="go to the green square")
+
+    @property
+    def observation(self) -> ArmObservation:
+        return ArmObservation(np.kron(picture(self.pose, self.target), np.ones((10, 10, 1), np.uint8)), self.pose)
 
     def fork(self) -> Fork:
         return Fork(self.pose, self.target)
 
-    def run(self, plan: Any) -> Outcome:
+    def run(self, plan: Any, answer: Any = None) -> Segment:
         before, self.decisions = self.pose, self.decisions + 1
         self.pose = plan[-1]
         done = self._left() < 0.05
         path = np.stack([before[:3], *plan[:, :3]])
-        return Outcome(self._observe(), plan, path, done, not done and self.decisions >= self.task.budget)
+        return Segment(self.observation, plan, path, done, not done and self.decisions >= self.task.budget)
 
     def truth(self) -> Truth:
         return Truth(self.pose[:3], 0.0, self._left(), float("nan"))
@@ -82,23 +86,21 @@ class DotEnv:
     def result(self) -> dict[str, float]:
         return {"success": float(self._left() < 0.05), "actions": float(self.decisions)}
 
-    def close(self) -> None:
-        pass
-
     def _left(self) -> float:
         return float(np.linalg.norm(self.pose[:2] - self.target))
 
-    def _observe(self) -> ArmObservation:
-        return ArmObservation(np.kron(picture(self.pose, self.target), np.ones((10, 10, 1), np.uint8)), self.pose)
-
 
 @dataclass
-class DotTask:
+class DotTask(Task):
     seed: int = 0
     budget: int = 6
     name: str = "dot"
     metrics: tuple[str, ...] = ("success", "mean_trajectory")
-    defaults: dict[str, int] = field(default_factory=lambda: {"candidates": 5, "horizon": 5, "execute": 5})
+    space: str = GRIPPER_POSES
+
+    @property
+    def defaults(self) -> dict[str, int]:
+        return {"candidates": 5, "horizon": 5, "execute": 5}
 
     def describe(self) -> dict[str, Any]:
         return {"task": self.name, "seed": self.seed}
@@ -155,15 +157,22 @@ class Spy(wiw.WorldModel):
         return frames
 
 
+def imagine(model: Any, proposals: Any, observations: Any) -> Any:
+    """Ask a model for each episode's plans from its first observation."""
+    keys, origins = [Key(0, index) for index in range(len(proposals))], [range(len(own)) for own in proposals]
+    space, inputs, frames = (
+        plan_space("pose7"),
+        [ModelInput(each) for each in observations],
+        FrameSpec("front", (48, 48)),
+    )
+    return space.imagine(model, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
+
+
 def asked(model: Any, plans: Any, episodes: int = 1) -> Any:
     env = DotEnv(DotTask())
-    queries = []
-    for index, episode in enumerate(DotTask().episodes(episodes)):
-        observation = env.begin(episode)
-        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
-    proposals = [[Proposal(np.asarray(plan, float), text="to the left") for plan in plans] for _ in queries]
-    origins = [range(len(plans)) for _ in queries]
-    return imagine_poses(Attempts(model), queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+    observations = [env.begin(episode) for episode in DotTask().episodes(episodes)]
+    proposals = [[Proposal(np.asarray(plan, float), text="to the left") for plan in plans] for _ in observations]
+    return imagine(model, proposals, observations)
 
 
 def plan_of(count: int, end: float = 1.0) -> Any:
@@ -181,7 +190,7 @@ def test_a_plan_is_imagined_at_the_models_length_and_seen_at_its_own_poses() -> 
     short, long = (rollout.frames[:, 0, 0, 0] for rollout in found.rollouts[0])
     assert short.tolist() == [3, 5, 8, 10, 13]
     assert len(long) == 50 and long[-1] == 13 and (np.diff(long[1:].astype(int)) >= 0).all()
-    assert found.calls == [{"consultations": 1, "rows": 2, "frames": 26}]
+    assert found.costs == [{"consultations": 1, "rows": 2, "frames": 26}]
     assert found.rollouts[0][0].frames.shape == (5, 48, 48, 3) and not found.rollouts[0][0].real.any()
 
 
@@ -195,7 +204,7 @@ def test_a_model_of_any_length_gets_the_plan_itself() -> None:
 def test_equal_plans_of_an_episode_are_asked_once() -> None:
     model = Spy()
     found = asked(model, [plan_of(5), plan_of(5), plan_of(5, 0.7)], episodes=2)
-    assert [call["rows"] for call in found.calls] == [2, 2]
+    assert [call["rows"] for call in found.costs] == [2, 2]
     np.testing.assert_array_equal(found.rollouts[0][0].frames, found.rollouts[0][1].frames)
     seeds = np.concatenate([seeds for _, _, seeds in model._calls])
     assert len(set(seeds.tolist())) == 4
@@ -208,21 +217,38 @@ def test_words_are_the_policys_or_made_of_the_poses() -> None:
     assert controls[0].text == "to the left" and controls[0].ids is None
     assert observations.image.shape == (1, 32, 32, 3)
     env = DotEnv(DotTask())
-    query = Query(env.begin(DotTask().episodes(1)[0]), env.goal, Key(0, 0))
-    bare = [[Proposal(plan_of(2))]]
-    imagine_poses(Attempts(model), [query], bare, [[0]], FrameSpec("front", (48, 48)), Clock())
+    imagine(model, [[Proposal(plan_of(2))]], [env.begin(DotTask().episodes(1)[0])])
     assert model._calls[-1][1][0].text == wiw.action.to_text(plan_of(2))
+
+
+def test_a_model_with_a_memory_sees_the_front_views_and_gripper_poses_of_earlier_decisions() -> None:
+    model = Spy(control="action", space="pose7", frames=14, best_batch=9, needs=("history",), history=3)
+    reacher = Reacher()
+    reacher.score = lambda situations, *_: [np.array([1.0, 0.0]) for _ in situations]
+    agent = wiw.Agent(reacher, model, candidates=2, horizon=5, execute=2)
+    env = DotEnv(DotTask())
+    observation, seen, carried = env.begin(DotTask().episodes(1)[0]), [], []
+    for decision in range(4):
+        seen.append(observation)
+        chosen = agent.decide(observation, env.goal, Key(0, 0, decision))
+        carried.append(chosen.actions[: chosen.execute])
+        observation = env.run(carried[-1]).observation
+    young, old = model._calls[1][0].history, model._calls[3][0].history
+    assert young.count.tolist() == [2, 2] and old.count.tolist() == [3, 3]
+    np.testing.assert_array_equal(old.poses, [[each.pose for each in seen[1:]]] * 2)
+    np.testing.assert_array_equal(young.poses[:, 0], young.poses[:, 1])
+    np.testing.assert_array_equal(old.actions, [carried[1:3]] * 2)
+    np.testing.assert_array_equal(old.images[:, -1], model._calls[3][0].image)
+    np.testing.assert_array_equal(old.images[:, :2], [[model._calls[k][0].image[0] for k in (1, 2)]] * 2)
+    assert (old.images[0, 0] != old.images[0, 1]).any()
 
 
 def test_choosing_by_imagination_pays(tmp_path: Path) -> None:
     arms = {
-        name: wiw.Agent(Reacher(), model, placebo=placebo)
-        for name, model, placebo in [
-            ("none", None, None),
-            ("copy", "copy", None),
-            ("oracle", "oracle", None),
-            ("swapped", "oracle", "swapped"),
-        ]
+        "none": AgentRecipe(Reacher()),
+        "copy": AgentRecipe(Reacher(), "copy"),
+        "oracle": AgentRecipe(Reacher(), "oracle"),
+        "swapped": AgentRecipe(Reacher(), "oracle", placebo="swapped"),
     }
     runs = {
         name: evaluate(DotTask(), agent, 16, out=tmp_path / name, live=5, progress=False)
@@ -234,7 +260,7 @@ def test_choosing_by_imagination_pays(tmp_path: Path) -> None:
 
 
 def test_records_hold_poses_pictures_and_fidelity(tmp_path: Path) -> None:
-    log = evaluate(DotTask(), wiw.Agent(Reacher(), "copy", fidelity=True), 1, out=tmp_path, progress=False)
+    log = evaluate(DotTask(), wiw.Agent(Reacher(), "copy"), 1, out=tmp_path, fidelity=True, progress=False)
     decision = log.decisions[0]
     assert np.shape(decision["actions"]) == (5, 7) and decision["calls"]["rows"] == 5
     assert min(decision["fidelity"]["psnr"]) > 5
@@ -257,14 +283,55 @@ def test_results_do_not_depend_on_who_else_is_live(tmp_path: Path) -> None:
         ({"model": "warp"}, "this agent plans in poses of a gripper"),
         ({"model": Spy(control="action", space="pose7", view="panorama")}, "imagines panoramas"),
         ({"model": Spy(control="viewpoint", space="pose7")}, "move none"),
-        ({"model": "copy", "depth": 2}, "a gripper sees none"),
-        ({"model": "copy", "placebo": "shuffled"}, "use 'swapped'"),
-        ({"model": "copy", "revision": "heuristic"}, "plans in poses of a gripper, but the reviser"),
+        ({"model": "copy", "depth": 2}, "proposes from imagined places, but poses of a gripper lead to none"),
+        ({"model": "copy", "reviser": "heuristic"}, "plans in poses of a gripper, but the reviser"),
     ],
 )
 def test_what_poses_cannot_have_is_refused(options: Any, said: str) -> None:
     with pytest.raises(ArgumentError, match=said):
         wiw.Agent(Reacher(), **options)
+
+
+def test_a_shuffled_placebo_of_poses_is_refused() -> None:
+    """As soon as a run composes it; one that is composed by hand, at its first decision."""
+    refusal = "deals primitives anew, and these plans are made of none; use 'swapped'"
+    with pytest.raises(ArgumentError, match=refusal):
+        AgentRecipe(Reacher(), "copy", placebo="shuffled").build(RunContext(DotTask()))
+    agent = wiw.Agent(Reacher(), ShuffledPlacebo(wiw.world_model("copy", space="pose7")))
+    env = DotEnv(DotTask())
+    observation = env.begin(DotTask().episodes(1)[0])
+    with pytest.raises(ArgumentError, match=refusal):
+        agent.decide(observation, env.goal, Key(0, 0))
+
+
+def test_plans_of_poses_are_judged_by_the_truth() -> None:
+    """`TrueScores` asks the guide of the live environment for poses as it does for primitives."""
+
+    class Near(Guide):
+        def __init__(self, target: Any) -> None:
+            self.target = target
+
+        def worth(self, plan: Any) -> float:
+            return -float(np.linalg.norm(plan[-1][:2] - self.target))
+
+        def plan(self, length: int) -> Any:
+            return resample(np.array([[*self.target, *HOME[2:]]]), length, start=np.array(HOME, float))
+
+    class Guided(DotEnv):
+        def guide(self) -> Near:
+            return Near(self.target)
+
+    env, reacher = Guided(DotTask()), Reacher()
+    observation = env.begin(DotTask().episodes(1)[0])
+    environments = LiveEnvironments()
+    environments.add(Key(0, 0), env)
+    agent = wiw.Agent(TruePlans(reacher), "copy", reviser=TrueScores(reacher), candidates=4, execute=5)
+    agent.grant(environments)
+    decision = agent.decide(observation, env.goal, Key(0, 0))
+    assert decision.chosen == 0 and len(decision.proposals) == 4
+    np.testing.assert_allclose(decision.scores[0], 0, atol=1e-9)
+    np.testing.assert_array_equal(decision.scores, [env.guide().worth(plan.actions) for plan in decision.proposals])
+    assert env.run(decision.actions).terminated
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from wiw.action import PoseGrid
 from wiw.envs.manipulation import ManipulationEnv
 from wiw.errors import ArgumentError
-from wiw.tabletop.kind import PALETTE, REACH, above, scattered
+from wiw.tabletop.base import PALETTE, REACH, make_action, scatter_places
 from wiw.tabletop.workbench import LAMPS, TABLE
 from wiw.tasks.imagenav import ImageNav
-from wiw.tasks.manipulation import KINDS, Manipulation
+from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 
 GRID = PoseGrid()
 
@@ -24,7 +24,7 @@ def solved(env: ManipulationEnv, discrete: bool = False) -> dict[str, float]:
     """The result of an episode that its expert plays, asked anew where a plan was not enough."""
     kind, setup = env.table.kind, env.table.setup
     while True:
-        plan = kind.expert(env.observation.places, setup.target)
+        plan = kind.plan_expert(env.observation.places, setup.target)
         for pose in GRID.decode(GRID.encode(plan)) if discrete else plan:
             *_, done, over, info = env.step(pose)
             if done or over:
@@ -32,7 +32,7 @@ def solved(env: ManipulationEnv, discrete: bool = False) -> dict[str, float]:
 
 
 @pytest.mark.parametrize("discrete", [False, True])
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
     """Of these few all but one; `docs/results.md` has 200 tables of each."""
     env = Manipulation(name, seed=7).environment()
@@ -45,7 +45,7 @@ def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
     assert all(result["poses"] <= 15 for result in results)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_another_target_than_the_one_that_is_told_is_no_success(name: str) -> None:
     env = Manipulation(name, seed=3).environment()
     env.reset(options={"episode": 0})
@@ -54,52 +54,52 @@ def test_another_target_than_the_one_that_is_told_is_no_success(name: str) -> No
         name for name in setup.objects if name not in ("ring", "block") and name not in np.atleast_1d(setup.target)
     ]
     wrong = (others[0],) if isinstance(setup.target, tuple) else others[0]
-    for pose in kind.expert(env.observation.places, wrong):
+    for pose in kind.plan_expert(env.observation.places, wrong):
         _, _, done, over, _ = env.step(pose)
         assert not done
         if over:
             break
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_instructions_name_the_target_and_tables_are_functions_of_their_seed(name: str) -> None:
-    kind = KINDS[name]
+    kind = TABLETOP_TASKS[name]
     for seed, variation in ((0, 0), (1, 1), (2, 7), (3, 19)):
-        setup, again = kind.setup(seed, variation), kind.setup(seed, variation)
+        setup, again = kind.create_setup(seed, variation), kind.create_setup(seed, variation)
         for colour in np.atleast_1d(setup.target):
             assert colour in setup.instruction and colour in setup.objects
         assert setup.instruction == again.instruction and setup.target == again.target
         for (one, here), (other, there) in zip(setup.things, again.things, strict=True):
             assert one.name == other.name
             np.testing.assert_array_equal(here, there)
-        moved = [pose for _, pose in kind.setup(seed + 100, variation).things]
+        moved = [pose for _, pose in kind.create_setup(seed + 100, variation).things]
         assert any(not np.allclose(pose, other) for pose, (_, other) in zip(moved, setup.things, strict=True))
 
 
 def test_buttons_count_in_their_order() -> None:
-    kind = KINDS["push_buttons"]
-    setup = kind.setup(5, 2)
+    kind = TABLETOP_TASKS["push_buttons"]
+    setup = kind.create_setup(5, 2)
     assert len(setup.target) == 3
     for order, right in ((setup.target, True), (setup.target[::-1], False), ((*setup.target, setup.target[0]), False)):
-        bench = setup.bench()
-        for pose in kind.expert(bench.places(setup.objects), order):
-            bench.go(pose)
-        assert bench.pressed == order
-        assert kind.succeeded(bench, setup) is right
+        bench = setup.build_workbench()
+        for pose in kind.plan_expert(bench.get_poses(setup.objects), order):
+            bench.move_to(pose)
+        assert bench.pressed_buttons == order
+        assert kind.is_success(bench, setup) is right
 
 
 def test_rings_light_up_by_the_order_of_pushes_whatever_is_asked() -> None:
-    kind = KINDS["push_buttons"]
-    setup = kind.setup(5, 2)
-    bench = setup.bench()
-    dark, before = bench.picture()["color"].astype(int), bench.fork()
+    kind = TABLETOP_TASKS["push_buttons"]
+    setup = kind.create_setup(5, 2)
+    bench = setup.build_workbench()
+    dark, before = bench.render_view()["color"].astype(int), bench.fork()
     one, other, third = setup.objects
     order = (third, one, other, third)
-    for pose in kind.expert(bench.places(setup.objects), order):
-        bench.go(pose)
-    assert bench.pressed == order and before.pressed == ()
-    bench.go(above(0.0, 0.35, 0.35, 0.0))
-    lit = bench.picture()["color"].astype(int)
+    for pose in kind.plan_expert(bench.get_poses(setup.objects), order):
+        bench.move_to(pose)
+    assert bench.pressed_buttons == order and before.pressed_buttons == ()
+    bench.move_to(make_action(0.0, 0.35, 0.35, 0.0))
+    lit = bench.render_view()["color"].astype(int)
     changed = np.abs(lit - dark).sum(-1) > 60
     pixels = {}
     for lamp, colour in LAMPS.items():
@@ -127,7 +127,7 @@ def test_episodes_end_with_their_actions_and_record_what_was_refused() -> None:
     assert len(segment.refused) == 2 and segment.path.shape == (4, 3)
     assert env.result() == {"success": 0.0, "actions": 1.0, "poses": 3.0, "refused": 2.0}
     with pytest.raises(ArgumentError, match="finite pose"):
-        env.table.bench.go([np.nan] * 7)
+        env.table.bench.move_to([np.nan] * 7)
 
 
 def test_what_is_no_task_is_named() -> None:
@@ -144,12 +144,12 @@ def test_what_is_no_task_is_named() -> None:
 @settings(max_examples=30)
 @given(st.integers(0, 2**32), st.integers(1, 4))
 def test_things_are_scattered_apart_and_in_reach(key: int, count: int) -> None:
-    places = scattered(key, count, 0.13)
+    places = scatter_places(key, count, 0.13)
     assert (places >= REACH[0]).all() and (places <= REACH[1]).all()
     gaps = np.linalg.norm(places[:, None] - places, axis=-1) + 9 * np.eye(count)
     assert gaps.min() >= 0.13
     with pytest.raises(ArgumentError, match="room"):
-        scattered(key, 3, 2.0)
+        scatter_places(key, 3, 2.0)
 
 
 def test_the_palette_is_told_apart() -> None:

@@ -19,8 +19,8 @@ from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.store import RunStore
 from wiw.studies.evaluate import evaluate, resume_run
 from wiw.studies.run_log import load_run
-from wiw.tabletop.kind import above
-from wiw.tasks.manipulation import KINDS, Manipulation
+from wiw.tabletop.base import make_action
+from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Proposal
 
 POLICY = f"{Path(__file__).with_name('pressing_policy.py')}:Pressing"
@@ -149,7 +149,7 @@ def test_other_tasks_have_no_tasks(capsys: Any) -> None:
 
 
 def test_a_run_has_as_many_episodes_as_the_preset_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Manipulation().usual == 200 and Manipulation("slide_block").usual == 50
+    assert Manipulation().default_episodes == 200 and Manipulation("slide_block").default_episodes == 50
     own = tmp_path / "mine.yaml"
     own.write_text("episodes: 1\nactions: 1\n")
     agent = AgentRecipe(POLICY, candidates=1, horizon=1)
@@ -165,13 +165,13 @@ def test_gymnasium_knows_the_task() -> None:
     env = wiw.make("Manipulation-v0", tasks=["stack_cups"], seed=4, depth=False)
     observation, info = env.reset(options={"episode": 1})
     assert {*observation} == {"front", "pose", "joints", "held"} and "cup" in info["instruction"]
-    assert env.unwrapped.task.tasks == ("stack_cups",) and [*KINDS] == list(Manipulation().tasks)
+    assert env.unwrapped.task.tasks == ("stack_cups",) and [*TABLETOP_TASKS] == list(Manipulation().tasks)
     assert np.ptp(observation["front"]) > 100
 
 
 def test_a_run_says_which_renderer_drew_it() -> None:
     assert Manipulation(backend="cpu").describe()["backend"] == "cpu"
-    assert Manipulation.portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}
+    assert Manipulation.make_portable({"tasks": "all"}) == {"tasks": "all", "backend": resolve_backend("auto")}
 
 
 def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
@@ -180,7 +180,7 @@ def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     options = {"tasks": "push_buttons", "actions": 4, "seed": 3}
     log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False, keep_images=0)
     assert [episode["metrics"]["success"] for episode in log.episodes] == [0.0, 0.0]
-    found = wiw.attribute(tmp_path, progress=False)["copy"]
+    found = wiw.blame(tmp_path, progress=False)["copy"]
     assert found.verdicts["beyond"] == 1 and sum(found.verdicts.values()) == 2
 
 
@@ -199,7 +199,7 @@ def test_a_guide_knows_what_plans_are_worth() -> None:
     env = Manipulation("push_buttons").environment()
     env.begin(env.task.episode(0))
     kind, setup = env.table.kind, env.table.setup
-    wrong = kind.expert(env.observation.places, setup.objects[2:])
+    wrong = kind.plan_expert(env.observation.places, setup.objects[2:])
     assert not env.run(wrong).terminated
     assert env.guide().worth(env.table.bench.pose[None]) < -100
     assert len(env.guide().plan(5)) == 1
@@ -209,7 +209,7 @@ class Sinking(Pressing):
     """Into the table, and up again."""
 
     def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
-        ways = np.array([above(0.2, 0.35, height, 1.0) for height in (-0.2, 0.2, -0.2)])
+        ways = np.array([make_action(0.2, 0.35, height, 1.0) for height in (-0.2, 0.2, -0.2)])
         return [[Proposal(ways)] for _ in situations]
 
 

@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 import wiw
 from wiw._core import core
 from wiw.action import PoseGrid
-from wiw.envs.manipulation import checked
+from wiw.envs.manipulation import check_poses
 from wiw.envs.manipulation_vector import ManipulationVectorEnv
 from wiw.envs.sensors import ARM
 from wiw.errors import ArgumentError
-from wiw.tabletop.cloud import points_of
-from wiw.tabletop.kind import above
+from wiw.tabletop.base import make_action
+from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.workbench import CAMERAS, TABLE
 
 ALL: dict[str, Any] = {
@@ -45,7 +45,7 @@ def test_every_camera_gives_what_is_asked_for() -> None:
     assert env.observation_space.contains(observation) and info["objects"] == tuple(env.table.objects)
     for camera in CAMERAS:
         names = [camera, "depth", "ids"] if camera == "front" else [camera, f"{camera}_depth", f"{camera}_ids"]
-        alone = env.table.bench.picture(camera, (60, 60), ("color", "depth"))
+        alone = env.table.bench.render_view(camera, (60, 60), ("color", "depth"))
         np.testing.assert_array_equal(observation[names[0]], alone["color"])
         np.testing.assert_array_equal(observation[names[1]], alone["depth"])
         assert len({observation[names[2]].tobytes(), *(observation[other].tobytes() for other in CAMERAS)}) == 5
@@ -61,7 +61,7 @@ def test_ids_number_the_objects() -> None:
     points = observation["points"][: 240**2].reshape(240, 240, 3)
     for number, name in enumerate(info["objects"], start=1):
         middle = points[observation["ids"] == number].mean(axis=0)
-        np.testing.assert_allclose(middle[:2], env.table.bench.place_of(name)[:2, 3], atol=0.05)
+        np.testing.assert_allclose(middle[:2], env.table.bench.get_pose(name)[:2, 3], atol=0.05)
 
 
 def test_points_lie_where_pixels_look() -> None:
@@ -70,7 +70,7 @@ def test_points_lie_where_pixels_look() -> None:
     count = 60 * 60
     assert observation["points"].shape == (4 * count, 3) and observation["points"].dtype == np.float32
     np.testing.assert_array_equal(observation["colors"][:count].reshape(60, 60, 3), observation["front"])
-    back = CAMERAS["front"].pixels_of(observation["points"][:count], (60, 60)).reshape(60, 60, 2)
+    back = CAMERAS["front"].project_points(observation["points"][:count], (60, 60)).reshape(60, 60, 2)
     columns, rows = np.meshgrid(np.arange(60) + 0.5, np.arange(60) + 0.5)
     np.testing.assert_allclose(back, np.stack([columns, rows], axis=-1), atol=2e-3)
     # All cameras see the same table's top.
@@ -87,7 +87,7 @@ def test_points_are_those_of_a_slow_reading(key: int) -> None:
     camera[:3, :3], camera[:3, 3] = turn * np.sign(np.linalg.det(turn)), draws[9:12]
     depth, hfov = draws[12:27].reshape(3, 5).astype(np.float32), 30 + 100 * draws[27]
     depth[0, 0] = 0
-    found = points_of(depth, hfov, camera)
+    found = unproject_depth(depth, hfov, camera)
     focal = 2.5 / np.tan(np.radians(hfov / 2))
     for row, column in np.ndindex(3, 5):
         ray = np.array([(column + 0.5 - 2.5) / focal, (1.5 - row - 0.5) / focal, -1.0, 0.0]) * depth[row, column]
@@ -98,14 +98,14 @@ def test_points_are_those_of_a_slow_reading(key: int) -> None:
 def test_the_body_is_felt() -> None:
     env = made(tasks="slide_block")
     first, _ = env.reset(options={"episode": 0})
-    x, y = env.table.bench.place_of("block")[:2, 3]
-    for pose in (above(x, y, 0.15, 1.0), above(x, y, 0.02, 1.0)):
+    x, y = env.table.bench.get_pose("block")[:2, 3]
+    for pose in (make_action(x, y, 0.15, 1.0), make_action(x, y, 0.02, 1.0)):
         env.step(pose)
-    holding, *_ = env.step(above(x, y, 0.02, 0.0))
-    lifted, *_ = env.step(above(x, y, 0.2, 0.0))
+    holding, *_ = env.step(make_action(x, y, 0.02, 0.0))
+    lifted, *_ = env.step(make_action(x, y, 0.2, 0.0))
     assert [each["held"] for each in (first, holding, lifted)] == [0, 1, 1]
     assert np.abs(lifted["joints"] - first["joints"]).max() > 0.05
-    np.testing.assert_allclose(lifted["pose"][:3], above(x, y, 0.2, 0.0)[:3], atol=5e-3)
+    np.testing.assert_allclose(lifted["pose"][:3], make_action(x, y, 0.2, 0.0)[:3], atol=5e-3)
 
 
 def test_whole_numbers_are_the_grids_poses() -> None:
@@ -166,10 +166,10 @@ def test_a_plan_that_is_none_moves_nothing(plan: Any, said: str) -> None:
 def test_plans_are_finite_or_refused(plan: list[list[float]]) -> None:
     valid = all(np.isfinite(pose).all() and 0 <= pose[6] <= 1 for pose in plan)
     if valid:
-        np.testing.assert_array_equal(checked(plan), plan)
+        np.testing.assert_array_equal(check_poses(plan), plan)
     else:
         with pytest.raises(ArgumentError):
-            checked(plan)
+            check_poses(plan)
 
 
 def test_refused_ways_leave_a_valid_state() -> None:
@@ -177,14 +177,14 @@ def test_refused_ways_leave_a_valid_state() -> None:
     env = made(tasks="push_buttons")
     env.reset(options={"episode": 0})
     bench = env.table.bench
-    untouched = {name: bench.place_of(name) for name in env.table.objects}
+    untouched = {name: bench.get_pose(name) for name in env.table.objects}
     refusals = [[3.0, 0, 1.0, np.pi, 0, 0, 1], [0.4, 0.35, TABLE - 0.2, np.pi, 0, 0, 1], [-0.35, 0, 0.8, 0, 0, 0, 1]]
     segment = env.run(refusals)
     assert len(segment.refused) == 3 and {"collision"} < {*segment.refused} and env.result()["refused"] == 3.0
     assert len(segment.executed) == 3 and np.isfinite(segment.path).all() and np.isfinite(bench.joints).all()
     assert bench.pose[2] > TABLE - 0.005 and (np.abs(bench.joints[:7]) < 3.8).all()
     for name, place in untouched.items():
-        np.testing.assert_allclose(bench.place_of(name), place, atol=1e-6)
+        np.testing.assert_allclose(bench.get_pose(name), place, atol=1e-6)
     assert env.run([POSE]).refused == ()
     np.testing.assert_allclose(bench.pose[:3], POSE[:3], atol=5e-3)
 
@@ -195,7 +195,7 @@ def test_refused_ways_leave_a_valid_state() -> None:
 def plans(count: int, steps: int) -> Any:
     """Somewhere over the table, other for each place and step."""
     draws = core.uniform(core.fold_key([7]), count * steps * 4).reshape(steps, count, 4)
-    return [[above(0.3 * x, 0.4 * y - 0.2, 0.05 + 0.2 * h, round(g)) for x, y, h, g in row] for row in draws]
+    return [[make_action(0.3 * x, 0.4 * y - 0.2, 0.05 + 0.2 * h, round(g)) for x, y, h, g in row] for row in draws]
 
 
 def vector(count: int, **options: Any) -> Any:

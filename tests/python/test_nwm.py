@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import pickle
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ import wiw
 from wiw import action
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, WeightsError
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, Goal, History, Key, Observation, Proposal
+from wiw.world_models.nwm.context import nearest_frames
 from wiw.world_models.nwm.motion import motions, normalised
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
@@ -253,13 +255,51 @@ def test_history_is_the_context_where_there_is_one(model: NWM) -> None:
     repeated = model.rollout(given, plan, seeds)
     past = observations(5, seed=1).image
 
-    def with_past(*views):
-        return model.rollout(Conditioning(given.image, history=[np.stack(views)]), plan, seeds)
+    def with_past(*views, apart=1):
+        images, lengths = np.stack([*views, given.image[0]])[None], np.full((1, len(views)), apart)
+        actions = np.full((1, len(views), apart), FORWARD, np.int8)
+        history = History(images, np.zeros((1, len(views) + 1, 3)), actions, lengths, np.array([len(views) + 1]))
+        return model.rollout(replace(given, history=history), plan, seeds)
 
     np.testing.assert_array_equal(with_past(*[given.image[0]] * 3), repeated)
     assert (with_past(*past[:3]) != repeated).any()
+    assert (with_past(*past[2::-1]) != with_past(*past[:3])).any()  # in order
     np.testing.assert_array_equal(with_past(*past[2:]), with_past(*past))  # the last three count
     np.testing.assert_array_equal(with_past(past[0]), with_past(past[0], past[0], past[0]))
+    twos = with_past(past[0], past[0], given.image[0])  # of frames 3 actions apart, 3 and 2 ago and 1 and 0 ago
+    np.testing.assert_array_equal(with_past(*past[1::-1], apart=3), twos)
+
+
+def test_context_is_taken_at_the_spacing_of_its_own_frames() -> None:
+    lengths = np.array([[1, 1, 1], [3, 3, 3], [2, 2, 2], [9, 9, 9], [0, 0, 0], [0, 3, 1], [5, 1, 2]])
+    assert nearest_frames(lengths, 4).tolist() == [
+        [0, 1, 2, 3], [2, 2, 3, 3], [1, 2, 2, 3], [3, 3, 3, 3], [0, 0, 0, 0], [0, 2, 2, 3], [1, 2, 2, 3],
+    ]  # fmt: skip
+
+
+def test_the_loop_hands_it_what_was_seen(model: NWM, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each decision's context is the latest front views, oldest first."""
+    assert model.accepts.needs == ("history",) and model.accepts.history == 4
+    contexts, latents = [], model._first_context
+    monkeypatch.setattr(model, "_first_context", lambda given: contexts.append(latents(given)) or contexts[-1].clone())
+
+    class Ahead(wiw.Policy):
+        def propose(self, situations, candidates, horizon):
+            return [[Proposal([FORWARD])] for _ in situations]
+
+        def score(self, situations, proposals, rollouts):
+            return [np.zeros(1) for _ in situations]
+
+    agent = wiw.Agent(Ahead(), model, candidates=1, horizon=1)
+    panoramas = np.random.default_rng(0).integers(0, 256, (6, 576, 1024, 3), np.uint8)
+    for decision, panorama in enumerate(panoramas):
+        seen = Observation(panorama, panorama[:480, :480], np.array([0.2 * decision, 0, 0]))
+        agent.decide(seen, Goal("x"), Key(0, 0, decision))
+    now = [context[0, -1] for context in contexts]
+    assert len(now) == 6 and (now[0] - now[1]).abs().max() > 0.1
+    for decision, context in enumerate(contexts):
+        for place, k in enumerate(range(decision - 3, decision + 1)):
+            torch.testing.assert_close(context[0, place], now[max(0, k)])
 
 
 def test_conventions_and_spacing_steer(model: NWM, weights: Path) -> None:

@@ -155,43 +155,6 @@ def test_controls_of_a_part_say_the_same_in_every_form(plans, model):
             assert (part.length == part.steps).all()  # padding would change what such a model imagines
 
 
-def brute_force_beam(width, depth, propose, score):
-    """Level by level: everything that can be appended, the best `width` kept, ties to the earlier candidate."""
-    beam = [((), 0.0, None)]
-    for _ in range(depth):
-        candidates = []
-        for plan, _, origin in beam:
-            for i, more in enumerate(propose(plan)):
-                candidates.append((plan + more, score(plan + more), i if origin is None else origin))
-        beam = [candidates[i] for i in sorted(range(len(candidates)), key=lambda i: (-candidates[i][1], i))][:width]
-    return beam
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.integers(1, 4), st.integers(1, 3), st.integers(1, 4), st.integers(0, 2**20))
-def test_beam_search_equals_brute_force(width, depth, count, seed):
-    def propose(episode):
-        def proposals(plan):
-            rng = np.random.default_rng([seed, episode, *plan])
-            return [tuple(rng.integers(1, 4, rng.integers(0, 4)).tolist()) for _ in range(rng.integers(1, 5))]
-
-        return proposals
-
-    def score(plan):
-        return float(sum(plan) % 3)  # many ties
-
-    search = planner.BeamSearch(width, depth)
-    plans = search.ask([propose(e)(()) for e in range(count)])
-    while True:
-        search.tell([[score(tuple(p.tolist())) for p in candidates] for candidates in plans])
-        if search.done:
-            break
-        plans = search.ask([[propose(e)(tuple(p.tolist())) for p, _, _ in search.beams[e]] for e in range(count)])
-    for episode in range(count):
-        got = [(tuple(plan.tolist()), value, origin) for plan, value, origin in search.beams[episode]]
-        assert got == brute_force_beam(width, depth, propose(episode), score)
-
-
 def test_wrong_arguments_name_the_cure():
     with pytest.raises(ArgumentError, match="frames"):
         planner.ModelSpec(frames=1)
@@ -203,12 +166,6 @@ def test_wrong_arguments_name_the_cure():
         planner.Batch.build([[[1, 7]]])
     with pytest.raises(ArgumentError, match="integers"):
         planner.Batch.build([[[0.5]]])
-    search = planner.BeamSearch(2)
-    search.ask([[[1], [2]]])
-    with pytest.raises(ArgumentError, match="candidate 1 of episode 0 is NaN"):
-        search.tell([[0.0, np.nan]])
-    with pytest.raises(ArgumentError, match="2 scores"):
-        search.tell([[0.0]])
 
 
 def test_rollouts_that_do_not_fit_are_refused():

@@ -21,13 +21,13 @@ from wiw.policies.matcher import (
     Matcher,
     Memory,
     appearance,
-    diverse,
-    imagined_gain,
-    positions_after,
-    recall,
-    straight_run,
+    choose_diverse,
+    measure_imagined_gain,
+    plan_straight_run,
+    predict_positions,
+    recall_gains,
 )
-from wiw.policies.matcher.exploration import CELL, FAR, ExplorationMap, cells
+from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, ExplorationMap, to_cells
 from wiw.types import Goal, Key, Observation, Proposal, Rollout
 
 BLANK = Observation(np.zeros((576, 1024, 3), np.uint8), np.zeros((480, 480, 3), np.uint8), np.zeros(3))
@@ -64,7 +64,7 @@ def test_the_heuristic_draws_anew_for_each_decision_and_candidate() -> None:
 def test_histogram_similarity_equals_its_slow_twin() -> None:
     panoramas, image = noise(2, 64, 128, 3), noise(64, 64, 3, seed=1)
     panoramas[0, 20:44, 40:90] = noise(24, 50 + 6, 3, seed=1)[:, :50]
-    goal, places = appearance.goal_template(image), appearance.describe(panoramas)
+    goal, places = appearance.build_goal_template(image), appearance.extract_features(panoramas)
     fast = appearance.histogram_similarity(places, goal)
     total = len(goal.bins)
     own = np.zeros(total)
@@ -79,9 +79,9 @@ def test_histogram_similarity_equals_its_slow_twin() -> None:
 def test_a_place_is_most_like_the_goal_that_was_seen_from_it() -> None:
     panorama = noise(576, 1024, 3)
     image = wiw.panorama.to_perspective(panorama, 90.0, (480, 480))
-    goal = appearance.goal_template(image)
-    here = appearance.similarity(appearance.describe(wiw.panorama.resize(panorama[None], (64, 128))), goal)[0]
-    there = appearance.similarity(appearance.describe(noise(1, 64, 128, 3, seed=5)), goal)[0]
+    goal = appearance.build_goal_template(image)
+    here = appearance.similarity(appearance.extract_features(wiw.panorama.resize(panorama[None], (64, 128))), goal)[0]
+    there = appearance.similarity(appearance.extract_features(noise(1, 64, 128, 3, seed=5)), goal)[0]
     assert here.argmax() in (63, 64, 65)
     assert 3.0 < here.max() <= 4.001
     assert there.max() < here.max() - 1
@@ -98,40 +98,40 @@ def test_positions_after_a_plan_equal_step_by_step(odometry: tuple[float, float,
         azimuth += {TURN_LEFT: 1, TURN_RIGHT: -1}.get(action, 0) * np.pi / 8
         x, y = (x + 0.2 * np.cos(azimuth), y + 0.2 * np.sin(azimuth)) if action == FORWARD else (x, y)
         slow.append((x, y))
-    np.testing.assert_allclose(positions_after(np.array(odometry), np.array(actions, np.int8)), slow, atol=1e-9)
+    np.testing.assert_allclose(predict_positions(np.array(odometry), np.array(actions, np.int8)), slow, atol=1e-9)
 
 
 def test_imagined_places_are_remembered_and_recalled_from_the_next_place() -> None:
-    goal = appearance.goal_template(noise(64, 64, 3))
+    goal = appearance.build_goal_template(noise(64, 64, 3))
     memory = Memory(goal)
     memory.profile[:] = 1.0
-    plan = Proposal(straight_run(2, 5, 3))  # two turns to the left, three steps
+    plan = Proposal(plan_straight_run(2, 5, 3))  # two turns to the left, three steps
     frames = noise(5, 64, 128, 3, seed=3)
     real = np.array([True, True, False, False, False])
-    gain = imagined_gain(memory, np.zeros(3), plan, Rollout(frames, real, "panorama"))
-    values = appearance.similarity(appearance.describe(frames[2:]), goal).max(1)
+    gain = measure_imagined_gain(memory, np.zeros(3), plan, Rollout(frames, real, "panorama"))
+    values = appearance.similarity(appearance.extract_features(frames[2:]), goal).max(1)
     assert gain == pytest.approx(values.max() - 1.0)
-    assert [value for _, value in memory.imagined] == pytest.approx(values.tolist())
+    assert [value for _, value in memory.imagined_places] == pytest.approx(values.tolist())
     runs = np.full(HEADINGS, 3 * STEP)
-    known = recall(memory, np.zeros(3), runs)
+    known = recall_gains(memory, np.zeros(3), runs)
     assert known[2] == pytest.approx(gain)
     assert (known[6:] == 0).all()
     step = np.array([*(STEP * np.array([np.cos(np.pi / 4), np.sin(np.pi / 4)])), np.pi / 4])
-    assert recall(memory, step, runs - STEP)[0] == pytest.approx(values[1:].max() - 1.0)
+    assert recall_gains(memory, step, runs - STEP)[0] == pytest.approx(values[1:].max() - 1.0)
 
 
 def test_turning_on_the_spot_imagines_nothing() -> None:
-    memory = Memory(appearance.goal_template(noise(64, 64, 3)))
-    turning = Proposal(straight_run(8, 5, 3))
+    memory = Memory(appearance.build_goal_template(noise(64, 64, 3)))
+    turning = Proposal(plan_straight_run(8, 5, 3))
     future = Rollout(noise(5, 64, 128, 3), np.ones(5, bool), "panorama")
-    assert imagined_gain(memory, np.zeros(3), turning, future) is None
-    assert memory.imagined == []
+    assert measure_imagined_gain(memory, np.zeros(3), turning, future) is None
+    assert memory.imagined_places == []
 
 
 def test_diverse_headings_keep_their_distance_and_no_plan_comes_twice() -> None:
-    plans = {k: straight_run(k, 5, 5) for k in range(HEADINGS)}
-    assert diverse([0, 1, 2, 3, 15], plans, 3, 3) == [0, 3, 1]
-    chosen = diverse([5, 6, 7, 8, 11], plans, 1, 3)  # five turns and more are cut to the same five left turns
+    plans = {k: plan_straight_run(k, 5, 5) for k in range(HEADINGS)}
+    assert choose_diverse([0, 1, 2, 3, 15], plans, 3, 3) == [0, 3, 1]
+    chosen = choose_diverse([5, 6, 7, 8, 11], plans, 1, 3)  # five turns and more are cut to the same five left turns
     assert chosen == [5, 11]
 
 
@@ -150,17 +150,17 @@ def corridor() -> tuple[ExplorationMap, NDArray[np.float32]]:
 def test_the_map_knows_walls_free_space_and_the_frontier() -> None:
     exploration, depth = corridor()
     exploration.update(depth, np.zeros(3), np.zeros(128, np.float32))
-    free = exploration.free()
-    assert free[cells(np.array([-1.5, 0.0, 2.0]), np.zeros(3))].all()
-    assert not free[cells(np.zeros(2), np.array([-1.0, 1.0]))].any()
+    free = exploration.find_free_cells()
+    assert free[to_cells(np.array([-1.5, 0.0, 2.0]), np.zeros(3))].all()
+    assert not free[to_cells(np.zeros(2), np.array([-1.0, 1.0]))].any()
     runs, ends = exploration.look_ahead(np.zeros(3), 4, 2.5)
     assert runs[0] == 2.5
     assert 0.5 < runs[1] < 1.0
     np.testing.assert_allclose(ends[0], [2.5, 0])
     distance = exploration.distance_to_target(4.0, 0.1)
-    ahead = exploration.at(distance, np.array([[0.0, 0.0], [2.0, 0.0]]))
+    ahead = exploration.sample_grid(distance, np.array([[0.0, 0.0], [2.0, 0.0]]))
     assert ahead[0] > ahead[1] + 1.5  # the open end of the corridor
-    assert exploration.at(distance, np.array([[0.0, 1.5]]))[0] == FAR
+    assert exploration.sample_grid(distance, np.array([[0.0, 1.5]]))[0] == FAR_DISTANCE
 
 
 def test_the_target_is_the_frontier_that_looks_like_the_goal() -> None:
@@ -173,16 +173,16 @@ def test_the_target_is_the_frontier_that_looks_like_the_goal() -> None:
         exploration = ExplorationMap()
         exploration.update(depth, np.zeros(3), likeness)
         distance = exploration.distance_to_target(4.0, 0.1)
-        there, away = exploration.at(distance, np.array([[nearer, 0.0], [-nearer, 0.0]]))
+        there, away = exploration.sample_grid(distance, np.array([[nearer, 0.0], [-nearer, 0.0]]))
         assert there < away
 
 
 def test_a_refused_step_makes_what_is_ahead_solid() -> None:
     exploration, depth = corridor()
     exploration.update(depth, np.zeros(3), np.zeros(128, np.float32))
-    exploration.note_blocked(np.array([STEP, 0.0, 0.0]))
+    exploration.mark_blocked(np.array([STEP, 0.0, 0.0]))
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] == 1.0
-    exploration.note_blocked(np.zeros(3))
+    exploration.mark_blocked(np.zeros(3))
     assert exploration.look_ahead(np.zeros(3), 1, 1.0)[0][0] < 3 * CELL
 
 
@@ -213,6 +213,6 @@ def test_the_matcher_extends_plans_without_changing_what_it_knows_of_the_real_ep
     there = Situation(Observation(noise(576, 1024, 3, seed=7), BLANK.front, ahead), goal, Key(0, 0), memory)
     (plans,) = policy.extend([there], 3, 5)
     assert len(plans) == 3
-    assert memory.similarity == before.similarity and memory.recalled == before.recalled
+    assert memory.similarity == before.similarity and memory.recalled_gains == before.recalled_gains
     np.testing.assert_array_equal(memory.histogram, before.histogram)
-    np.testing.assert_array_equal(memory.map.seen, before.map.seen)
+    np.testing.assert_array_equal(memory.map.explored, before.map.explored)

@@ -37,7 +37,7 @@ def written(folder: Path, text: str) -> Path:
 
 
 def test_shipped_presets_hold_the_published_rules() -> None:
-    assert presets.names("imagenav") == ["paper", "official"]
+    assert presets.list_presets("imagenav") == ["paper", "official"]
     assert asdict(ImageNav().rules) == asdict(ImageNav(preset="paper").rules) == PAPER
     assert asdict(ImageNav(preset="official").rules) == OFFICIAL
     assert ImageNav(preset="official").budget == 21 * 3

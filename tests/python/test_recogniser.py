@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from wiw.errors import ArgumentError, BackendError, FileError
 from wiw.panorama import directions
-from wiw.perception.calibration import calibration_error, fitted_temperature, softmax
-from wiw.perception.glimpses import CONTEXT, FILL, SIDE, STEP, Glimpses, glimpses, joined
+from wiw.perception.calibration import calibration_error, fit_temperature, softmax
+from wiw.perception.glimpses import CLOSE_FILL, SIDE, STEP, WIDE_FACTOR, Glimpses, extract_glimpses, join_glimpses
 
 NAMES = ("chair", "bed", "plant")
 
@@ -32,7 +32,7 @@ def spot(yaw: float, pitch: float, radius: float, size: tuple[int, int] = (288, 
 def look_at(masks: Any) -> tuple[Glimpses, Any]:
     masks = np.stack(masks)
     panoramas = np.where(masks[..., None], [0, 200, 0], [40, 40, 40]).astype(np.uint8)
-    return glimpses(panoramas, masks, np.arange(len(masks)) == 0)
+    return extract_glimpses(panoramas, masks, np.arange(len(masks)) == 0)
 
 
 def noise(count: int, seed: int) -> Glimpses:
@@ -49,7 +49,7 @@ def noise(count: int, seed: int) -> Glimpses:
 def test_the_box_fills_the_close_view_and_is_where_the_thing_is(yaw: float, pitch: float, radius: float) -> None:
     found, frames = look_at([spot(yaw, pitch, radius)])
     assert frames.tolist() == [0]
-    for view, fill in enumerate((FILL, FILL / CONTEXT)):
+    for view, fill in enumerate((CLOSE_FILL, CLOSE_FILL / WIDE_FACTOR)):
         left, top, right, bottom = found.boxes[0, view]
         assert fill / STEP**2 - 0.03 < max(right - left, bottom - top) < fill + 0.03
         assert abs((left + right) / 2 - 0.5) < 0.05
@@ -84,9 +84,9 @@ def test_frames_without_the_target_give_no_look() -> None:
     assert (len(found), frames.tolist()) == (1, [1])
     assert len(look_at([empty])[0]) == 0
     with pytest.raises(ArgumentError, match="masks"):
-        glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((1, 8, 16), bool), np.ones(2, bool))
+        extract_glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((1, 8, 16), bool), np.ones(2, bool))
     with pytest.raises(ArgumentError, match="flag"):
-        glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((2, 8, 16), bool), np.ones(3, bool))
+        extract_glimpses(np.zeros((2, 8, 16, 3), np.uint8), np.zeros((2, 8, 16), bool), np.ones(3, bool))
     with pytest.raises(ArgumentError, match="boxes"):
         Glimpses(found.images, found.boxes[:0], found.scalars)
     with pytest.raises(ArgumentError, match="NaN"):
@@ -102,7 +102,7 @@ def test_the_temperature_is_found_again(temperature: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     logits = rng.normal(0, 2, (20000, 4))
     labels = (softmax(logits).cumsum(axis=1) > rng.random((20000, 1))).argmax(axis=1)  # drawn from them at 1
-    assert fitted_temperature(temperature * logits, labels) == pytest.approx(temperature, rel=0.06)
+    assert fit_temperature(temperature * logits, labels) == pytest.approx(temperature, rel=0.06)
 
 
 def test_calibration_error_is_the_gap_between_confidence_and_accuracy() -> None:
@@ -146,12 +146,13 @@ def test_sets_are_independent_of_each_other_and_of_the_order_of_looks() -> None:
 def test_looks_are_added_with_their_weights() -> None:
     recogniser = untrained()
     looks = noise(4, 5)
-    from wiw.perception.recognition_network import pictures
+    from wiw.perception.recognition_network import to_network_input
 
     with torch.inference_mode():
-        stacked = pictures(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
+        stacked = to_network_input(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
         logits, weights = (
-            part.double().numpy() for part in recogniser.network.looks(stacked, torch.from_numpy(looks.scalars))
+            part.double().numpy()
+            for part in recogniser.network.encode_glimpses(stacked, torch.from_numpy(looks.scalars))
         )
         independence = float(torch.sigmoid(recogniser.network.independence))
     expected = (weights[:, None] * logits).sum(axis=0) / weights.sum() ** (1 - independence)
@@ -160,10 +161,10 @@ def test_looks_are_added_with_their_weights() -> None:
 
 
 def test_the_box_is_drawn_where_it_is() -> None:
-    from wiw.perception.recognition_network import pictures
+    from wiw.perception.recognition_network import to_network_input
 
     boxes = np.array([[[0.25, 0.5, 0.75, 0.625], [0.1, 0.1, 0.102, 0.9]]], np.float32)
-    drawn = pictures(torch.zeros(1, 2, SIDE, SIDE, 3, dtype=torch.uint8), torch.from_numpy(boxes))[0].numpy()
+    drawn = to_network_input(torch.zeros(1, 2, SIDE, SIDE, 3, dtype=torch.uint8), torch.from_numpy(boxes))[0].numpy()
     filled = (drawn[[3, 7]] + 1) / 2
     assert filled[0, 32:40, 16:48].min() == 1
     assert filled.reshape(2, -1).sum(axis=1) == pytest.approx([8 * 32, 0.002 * 0.8 * SIDE**2], rel=1e-3)
@@ -171,9 +172,9 @@ def test_the_box_is_drawn_where_it_is() -> None:
 
 
 def test_the_shipped_size_is_small() -> None:
-    from wiw.perception.recognition_network import Network, parameters
+    from wiw.perception.recognition_network import Network
 
-    assert 100_000 < parameters(Network(26)) < 600_000
+    assert 100_000 < sum(value.numel() for value in Network(26).parameters()) < 600_000
 
 
 def test_a_saved_recogniser_answers_exactly_as_before(tmp_path: Path) -> None:
@@ -250,7 +251,7 @@ def test_importing_it_imports_no_torch() -> None:
 
 
 def test_joining_nothing_gives_nothing() -> None:
-    assert len(joined([])) == 0
+    assert len(join_glimpses([])) == 0
     parts = [noise(2, 0), noise(1, 1)]
-    assert len(joined(parts)) == 3
-    np.testing.assert_array_equal(joined(parts).images[2], parts[1].images[0])
+    assert len(join_glimpses(parts)) == 3
+    np.testing.assert_array_equal(join_glimpses(parts).images[2], parts[1].images[0])

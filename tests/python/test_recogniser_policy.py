@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 from hypothesis import given
 from hypothesis import strategies as st
 from test_active_recognition import Sink
@@ -39,29 +40,29 @@ def panorama_of(place: Any, position: Any, yaw: float, name: str) -> tuple[Any, 
 @pytest.mark.parametrize("yaw", [0.0, 1.2, -2.5])
 def test_sight_is_where_the_thing_is(two_rooms: str, yaw: float) -> None:
     mask, depth, _ = panorama_of(world(two_rooms), (-1.2, 0, -1.2), yaw, "table")
-    seen = steering.sight(mask, depth)
+    seen = steering.locate_in_view(mask, depth)
     assert np.degrees(seen.bearing) == pytest.approx((90 - np.degrees(yaw) + 180) % 360 - 180, abs=3)  # 1 m to the west
     assert 1.0 < seen.distance < 1.8
     assert seen.side == 0
-    assert steering.sight(np.zeros_like(mask), depth) is None
+    assert steering.locate_in_view(np.zeros_like(mask), depth) is None
 
 
 @pytest.mark.parametrize("start", [(-1.0, 0, 1.2), (-0.6, 0, 1.0)])
 def test_the_side_of_a_detour_is_where_more_is_seen(two_rooms: str, start: Any) -> None:
     place = world(two_rooms)
     mask, depth, thing = panorama_of(place, start, -np.pi / 2, "shelf")  # through the door, behind the wall beside it
-    seen = steering.sight(mask, depth)
+    seen = steering.locate_in_view(mask, depth)
     assert seen.side != 0
     left, right = (visible_share(place, np.add(start, (0, 0, step)), thing) for step in (-0.15, 0.15))
     assert seen.side == (1 if left > right else -1)
     assert abs(left - right) > 0.05
-    first = steering.headings(seen, seen.bearing, 0)[0]
+    first = steering.rank_headings(seen, seen.bearing, 0)[0]
     assert (first - seen.bearing) * seen.side > 0
 
 
 def test_clearance_is_the_way_to_the_walls(two_rooms: str) -> None:
     _, depth, _ = panorama_of(world(two_rooms), (-1.2, 0, -1.2), 0.0, "table")
-    free = steering.clearance(depth)
+    free = steering.measure_clearance(depth)
     assert free[0] == pytest.approx(0.8, abs=0.05)  # the wall in the north
     assert free[8] == pytest.approx(3.0, abs=0.1)  # the partition, beside the way to the wall in the south
     assert free[4] == pytest.approx(1.0, abs=0.1)  # the table in the west
@@ -70,7 +71,7 @@ def test_clearance_is_the_way_to_the_walls(two_rooms: str) -> None:
 
 @given(st.floats(-4, 4), st.lists(st.floats(0, 5), min_size=16, max_size=16), st.integers(1, 6))
 def test_plans_are_turns_and_then_steps_where_it_is_free(heading: float, free: list[float], horizon: int) -> None:
-    plan = steering.plan(heading, np.array(free), horizon).tolist()
+    plan = steering.plan_towards(heading, np.array(free), horizon).tolist()
     assert 1 <= len(plan) <= horizon
     turns = [action for action in plan if action != FORWARD]
     assert plan == turns + [FORWARD] * (len(plan) - len(turns))
@@ -84,19 +85,21 @@ def test_plans_are_turns_and_then_steps_where_it_is_free(heading: float, free: l
 
 def test_a_plan_goes_round_what_is_in_the_way() -> None:
     free = np.full(16, 3.0)
-    assert steering.plan(np.pi / 4, free, 4).tolist() == [TURN_LEFT, TURN_LEFT, FORWARD, FORWARD]
+    assert steering.plan_towards(np.pi / 4, free, 4).tolist() == [TURN_LEFT, TURN_LEFT, FORWARD, FORWARD]
     free[2] = 0.3
-    assert steering.plan(np.pi / 4, free, 4).tolist() == [TURN_LEFT, FORWARD, FORWARD, FORWARD]
-    assert steering.plan(np.pi, np.zeros(16), 3).tolist().count(FORWARD) == 0
-    assert steering.plan(0.0, np.full(16, np.inf), 4).tolist() == [FORWARD] * 4  # nothing stands anywhere around
+    assert steering.plan_towards(np.pi / 4, free, 4).tolist() == [TURN_LEFT, FORWARD, FORWARD, FORWARD]
+    assert steering.plan_towards(np.pi, np.zeros(16), 3).tolist().count(FORWARD) == 0
+    assert (
+        steering.plan_towards(0.0, np.full(16, np.inf), 4).tolist() == [FORWARD] * 4
+    )  # nothing stands anywhere around
 
 
 def test_what_is_large_or_hidden_is_passed_aside_and_what_is_small_is_neared() -> None:
-    small = steering.Sight(0.5, 3.0, np.radians(10), 0.0, 0.0)
-    assert steering.headings(small, 0.5, 0)[0] == 0.5
-    assert steering.headings(replace(small, size=np.radians(60)), 0.5, -1)[0] < 0.5
-    assert steering.headings(replace(small, hidden_left=0.8), 0.5, 1)[0] < 0.5
-    assert steering.headings(None, -1.0, 1)[0] == -1.0
+    small = steering.TargetSighting(0.5, 3.0, np.radians(10), 0.0, 0.0)
+    assert steering.rank_headings(small, 0.5, 0)[0] == 0.5
+    assert steering.rank_headings(replace(small, size=np.radians(60)), 0.5, -1)[0] < 0.5
+    assert steering.rank_headings(replace(small, hidden_left=0.8), 0.5, 1)[0] < 0.5
+    assert steering.rank_headings(None, -1.0, 1)[0] == -1.0
 
 
 # -- answers -----------------------------------------------------------------------------------------------------------
@@ -125,7 +128,7 @@ def policy(weights: Path, **options: Any) -> Any:
 def answers(task: Any, agent: Any, live: int = 4, episodes: int = 1) -> list[list[float]]:
     sink = Sink()
     numbered = [(i, replace(task.episodes(1)[0], start_yaw=0.7 * i)) for i in range(episodes)]
-    run_episodes(task, agent.settled(task.defaults), numbered, seed=0, live=live, sink=sink)
+    run_episodes(task, agent_for(task, agent), numbered, seed=0, live=live, sink=sink)
     assert [result.status for result in sink.results] == ["done"] * episodes
     return [
         [list(row.decision.answer.probabilities) for row in sink.decisions if row.episode == i] for i in range(episodes)
@@ -199,13 +202,13 @@ def test_turns_and_the_order_of_steering_cost_a_plan(two_rooms: str, tmp_path: P
 def test_weights_that_come_with_the_package_know_things_of_unseen_homes() -> None:
     from wiw.perception.recogniser import Recogniser
     from wiw.policies.recogniser import WEIGHTS
-    from wiw.training.looks import START, LookRules, look_around
+    from wiw.training.glimpse_sets import START, GlimpseSetRules, collect_glimpse_sets
 
     recogniser = Recogniser.load(WEIGHTS)
     assert WEIGHTS.stat().st_size < 2 * 2**20
     assert recogniser.card["accuracy"]["start + 3 real"] > recogniser.card["accuracy"]["start"] > 0.75
     assert recogniser.card["calibration_error"]["after"] < 0.05
-    looks = look_around(world("apartments:test/900"), 0, recogniser.categories, LookRules(places=6))
+    looks = collect_glimpse_sets(world("apartments:test/900"), 0, recogniser.categories, GlimpseSetRules(places=6))
     first = [looks.glimpses[np.array([row])] for row in np.flatnonzero(looks.kinds == START)]
     right = recogniser(first).argmax(axis=1) == looks.labels
     assert len(right) >= 20
@@ -220,10 +223,10 @@ def test_front_views_are_looked_at_too(two_rooms: str, tmp_path: Path, weights: 
     frames = observation.front[None]
     mask = wiw.panorama.to_perspective(observation.target.mask.astype(np.uint8), 90.0, (480, 480), 0.0, 0.0, "nearest")
     track = Track(mask[None] > 0, (observation.target.front_box,))
-    look = policy(weights)._looks(Rollout(frames, np.zeros(1, bool), "front"), track)
-    from wiw.perception.glimpses import glimpses
+    look = policy(weights)._extract_glimpses(Rollout(frames, np.zeros(1, bool), "front"), track)
+    from wiw.perception.glimpses import extract_glimpses
 
-    real, _ = glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
+    real, _ = extract_glimpses(observation.panorama[None], observation.target.mask[None], np.zeros(1, bool))
     np.testing.assert_allclose(look.scalars, real.scalars, atol=0.02)
     inside = look.images[0, 0].max(axis=-1) > 0  # nothing is known of what lies beyond the front view
     assert 0.3 < inside.mean() < 1
@@ -239,10 +242,10 @@ def test_a_policy_that_only_proposes_is_revised_by_it(
     monkeypatch.setattr("wiw.policies.recogniser.WEIGHTS", weights)
     task = AR(episode_file=a_file(tmp_path, two_rooms), decisions=2)
     agent = wiw.Agent("heuristic", model)
-    assert isinstance(agent.settled(task.defaults).revision, Recognition)
+    assert isinstance(agent_for(task, agent).reviser, Recognition)
     assert len(answers(task, agent)[0]) == 2
-    assert not isinstance(wiw.Agent("heuristic", "copy", "matcher").settled(task.defaults).revision, Recognition)
-    assert not isinstance(wiw.Agent("matcher", model).settled(task.defaults).revision, Recognition)
+    assert not isinstance(agent_for(task, wiw.Agent("heuristic", "copy", "matcher")).reviser, Recognition)
+    assert not isinstance(agent_for(task, wiw.Agent("matcher", model)).reviser, Recognition)
 
 
 def test_it_is_told_by_its_weights(weights: Path, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch", reason="torch is not installed: pip install
 
 from torch.nn import functional  # noqa: E402
 
-from wiw.perception.rednet_network import RedNet, empty  # noqa: E402
+from wiw.perception.rednet_network import RedNet, create_empty  # noqa: E402
 
 PUBLISHED = {
     "conv1.weight": (64, 3, 7, 7),
@@ -49,7 +49,7 @@ PUBLISHED = {
 
 
 def test_names_and_shapes_are_those_of_the_published_weights() -> None:
-    state = {name: tuple(value.shape) for name, value in empty(40, 64).state_dict().items()}
+    state = {name: tuple(value.shape) for name, value in create_empty(40, 64).state_dict().items()}
     assert {name: state.get(name) for name in PUBLISHED} == PUBLISHED
     assert len(state) == 928
     assert not any("upsample" in name for name in state if name.startswith("final_conv"))
@@ -157,7 +157,7 @@ def test_views_are_fed_as_the_weights_were_trained(network: RedNet, checkpoint: 
     images, depth = seen()
     fed: list[Any] = []
     source._model.register_forward_pre_hook(lambda module, inputs: fed.append(inputs))
-    found = source.views(images, depth)
+    found = source.label_views(images, depth)
     colour = (images / 255 - [0.493, 0.468, 0.438]) / [0.544, 0.521, 0.499]
     part = (np.clip(depth / 10, 0, 1) - 0.213) / 0.285
     for row in range(2):
@@ -175,9 +175,9 @@ def test_views_are_fed_as_the_weights_were_trained(network: RedNet, checkpoint: 
 def test_panoramas_are_looked_at_by_the_faces_of_their_cube(checkpoint: Path) -> None:
     source = SEMANTICS.make("rednet", weights=checkpoint.parent, device="cpu", face=32)
     images, depth = seen()
-    found = source.panoramas(images, depth)
+    found = source.label_panoramas(images, depth)
     assert (found.shape, found.dtype) == ((2, 32, 64), np.dtype(np.uint32))
-    np.testing.assert_array_equal(found[1:], source.panoramas(images[1:], depth[1:]))
+    np.testing.assert_array_equal(found[1:], source.label_panoramas(images[1:], depth[1:]))
     asked: list[Any] = []
 
     def answer(faces: Any, planar: Any) -> Any:
@@ -185,8 +185,8 @@ def test_panoramas_are_looked_at_by_the_faces_of_their_cube(checkpoint: Path) ->
         asked.append((faces.shape, planar))
         return np.broadcast_to(np.arange(1, 7, dtype=np.uint32)[:, None, None], planar.shape).copy()
 
-    source.views = answer
-    found = source.panoramas(images[:1], np.full_like(depth[:1], 5))
+    source.label_views = answer
+    found = source.label_panoramas(images[:1], np.full_like(depth[:1], 5))
     assert asked[0][0] == (6, 32, 32, 3)
     assert asked[0][1].max() < 5 and asked[0][1].min() == pytest.approx(5 / np.sqrt(3), rel=0.05)
     assert [found[0, 16, column] for column in (32, 48, 0, 16)] == [1, 2, 3, 4]  # front, right, back, left
@@ -205,9 +205,9 @@ def test_what_it_cannot_use_is_named(checkpoint: Path, tmp_path: Path) -> None:
     source = SEMANTICS.make("rednet", weights=checkpoint, device="cpu", face=32)
     images, depth = seen()
     with pytest.raises(ArgumentError, match="depth"):
-        source.panoramas(images)
+        source.label_panoramas(images)
     with pytest.raises(ArgumentError, match="multiples of 32"):
-        source.views(images[:, :30], depth[:, :30])
+        source.label_views(images[:, :30], depth[:, :30])
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.analysis.summary import summarise
-from wiw.report.episodes import stories
+from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
 from wiw.report.page import render, sentence
 from wiw.report.plans import glyphs
+from wiw.report.story import Album
 from wiw.studies.evaluate import run_arms
 from wiw.types import Episode
 
@@ -67,25 +68,31 @@ def test_the_page_is_whole_and_needs_nothing_else(page):
 
 def test_the_page_shows_every_arm_decision_and_failure(log, page):
     text = " ".join(page.texts)
-    told, _ = stories(log.store, log.arms)
-    assert [story.index for story in told] == [0, 5]
-    steps = sum(len(attempt.steps) for story in told for attempt in story.attempts)
+    shown, _ = read_stories(log.store, log.arms, Album())
+    assert [story.index for story in shown] == [5, 0]  # first the one that a model wins
+    steps = sum(len(attempt.steps) for story in shown for attempt in story.attempts)
     classes = [attributes.get("class", "") for _, attributes in page.tags]
     assert classes.count("step") == steps and classes.count("attempt") == 8
     assert sum("chosen" in name for name in classes) == steps
-    assert "no such scene" in text and "the ceiling" in text and "the floor" in text
+    assert "no such scene" in text and "ceiling, the true future" in text and "floor, predicts" in text
     assert f"{log.numbers()['warp'].estimates['success'].value:.1f}" in text
 
 
 def test_a_task_that_says_nothing_of_itself_is_spoken_of_plainly(page):
     text = " ".join(page.texts)
     assert "percent of episodes that succeeded." in text and "succeeded, %" in text
-    assert "not succeeded in" in text and "reached in" not in text
+    assert "not succeeded after" in text and "reached" not in text
 
 
 def test_pictures_are_kept_small_and_inside(page):
-    pictures = [attributes["src"] for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) > 20 and all(picture.startswith("data:image/jpeg;base64,") for picture in pictures)
+    pictures = [attributes["href"] for tag, attributes in page.tags if tag == "image"]
+    assert all(picture.startswith("data:image/webp;base64,") for picture in pictures)
+    assert len(pictures) == len(set(pictures))  # what two arms or two decisions have in common is there once
+    shown = [attributes for tag, attributes in page.tags if "picture" in attributes.get("class", "").split()]
+    assert len(shown) > 4 * len(pictures) > 20 and all(attributes["aria-label"] for attributes in shown)
+    identifiers = {attributes["id"] for tag, attributes in page.tags if tag == "symbol"}
+    uses = {attributes["href"][1:] for tag, attributes in page.tags if tag == "use" and "href" in attributes}
+    assert uses == identifiers
 
 
 def test_text_from_a_run_is_escaped(tmp_path):
@@ -110,7 +117,7 @@ def test_text_from_a_run_is_escaped(tmp_path):
 
 def test_a_run_without_an_ended_episode_still_has_a_page(tmp_path):
     log = run_arms(LineTask(broken=("0000",)), {"none": LineAgent()}, 1, out=tmp_path / "run", progress=False)
-    assert "Failures of infrastructure" in render(log)
+    assert "Infrastructure errors" in render(log)
 
 
 def summary(wins, n=40, saved=0.0):
@@ -129,10 +136,10 @@ def summary(wins, n=40, saved=0.0):
 
 
 def test_the_sentence_claims_no_more_than_the_interval_bears():
-    assert "may be chance" in sentence(summary(1))
-    assert "may be chance" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
+    assert "the interval includes 0" in sentence(summary(1))
+    assert "includes 0" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
     assert "primitives" not in sentence(summary(1))
-    assert "It took 2.0 primitives fewer" in sentence(summary(1, saved=2.0))
+    assert "It took 2.0 fewer primitives" in sentence(summary(1, saved=2.0))
     assert sentence(summarise(["none"], [], 3)) == ""
 
 

@@ -16,8 +16,8 @@ import wiw
 from wiw.errors import ArgumentError, FileError
 from wiw.physics import PANDA_READY, Articulation, Box, World, place, read_surface
 from wiw.runs.recipes import AgentRecipe
-from wiw.tabletop.kinds import KINDS
-from wiw.tabletop.robot import own_panda, robot_of
+from wiw.tabletop.robot import load_panda, load_robot
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE, Thing, Workbench
 from wiw.tasks.manipulation import Manipulation
 
@@ -56,40 +56,40 @@ def other(tmp_path: Path) -> Path:
 
 
 def test_another_robot_is_found_its_way_about(other: Path) -> None:
-    robot = robot_of(other)
+    robot = load_robot(other)
     assert (robot.tcp, robot.hand) == ("acme_tool_center", "acme_hand")
     assert robot.fingers == ("acme_leftfinger", "acme_rightfinger") and robot.finger_joints == ("jaw1", "jaw2")
-    tip = robot.description.forward_kinematics(robot.ready)[robot.tcp_index]
-    usual = own_panda().description.forward_kinematics(PANDA_READY)[own_panda().tcp_index]
+    tip = robot.description.forward_kinematics(robot.ready_joints)[robot.tool_index]
+    usual = load_panda().description.forward_kinematics(PANDA_READY)[load_panda().tool_index]
     np.testing.assert_allclose(tip, usual, atol=2e-3)
-    assert robot.ready[-2:] == pytest.approx(0.04)
+    assert robot.ready_joints[-2:] == pytest.approx(0.04)
 
 
 def test_another_robot_takes_a_cube_and_is_seen(other: Path) -> None:
     cube = Thing("cube", ((Box([0.045] * 3), np.eye(4)),), (0.8, 0.1, 0.1), mass=0.08)
-    bench = Workbench([(cube, place(0.15, 0.1, TABLE + 0.0225))], robot=robot_of(other))
-    seen = bench.picture("front", (120, 120))["color"].astype(int)
+    bench = Workbench([(cube, place(0.15, 0.1, TABLE + 0.0225))], robot=load_robot(other))
+    seen = bench.render_view("front", (120, 120))["color"].astype(int)
     teal = (seen[..., 1] > seen[..., 0] + 60) & (np.abs(seen[..., 1] - seen[..., 2]) < 10)
     assert 100 < teal.sum() < 3000
     for height, gripper in ((0.15, 1), (0.02, 1), (0.02, 0), (0.2, 0)):
-        assert bench.go([0.15, 0.1, TABLE + height, np.pi, 0, 0, gripper]).why == "free"
-    assert bench.held == "cube" and bench.place_of("cube")[2, 3] > TABLE + 0.15
+        assert bench.move_to([0.15, 0.1, TABLE + height, np.pi, 0, 0, gripper]).reason == "free"
+    assert bench.held_object == "cube" and bench.get_pose("cube")[2, 3] > TABLE + 0.15
 
 
 def test_equal_descriptions_are_equal_robots(other: Path, tmp_path: Path) -> None:
     equal, fatter = (shutil.copytree(other.parents[1], tmp_path / name / "acme_description") for name in "ab")
     cube_stl(fatter / "meshes/hand.stl", 101.0)
-    assert robot_of(equal / "urdf/acme.urdf").identity == robot_of(other).identity != own_panda().identity
-    assert robot_of(fatter / "urdf/acme.urdf").identity != robot_of(other).identity
+    assert load_robot(equal / "urdf/acme.urdf").identity == load_robot(other).identity != load_panda().identity
+    assert load_robot(fatter / "urdf/acme.urdf").identity != load_robot(other).identity
 
 
 def test_a_task_names_its_robot(other: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     task = Manipulation("slide_block", robot=other)
-    assert task.describe()["robot"] == robot_of(other).identity
+    assert task.describe()["robot"] == load_robot(other).identity
     assert Manipulation("slide_block").describe()["robot"] == {"name": "panda"}
-    assert task.table(task.episode(0)).bench.robot is task.robot
+    assert task.set_table(task.episode(0)).bench.robot is task.robot
     monkeypatch.chdir(other.parent)
-    assert Manipulation.portable({"robot": "acme.urdf"})["robot"] == str(other)
+    assert Manipulation.make_portable({"robot": "acme.urdf"})["robot"] == str(other)
 
 
 @pytest.mark.parametrize(
@@ -106,24 +106,24 @@ def test_a_task_names_its_robot(other: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_what_cannot_work_at_the_table_is_refused(other: Path, old: str, new: str, words: str) -> None:
     other.write_text(other.read_text().replace(old, new))
     with pytest.raises(ArgumentError, match=f"(?s){words}"):
-        robot_of(other)
+        load_robot(other)
 
 
 def test_a_link_may_be_named_as_the_tool(other: Path) -> None:
     other.write_text(other.read_text().replace("tool_center", "point"))
-    robot = robot_of(other, "acme_point")
+    robot = load_robot(other, "acme_point")
     assert robot.tcp == "acme_point" and robot.identity["tcp"] == "acme_point"
     with pytest.raises(ArgumentError, match="acme_elbow"):
-        robot_of(other, "acme_elbow")
+        load_robot(other, "acme_elbow")
     with pytest.raises(ArgumentError, match="moving along y"):
-        robot_of(other, "acme_link8")  # turned by 45 degrees from the hand
+        load_robot(other, "acme_link8")  # turned by 45 degrees from the hand
 
 
 @pytest.mark.parametrize("damage", [lambda file: file.unlink(), lambda file: file.write_bytes(b"\0" * 200)])
 def test_a_missing_or_damaged_mesh_is_named_with_its_link(other: Path, damage) -> None:
     damage(other.parents[1] / "meshes/hand.stl")
     with pytest.raises(FileError, match=r"hand\.stl.*acme_hand"):
-        robot_of(other)
+        load_robot(other)
 
 
 def test_surfaces_of_files_keep_axes_scale_and_colours(tmp_path: Path) -> None:
@@ -156,13 +156,13 @@ def test_a_joint_that_mimics_goes_where_the_other_is_told_to_go(other: Path) -> 
 
 
 def test_the_real_description_does_the_work(franka_urdf: Path) -> None:
-    robot, kind = robot_of(franka_urdf), KINDS["insert_peg"]
-    setup = kind.setup(3, 4)
-    bench = setup.bench(robot=robot)
-    for pose in kind.expert(bench.places(setup.objects), setup.target):
-        bench.go(pose)
-    assert kind.succeeded(bench, setup)
-    assert sum(len(mesh["triangles"]) for _, mesh in robot.looks) > 50_000
+    robot, kind = load_robot(franka_urdf), TABLETOP_TASKS["insert_peg"]
+    setup = kind.create_setup(3, 4)
+    bench = setup.build_workbench(robot=robot)
+    for pose in kind.plan_expert(bench.get_poses(setup.objects), setup.target):
+        bench.move_to(pose)
+    assert kind.is_success(bench, setup)
+    assert sum(len(mesh["triangles"]) for _, mesh in robot.link_meshes) > 50_000
 
 
 PLY = """ply
@@ -226,25 +226,25 @@ def write(file: Path, text: str) -> Path:
 
 def test_an_arm_that_is_not_seen_leaves_the_things_where_they_are(tmp_path: Path) -> None:
     bare = re.sub(r"<visual>.*?</visual>", "", OWN, flags=re.S)
-    setup = KINDS["push_buttons"].setup(3, 0)
+    setup = TABLETOP_TASKS["push_buttons"].create_setup(3, 0)
     seen, with_own = (
-        setup.bench(robot=robot).picture("front", (120, 120), ("instance",), arm=False)["instance"]
-        for robot in (robot_of(write(tmp_path / "bare.urdf", bare)), None)
+        setup.build_workbench(robot=robot).render_view("front", (120, 120), ("instance",), arm=False)["instance"]
+        for robot in (load_robot(write(tmp_path / "bare.urdf", bare)), None)
     )
     np.testing.assert_array_equal(seen, with_own)
 
 
 def test_a_panda_of_narrower_fingers_works(tmp_path: Path) -> None:
     narrow = write(tmp_path / "narrow.urdf", OWN.replace('upper="0.04"', 'upper="0.035"'))
-    assert robot_of(narrow).ready[-2:] == pytest.approx(0.035)
+    assert load_robot(narrow).ready_joints[-2:] == pytest.approx(0.035)
     Manipulation("slide_block", robot=narrow).environment().reset(seed=0)
 
 
 def test_a_description_that_has_changed_is_another_robot(other: Path) -> None:
-    first = robot_of(other)
-    assert robot_of(other) is first
+    first = load_robot(other)
+    assert load_robot(other) is first
     other.write_text(other.read_text().replace("0 0.6 0.6 1", "0.6 0 0 1"))
-    assert robot_of(other).identity != first.identity
+    assert load_robot(other).identity != first.identity
 
 
 def test_a_model_that_draws_one_arm_is_refused_with_another(other: Path, tmp_path: Path) -> None:
@@ -255,16 +255,16 @@ def test_a_model_that_draws_one_arm_is_refused_with_another(other: Path, tmp_pat
 
 
 def test_a_bench_and_its_fork_are_drawn_by_two_threads(tmp_path: Path) -> None:
-    setup = KINDS["slide_block"].setup(3, 0)
-    bench = setup.bench()
+    setup = TABLETOP_TASKS["slide_block"].create_setup(3, 0)
+    bench = setup.build_workbench()
     fork = bench.fork()
-    fork.go([0.15, 0.1, TABLE + 0.1, np.pi, 0, 0, 1])
-    alone = [each.picture("front", (48, 48))["color"] for each in (bench, fork)]
+    fork.move_to([0.15, 0.1, TABLE + 0.1, np.pi, 0, 0, 1])
+    alone = [each.render_view("front", (48, 48))["color"] for each in (bench, fork)]
     usual = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     try:
         with ThreadPoolExecutor(2) as pool:
-            taken = list(pool.map(lambda k: (bench, fork)[k % 2].picture("front", (48, 48))["color"], range(120)))
+            taken = list(pool.map(lambda k: (bench, fork)[k % 2].render_view("front", (48, 48))["color"], range(120)))
     finally:
         sys.setswitchinterval(usual)
     assert all(np.array_equal(picture, alone[k % 2]) for k, picture in enumerate(taken))

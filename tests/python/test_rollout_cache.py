@@ -15,8 +15,8 @@ import pytest
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.errors import ArgumentError
-from wiw.loop.attempts import Attempts
-from wiw.loop.rollout_cache import Remembered, RolloutCache, default_folder, remember
+from wiw.loop.attempts import Attempted
+from wiw.loop.rollout_cache import Cached, RolloutCache, cache_rollouts, default_folder
 from wiw.runs.recipes import TaskRecipe
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import Accepts
@@ -63,12 +63,12 @@ def question(*plans, image=5, seeds=None, shared=0):
 
 def asked(ask, *given):
     before = Counting.rows
-    frames = ask(*given)
+    frames = ask.rollout(*given)
     return frames, Counting.rows - before
 
 
 def make(folder, model=None, **options):
-    return Remembered(Attempts(model or Counting()), RolloutCache(folder, **options))
+    return Cached(Attempted(model or Counting()), RolloutCache(folder, **options))
 
 
 def own(frames, controls):
@@ -178,7 +178,7 @@ def test_many_writers_and_readers_agree(tmp_path) -> None:
     def work(seed):
         order = np.random.default_rng(seed).permutation(np.repeat(np.arange(8), 8))
         ask = make(tmp_path, budget_gb=6 * (32 + 2 * H * W * 3) / 2**30)
-        wrong.extend(i for i in order if (ask(*question(FF, image=i))[0, 1:] != right[i][0, 1:]).any())
+        wrong.extend(i for i in order if (ask.rollout(*question(FF, image=i))[0, 1:] != right[i][0, 1:]).any())
 
     threads = [threading.Thread(target=work, args=(seed,)) for seed in range(6)]
     for thread in threads:
@@ -190,12 +190,12 @@ def test_many_writers_and_readers_agree(tmp_path) -> None:
 
 def test_who_is_cached(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("WIW_CACHE", str(tmp_path))
-    kept = remember(Attempts(Counting()), "auto")
-    assert isinstance(kept, Remembered) and kept.cache.folder == default_folder() == tmp_path / "rollouts"
-    warp, oracle = Attempts(wiw.world_model("warp")), Attempts(wiw.world_model("oracle"))
-    assert remember(warp, "auto") is warp and isinstance(remember(warp, tmp_path / "x"), Remembered)
-    assert remember(oracle, tmp_path / "x") is oracle
-    assert not isinstance(remember(Attempts(Counting()), "off"), Remembered)
+    kept = cache_rollouts(Attempted(Counting()), "auto")
+    assert isinstance(kept, Cached) and kept.cache.folder == default_folder() == tmp_path / "rollouts"
+    warp, oracle = Attempted(wiw.world_model("warp")), Attempted(wiw.world_model("oracle"))
+    assert cache_rollouts(warp, "auto") is warp and isinstance(cache_rollouts(warp, tmp_path / "x"), Cached)
+    assert cache_rollouts(oracle, tmp_path / "x") is oracle
+    assert not isinstance(cache_rollouts(Attempted(Counting()), "off"), Cached)
 
 
 def fingerprint_of(**changes) -> str:
@@ -229,11 +229,11 @@ def test_a_model_without_a_version_is_never_cached_and_a_warning_names_it(tmp_pa
     class Nameless(Counting):
         version = ""
 
-    ask = Attempts(Nameless())
+    ask = Attempted(Nameless())
     assert not ask.model.fingerprint()
     with caplog.at_level(logging.WARNING, "wiw.rollouts"):
-        assert remember(ask, tmp_path / "x") is ask and remember(ask, "auto") is ask
-        assert remember(ask, "off") is ask
+        assert cache_rollouts(ask, tmp_path / "x") is ask and cache_rollouts(ask, "auto") is ask
+        assert cache_rollouts(ask, "off") is ask
     assert caplog.text.count("rollouts of Nameless are not cached: it declares no version") == 1
     assert "version = '1'" in caplog.text and not (tmp_path / "x").exists()
 
@@ -286,7 +286,7 @@ class Logged(wiw.WorldModel):
 def test_the_same_run_twice_asks_nothing(tmp_path, two_rooms) -> None:
     (tmp_path / "logged.py").write_text(MODEL)
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
-    agent = wiw.runs.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", revision="matcher")
+    agent = wiw.runs.recipes.AgentRecipe("heuristic", f"{tmp_path}/logged.py:Logged", reviser="matcher")
 
     def run(name, **options):
         log = wiw.evaluate(task, agent, 3, out=tmp_path / name, progress=False, cache=tmp_path / "cache", **options)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
+import gzip
 import json
 import sqlite3
+from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from fakes import LineTask
 import wiw
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
-from wiw.runs.store import RunStore
+from wiw.runs.store import SCHEMA_VERSION, RunStore
 from wiw.studies.run_log import load_run
 from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation, Proposal, Rollout, Truth
 
@@ -92,9 +95,59 @@ def test_partial_episodes_are_discarded_on_resume_and_never_shown(run, tmp_path)
         store.write(decision_row("warp", record(1, 0), with_images=True))
 
 
-def test_failed_episodes_are_pending_only_when_asked(run):
-    run.write(OutcomeRow("warp", EpisodeResult(1, "0001", "line/0", "failed", error="disk")))
-    assert run.pending("warp") == [0, 2] and run.pending("warp", retry_failed=True) == [0, 1, 2]
+def test_episodes_with_errors_are_pending_only_when_asked(run):
+    run.write(OutcomeRow("warp", EpisodeResult(1, "0001", "line/0", "error", error="disk")))
+    assert run.pending("warp") == [0, 2] and run.pending("warp", retry_errors=True) == [0, 1, 2]
+
+
+@pytest.fixture
+def old_run(tmp_path, monkeypatch):
+    """A run of two episodes with schema version 7, in which the second ended with an error, called "failed" then."""
+    dump = gzip.decompress((Path(__file__).parents[1] / "data" / "run_schema_7.sql.gz").read_bytes()).decode()
+    folder = tmp_path / "old"
+    folder.mkdir()
+    with closing(sqlite3.connect(folder / "run.sqlite")) as connection:
+        connection.executescript(dump)
+        ((version,),) = connection.execute("SELECT wiw_version FROM run")
+    monkeypatch.setattr(wiw, "__version__", version)
+    return folder
+
+
+def version_and_statuses(folder):
+    with closing(sqlite3.connect(folder / "run.sqlite")) as connection:
+        ((version,),) = connection.execute("PRAGMA user_version")
+        return version, [status for (status,) in connection.execute("SELECT status FROM outcome ORDER BY episode")]
+
+
+def test_a_store_of_an_older_schema_is_read_as_it_lies(old_run):
+    log = load_run(old_run)
+    assert [row["status"] for row in log.episodes] == ["done", "error"]
+    assert log.numbers()["none"].errors == 1 and log.numbers()["none"].done == 1 and len(log.decisions) == 5
+    assert log.store.pending("none") == [] and log.store.pending("none", retry_errors=True) == [1]
+    assert "no such scene" in log.report().read_text()
+    log.close()
+    assert version_and_statuses(old_run) == (7, ["done", "failed"])
+
+
+def test_a_store_of_an_older_schema_is_updated_when_it_is_resumed(old_run):
+    with RunStore.resume(old_run) as store:
+        assert store.pending("none", retry_errors=True) == [1] and len(store.decisions()) == 5
+        store.discard("none", [1])
+        store.write(OutcomeRow("none", EpisodeResult(1, "0001", "line/0", "error", error="disk")))
+    assert version_and_statuses(old_run) == (SCHEMA_VERSION, ["done", "error"])
+    with RunStore.read(old_run) as store:
+        assert [row["error"] for row in store.outcomes()] == ["", "disk"]
+    with closing(sqlite3.connect(old_run / "run.sqlite")) as connection, pytest.raises(sqlite3.IntegrityError):
+        connection.execute("UPDATE outcome SET status = 'failed'")
+
+
+@pytest.mark.parametrize("version", [6, SCHEMA_VERSION + 1])
+def test_a_store_of_an_unknown_schema_is_refused(old_run, version):
+    with closing(sqlite3.connect(old_run / "run.sqlite")) as connection:
+        connection.execute(f"PRAGMA user_version = {version}")
+    for open_store in (RunStore.read, RunStore.resume):
+        with pytest.raises(StoreError, match=f"schema version {version}; .*reads versions 7 to {SCHEMA_VERSION}"):
+            open_store(old_run)
 
 
 def test_two_writers_are_refused(run):

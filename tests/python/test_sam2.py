@@ -82,7 +82,7 @@ def test_a_panorama_is_turned_so_that_the_target_is_in_the_middle(weights: Path)
         marked[:, 20:40, 56:72] = True
         return marked
 
-    tracker._follow = spy
+    tracker._track_video = spy
     for across in (False, True):
         view = observation(across)
         track = follow(tracker, view)
@@ -116,7 +116,7 @@ def test_masks_are_read_back_and_lost_targets_left_out(
 
     monkeypatch.setattr(tracker._model, "propagate_in_video_iterator", answer)
     track = follow(tracker, observation())
-    assert track.found.tolist() == [found] * 3
+    assert track.visible.tolist() == [found] * 3
     if found:
         left, top, right, bottom = track.boxes[0]
         shift = 4  # the target's middle is 4 columns right of the panorama's

@@ -11,7 +11,8 @@ import pytest
 import wiw
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
-from wiw.loop.agent import Query, consults
+from wiw.experiments.gating import Gated, is_consulted
+from wiw.loop.memory import Query
 from wiw.runs.recipes import AgentRecipe
 from wiw.types import Goal, Key, Observation, Proposal
 
@@ -20,7 +21,7 @@ def test_shares_of_decisions_are_nested_and_as_large_as_said() -> None:
     keys = [Key(5, e, d) for e in range(100) for d in range(20)]
     before: set[Key] = set()
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
-        chosen = {key for key in keys if consults(key, share)}
+        chosen = {key for key in keys if is_consulted(key, share)}
         assert before <= chosen and abs(len(chosen) / len(keys) - share) < 0.04
         before = chosen
     assert len(before) == len(keys)
@@ -50,27 +51,35 @@ def test_fewer_candidates_are_the_first_of_the_pool() -> None:
         (decision,) = agent.decide_batch([query()])
         assert agent.policy.asked == 4
         assert [len(p.actions) for p in decision.proposals] == [1, 2, 3, 4][:count]
-        assert agent.but().pool == 4 and agent.describe()["pool"] == 4
+        assert agent.replace().config.pool == 4 and agent.describe()["pool"] == 4
     with pytest.raises(ArgumentError, match="pool"):
         wiw.Agent(Many(), "copy", candidates=4, pool=3)
     with pytest.raises(ArgumentError, match="imagine_fraction"):
-        wiw.Agent(Many(), "copy", imagine_fraction=1.5)
+        Gated(wiw.world_model("copy"), 1.5)
 
 
 def test_decisions_without_imagination_follow_the_proposer() -> None:
-    agent = wiw.Agent(Many(), "copy", imagine_fraction=0.5)
+    agent = wiw.Agent(Many(), Gated(wiw.world_model("copy"), 0.5))
     queries = [query(episode) for episode in range(12)]
     decisions = agent.decide_batch(queries)
     for asked, decision in zip(queries, decisions, strict=True):
-        imagines = consults(asked.key, 0.5)
+        imagines = is_consulted(asked.key, 0.5)
         assert (decision.rollouts is not None) == imagines
         assert decision.chosen == (2 if imagines else 0)
         assert decision.calls.get("consultations", 0) == imagines
     assert 0 < sum(d.rollouts is not None for d in decisions) < 12
 
 
+def test_a_share_of_all_decisions_is_the_model_itself() -> None:
+    def describe(fraction):
+        return wiw.Agent(Many(), Gated(wiw.world_model("copy"), fraction)).describe()
+
+    plain = wiw.Agent(Many(), "copy").describe()
+    assert describe(1.0) == plain and describe(0.25) == {**plain, "imagine_fraction": 0.25}
+
+
 def test_a_sweep_in_python(two_rooms, tmp_path) -> None:
-    agent = AgentRecipe("heuristic", "copy", revision="matcher")
+    agent = AgentRecipe("heuristic", "copy", reviser="matcher")
     options = {"scenes": two_rooms, "decisions": 3}
     found = wiw.scale(
         "imagenav", agent, [1, 3], [0.0, 0.5, 1.0], episodes=3, out=tmp_path / "run", progress=False,

@@ -14,7 +14,7 @@ from wiw.errors import ArgumentError
 from wiw.policies.base import Situation
 from wiw.policies.scripted import Scripted
 from wiw.studies.evaluate import evaluate
-from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tasks.manipulation import Manipulation
 from wiw.types import Goal, Key, Proposal, Rollout
 
@@ -25,7 +25,7 @@ def begun(name: str, episode: int = 0, seed: int = 11) -> tuple[Any, Situation]:
     return env, Situation(observation, env.goal, Key(seed, episode), None)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_plans_are_functions_of_the_decision(name: str) -> None:
     _, one = begun(name)
     _, other = begun(name, 1)
@@ -35,7 +35,7 @@ def test_plans_are_functions_of_the_decision(name: str) -> None:
         np.testing.assert_array_equal(plan.actions, again.actions)
     assert len(together[0]) == 5 and len({plan.actions.tobytes() for plan in together[0]}) == 5
     for plan in together[0]:
-        assert 1 <= len(plan.actions) <= 5 and KINDS[name].target_of(plan.text)
+        assert 1 <= len(plan.actions) <= 5 and TABLETOP_TASKS[name].parse_target(plan.text)
         assert plan.prior == 0, "it does not know which of its plans err"
     later = Scripted().propose([Situation(one.observation, one.goal, one.key.at(1), None)], 1, 5)[0][0]
     assert not np.array_equal(later.actions, together[0][0].actions)
@@ -60,9 +60,9 @@ def test_it_errs_at_its_rates() -> None:
             [Situation(situation.observation, situation.goal, situation.key.at(decision), None)], 5, 5
         )[0]
     ]
-    right = [plan for plan in plans if kind.target_of(plan.text) == setup.target]
+    right = [plan for plan in plans if kind.parse_target(plan.text) == setup.target]
     assert 0.33 < len(right) / len(plans) < 0.57
-    exact = kind.expert(situation.observation.places, setup.target)
+    exact = kind.plan_expert(situation.observation.places, setup.target)
     off = np.array([plan.actions[2, :2] - exact[2, :2] for plan in right])
     assert 0.003 < off.std() < 0.02 and np.abs(off).max() < 0.05
     assert np.linalg.norm(exact[2, :2] - square) < 0.1
@@ -72,23 +72,24 @@ def test_it_stays_where_nothing_is_left() -> None:
     env, situation = begun("push_buttons")
     setup = env.table.setup
     wrong = next(name for name in setup.objects if name != setup.target[0])
-    for pose in env.table.kind.expert(situation.observation.places, (wrong,)):
+    for pose in env.table.kind.plan_expert(situation.observation.places, (wrong,)):
         env.step(pose)
     lost = Situation(env.observation, env.goal, situation.key.at(1), None)
     for plan in Scripted().propose([lost], 2, 5)[0]:
         np.testing.assert_allclose(plan.actions, np.tile(env.observation.pose, (5, 1)))
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_true_futures_of_right_plans_score_best(name: str) -> None:
     env, situation = begun(name, 2)
     kind, setup = env.table.kind, env.table.setup
     places = situation.observation.places
-    targets = [setup.target, *kind.alternatives(setup.objects, setup.target)[:2]]
-    plans = [Proposal(kind.expert(places, target)[:5]) for target in targets]
+    targets = [setup.target, *kind.list_alternatives(setup.objects, setup.target)[:2]]
+    plans = [Proposal(kind.plan_expert(places, target)[:5]) for target in targets]
     plans.append(Proposal(situation.observation.pose[None]))
     futures = [
-        Rollout(env.fork().fronts_after(plan.actions, (240, 240)), np.zeros(len(plan.actions), bool)) for plan in plans
+        Rollout(env.fork().render_fronts_after(plan.actions, (240, 240)), np.zeros(len(plan.actions), bool))
+        for plan in plans
     ]
     (scores,) = Scripted().score([situation], [plans], [futures])
     assert scores.shape == (4,) and scores[0] > scores[1:].max() + 0.1
@@ -114,16 +115,16 @@ def test_it_revises_other_policies_of_a_gripper(tmp_path: Path) -> None:
         space = "pose7"
 
         def propose(self, situations: Any, candidates: int, horizon: int) -> Any:
-            kind = KINDS["slide_block"]
+            kind = TABLETOP_TASKS["slide_block"]
             return [
                 [
                     Proposal(s.observation.pose[None]),
-                    Proposal(kind.expert(s.observation.places, kind.target_of(s.goal.text))[:horizon]),
+                    Proposal(kind.plan_expert(s.observation.places, kind.parse_target(s.goal.text))[:horizon]),
                 ]
                 for s in situations
             ]
 
-    agent = wiw.Agent(Wavering(), "oracle", revision="scripted")
+    agent = wiw.Agent(Wavering(), "oracle", reviser="scripted")
     log = evaluate(Manipulation("slide_block"), agent, 2, out=tmp_path, progress=False)
     assert [decision["chosen"] for decision in log.decisions] == [1, 1]
 

@@ -28,14 +28,14 @@ from websockets.sync.server import serve as serve_sync
 import wiw
 from wiw.errors import ArgumentError, ContractError, InfrastructureError, RemoteError, RolloutError
 from wiw.loop import attempts
-from wiw.loop.attempts import Attempts
+from wiw.loop.attempts import Attempted
 from wiw.serving import outbox
 from wiw.serving import server as serving
 from wiw.serving.background import served
 from wiw.serving.known import Known
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, History
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import patience
@@ -53,7 +53,20 @@ def seen(batch, needs=(), start=0):
         image,
         depth=np.broadcast_to(shades, (batch, *SIZE)).astype(np.float32) if "depth" in needs else None,
         semantic=np.broadcast_to(shades, (batch, *SIZE)).astype(np.uint32) if "semantic" in needs else None,
-        history=[image[:1].repeat(place + 1, 0) for place in range(batch)] if "history" in needs else None,
+        history=past(image) if "history" in needs else None,
+    )
+
+
+def past(image, most=3):
+    """A history that ends with the image, of one row more of the shade before than of the next."""
+    batch = len(image)
+    places = np.arange(batch)
+    return History(
+        np.stack([image - 1, image, image], 1)[:, :most],
+        np.repeat(places[:, None, None], 3, 1) * np.ones(3),
+        np.broadcast_to(np.arange(4, dtype=np.int8), (batch, 2, 4)) * (np.arange(4) < places[:, None, None] % 4 + 1),
+        np.repeat(places[:, None] % 4 + 1, 2, 1),
+        1 + places % 3,
     )
 
 
@@ -71,7 +84,7 @@ def plans(batch, count=5, length=None, shared=0):
 class Mixing(wiw.WorldModel):
     """Its frames are a function of all that a row is given; notes the batches that it is asked for."""
 
-    accepts = wiw.accepts("trajectory", size=SIZE, best_batch=8, needs=("depth", "semantic", "history"))
+    accepts = wiw.accepts("trajectory", size=SIZE, best_batch=8, needs=("depth", "semantic", "history"), history=3)
 
     def __init__(self, seconds=0.0):
         self.seconds, self.batches, self.gate = seconds, [], None
@@ -88,7 +101,10 @@ class Mixing(wiw.WorldModel):
                 seeds[row] % np.uint64(251),
                 observations.depth[row].sum(),
                 observations.semantic[row].sum(),
-                observations.history[row].sum(),
+                observations.history.images[row].sum(),
+                5 * observations.history.poses[row].sum(),
+                7 * (observations.history.actions[row] * np.arange(1, 3)[:, None]).sum(),
+                11 * observations.history.lengths[row].sum() + 13 * observations.history.count[row],
                 control.trajectory.sum() * 3,
             ]
             frames[row, 1:] += np.uint8(int(sum(map(int, facts))) % 256)
@@ -187,7 +203,7 @@ def test_a_whole_run_is_the_same_as_at_home(two_rooms, tmp_path):
     from wiw.tasks.imagenav import ImageNav
 
     def facts(model, name):
-        agent = wiw.Agent("heuristic", model, revision="matcher")
+        agent = wiw.Agent("heuristic", model, reviser="matcher")
         out = tmp_path / name
         wiw.evaluate(ImageNav(scenes=two_rooms, decisions=2), agent, 2, out=out, progress=False, workers=1)
         with RunStore.read(out) as store:
@@ -231,7 +247,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
             ask(client)
         assert caught.value.kind == kind
         with pytest.raises(RolloutError) as caught:
-            Attempts(client, 20.0)(seen(4), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 20.0).rollout(seen(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind
 
 
@@ -245,7 +261,7 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
             ask(client, 4)
         assert caught.value.kind == "deadline" and time.monotonic() - begin < 5
         with pytest.raises(RolloutError) as caught:
-            Attempts(client, 0.5)(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 0.5).rollout(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == "deadline"
         wait_for(lambda: len(server.queue) == 0)
         gate.set()
@@ -431,8 +447,10 @@ def test_a_client_that_was_closed_says_so_at_once():
 def test_a_row_that_is_too_large_is_told_of_at_once():
     with remote(Mixing()) as (client, _):
         observations = seen(1, ("depth", "semantic"))
-        observations = replace(observations, history=[np.zeros((3000, *SIZE, 3), np.uint8)])
-        with pytest.raises(RemoteError, match="a history may have 64 frames") as caught:
+        history = seen(1, ("history",)).history
+        history = replace(history, images=np.zeros((1, 3000, *SIZE, 3), np.uint8))
+        observations = replace(observations, history=history)
+        with pytest.raises(RemoteError, match="or a shorter history if it needs one") as caught:
             client.rollout(observations, plans(1), np.zeros(1, np.uint64))
         assert caught.value.kind == "row"
 

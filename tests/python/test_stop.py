@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from wiw.evaluation.runlog import load_run
-from wiw.evaluation.store import RunStore
+from wiw.runs.store import RunStore
+from wiw.studies.run_log import load_run
 
 BUSY = """
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_a_run_whose_calls_outlive_the_deadline_is_invalid_and_ends(tmp_path: Pa
     process = start_run(tmp_path, "with_torch()", "--deadline", 0.3)
     said, shown = process.communicate(timeout=300)
     assert process.returncode == 1, shown
-    assert "2 episodes failed for infrastructure" in shown and str(tmp_path / "run") in said
+    assert "2 infrastructure errors, excluded from scores" in shown and str(tmp_path / "run") in said
     assert [episode["kind"] for episode in load_run(tmp_path / "run").episodes] == ["world_model/deadline"] * 2
 
 

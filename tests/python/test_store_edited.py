@@ -12,10 +12,10 @@ import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.evaluation.evaluate import resume_run, run_arms
-from wiw.evaluation.export import tables
-from wiw.evaluation.runlog import load_run
-from wiw.evaluation.store import DECISION_JSON
+from wiw.report.export import tables
+from wiw.runs.store import DECISION_JSON
+from wiw.studies.evaluate import resume_run, run_arms
+from wiw.studies.run_log import load_run
 
 ODD = (
     "",

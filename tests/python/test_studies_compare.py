@@ -11,7 +11,7 @@ import wiw
 from wiw.analysis.statistics import estimate_difference, mcnemar
 from wiw.cli import main
 from wiw.errors import ArgumentError, StoreError
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import load_run
 
@@ -47,7 +47,7 @@ def test_common_arms_are_paired_by_episode(runs):
 
 def test_it_says_what_differs_between_the_agents(runs):
     remarks = wiw.compare(*runs).remarks()
-    assert remarks[0] == "copy: both runs describe the same agent." and remarks[2] == "warp: drive 0.4 -> 0.8."
+    assert remarks[0] == "copy: same agent in both runs." and remarks[2] == "warp: drive 0.4 -> 0.8."
 
 
 def test_arms_of_two_names(runs):
@@ -103,11 +103,11 @@ class Moved(LineTask):
         (LineTask(), 12, None, r"episodes is 16 in the first and 12 in the second.*--episodes 16"),
         (Moved(change=(("scene", "line/x"),)), 16, None, r'episode 3: scene is "line/1" in the first and "line/x"'),
         (Moved(change=(("start_yaw", 1.0),)), 16, None, "episode 3: start_yaw is 0.0 in the first and 1.0"),
-        (Moved(change=(("geodesic", 9.0),)), 16, None, r"episode 3: shortest way is .*the scene itself has changed"),
+        (Moved(change=(("geodesic", 9.0),)), 16, None, r"episode 3: shortest path is .*the scene itself has changed"),
     ],
 )
 def test_unlike_runs_are_refused_by_the_first_difference(runs, tmp_path, task, count, seed, message, capsys):
-    run_arms(task, {"warp": LineAgent(0.5)}, count, seed, out=tmp_path / "run", progress=False)
+    run_arms(task, {"warp": LineAgent(0.5)}, count, seed=seed, out=tmp_path / "run", progress=False)
     with pytest.raises(StoreError, match=message):
         wiw.compare(runs[0], tmp_path / "run")
     assert main(["compare", str(runs[0]), str(tmp_path / "run")]) == 2
@@ -124,8 +124,8 @@ def test_scenes_may_lie_elsewhere(runs, tmp_path):
     assert wiw.compare(*copies).difference("warp · there", "warp · here").estimate.n == 4
 
 
-def test_infrastructure_failures_leave_their_pair_out(runs, tmp_path):
+def test_infrastructure_errors_leave_their_pair_out(runs, tmp_path):
     run_arms(LineTask(broken=("0002",)), {"warp": LineAgent(0.5)}, 16, out=tmp_path / "run", progress=False)
     found = wiw.compare(runs[0], tmp_path / "run")
     assert found.difference("warp · run", "warp · old").estimate.n == 15
-    assert found["warp · run"].failed == 1
+    assert found["warp · run"].errors == 1

@@ -10,12 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, agent_for
 
 import wiw
 import wiw.tasks.navigation
 from wiw.errors import ArgumentError, ContractError, FileError, InfrastructureError, RegistryError, StoreError
-from wiw.runs.recipes import AgentRecipe, Ready, TaskRecipe, absolute, arm_recipes
+from wiw.experiments.fidelity import FidelityObserver
+from wiw.experiments.gating import Gated
+from wiw.experiments.placebos import ShuffledPlacebo
+from wiw.loop.attempts import Attempted
+from wiw.runs.recipes import AgentRecipe, TaskInMemory, TaskRecipe, absolute, arm_recipes
 from wiw.runs.store import store_path
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
@@ -57,14 +61,14 @@ def test_results_depend_on_the_seed(reference, tmp_path):
 
 
 def test_pictures_are_kept_for_chosen_episodes(reference, tmp_path):
-    assert reference.store.info["pictures"] == [0, 7]
+    assert reference.store.info["pictures"] == [1, 7]  # a model wins the first, the other is spread evenly
     assert reference.store.images("warp", 7, 0) and not reference.store.images("warp", 3, 0)
     assert not run(tmp_path / "run", episodes=2, keep_images=0).store.images("warp", 0, 0)
 
 
 def test_broken_episodes_fail_for_infrastructure_and_the_rest_goes_on(tmp_path):
     log = run(tmp_path / "run", task=LineTask(broken=("0002",)), workers=2)
-    failed = [row for row in log.episodes if row["status"] == "failed"]
+    failed = [row for row in log.episodes if row["status"] == "error"]
     assert [row["episode"] for row in failed] == [2, 2]
     assert "no such scene" in failed[0]["error"] and failed[0]["metrics"] == {}
     assert log.numbers()["warp"].done == 7
@@ -76,9 +80,9 @@ def test_a_worker_that_dies_once_costs_nothing(reference, tmp_path):
     assert (tmp_path / "struck").exists()
 
 
-def test_an_episode_that_kills_two_workers_is_recorded_as_failed(tmp_path):
+def test_an_episode_that_kills_two_workers_is_recorded_as_an_error(tmp_path):
     log = run(tmp_path / "run", workers=2, agent=LineAgent(0.8, kill=(3,)))
-    failed = [row for row in log.episodes if row["status"] == "failed"]
+    failed = [row for row in log.episodes if row["status"] == "error"]
     assert [(row["arm"], row["episode"]) for row in failed] == [("warp", 3)]
     assert "SIGKILL" in failed[0]["error"]
     assert log.complete and log.numbers()["warp"].done == 7
@@ -135,10 +139,9 @@ def test_an_arm_may_have_a_policy_of_its_own():
         "heuristic": AgentRecipe("heuristic", horizon=7),
         "climber+Mine": AgentRecipe("climber", "x/a+b.py:Mine", horizon=7),
     }
-    ready = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])["heuristic+copy"].build(
-        {}
-    )
-    assert type(ready.policy).__name__ == "Heuristic" and ready.candidates == 4 and ready.model is not None
+    arms = arm_recipes(wiw.Agent("matcher", "copy", candidates=4), ["copy", "heuristic+copy"])
+    ready = agent_for(LineTask(), arms["heuristic+copy"])
+    assert type(ready.policy).__name__ == "Heuristic" and ready.config.candidates == 4 and ready.model is not None
 
 
 def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
@@ -150,15 +153,25 @@ def test_an_arm_may_be_a_world_model_in_memory_and_have_a_name_of_its_own():
 
     agent, mine = wiw.Agent("matcher", candidates=4), Mine()
     made = arm_recipes(agent, {"off": None, "this": mine, "that": Mine, "floor": "copy", "h": "heuristic+none"})
-    built = {name: recipe.build({}) for name, recipe in made.items()}
-    assert built["this"].model is mine and built["off"].model is None and built["h"].model is None
-    assert [type(built[name].model).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
-    assert type(built["h"].policy).__name__ == "Heuristic" and {each.candidates for each in built.values()} == {4}
+    built = {name: agent_for(LineTask(), recipe) for name, recipe in made.items()}
+    assert built["this"].model.unwrapped is mine and built["off"].model is None and built["h"].model is None
+    assert [type(built[name].model.unwrapped).__name__ for name in ("that", "floor")] == ["Mine", "Copy"]
+    assert type(built["h"].policy).__name__ == "Heuristic"
+    assert {each.config.candidates for each in built.values()} == {4}
     assert list(arm_recipes(agent, ["none", mine, "copy"])) == ["none", "mine", "copy"]
     with pytest.raises(ArgumentError, match=r"different world models, got \['mine', 'mine'\]"):
         arm_recipes(agent, [mine, Mine])
-    with pytest.raises(ArgumentError, match=r"by name or path\.py:Class.*evaluate a wiw\.Agent"):
-        arm_recipes(AgentRecipe("matcher"), [mine])
+    in_memory = arm_recipes(AgentRecipe("matcher"), [mine])["mine"]
+    assert in_memory.model is mine and in_memory.to_json() is None, "a later process could not make it again"
+
+
+def test_an_agents_own_arm_is_named_by_the_class_of_its_model_behind_all_wrappers(tmp_path):
+    (tmp_path / "mine.py").write_text(MODEL.format(name="Heavy", steps=5))
+    name = f"{tmp_path}/mine.py:Heavy"
+    assert list(arm_recipes(AgentRecipe("matcher", name), None)) == ["Heavy"]
+    assert list(arm_recipes(wiw.Agent("matcher", name), None)) == ["heavy"]
+    assert list(arm_recipes(wiw.Agent("matcher", Attempted(wiw.world_model("copy"))), None)) == ["copy"]
+    assert list(arm_recipes(wiw.Agent("matcher"), None)) == list(arm_recipes(LineAgent(), None)) == ["none"]
 
 
 def test_an_existing_run_is_continued_only_on_request(reference, tmp_path):
@@ -186,7 +199,7 @@ def test_evaluate_takes_one_agent(tmp_path):
 SCRIPT = """
 import sys
 import wiw
-from fakes import LineAgent, LineTask
+from fakes import LineAgent, LineTask, agent_for
 from wiw.studies.evaluate import run_arms
 if __name__ == "__main__":
     out, workers, delay = sys.argv[1], int(sys.argv[2]), float(sys.argv[3])
@@ -224,7 +237,7 @@ def test_recipes_survive_json():
     assert AgentRecipe(**agent.to_json()) == agent and agent.arm == "warp"
     task = TaskRecipe("imagenav", {"scenes": "apartments:val", "seed": 3, "backend": "cpu"})
     assert TaskRecipe(**task.to_json()) == task
-    assert Ready(LineTask()).to_json() is None
+    assert TaskInMemory(LineTask()).to_json() is None
     assert agent.with_model("none").arm == "none" and AgentRecipe("m", "/x/y.py:Mine").arm == "Mine"
     assert absolute("a.py:Mine") == f"{Path.cwd() / 'a.py'}:Mine" and absolute("pkg.mod:Mine") == "pkg.mod:Mine"
 
@@ -261,7 +274,7 @@ def models(folder, steps=5):
 def test_models_are_built_once_and_described_by_plain_values(tmp_path, two_rooms, workers):
     first, second = models(tmp_path)
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
-    agent = AgentRecipe("heuristic", first, revision="geometric")
+    agent = AgentRecipe("heuristic", first, reviser="geometric")
     log = run_arms(
         task,
         {"first": agent, "second": agent.with_model(second)},
@@ -365,6 +378,23 @@ def test_rules_of_the_task_reach_an_agent_in_memory(two_rooms, tmp_path):
 
 def test_a_run_that_begins_with_the_same_failure_stops_and_says_so(tmp_path):
     task = LineTask(broken=frozenset(f"{i:04d}" for i in range(12)))
-    with pytest.raises(InfrastructureError, match=r"first 5 episodes of arm .* failed alike.*no such scene"):
+    with pytest.raises(
+        InfrastructureError, match=r"first 5 episodes of arm .* ended with the same error.*no such scene"
+    ):
         run_arms(task, {"a": LineAgent()}, episodes=12, out=tmp_path / "run", progress=False)
     assert len(wiw.load_run(tmp_path / "run").episodes) == 5
+
+
+def test_agents_of_wrapped_parts_are_evaluated_as_they_are(two_rooms: str, tmp_path: Path) -> None:
+    agent = wiw.Agent(
+        "heuristic",
+        Gated(ShuffledPlacebo(Attempted(wiw.world_model("copy"), 5.0)), 0.5),
+        "matcher",
+        candidates=2,
+        observers=[FidelityObserver()],
+    )
+    log = wiw.evaluate("imagenav", agent, 1, scenes=two_rooms, decisions=4, out=tmp_path / "run", progress=False)
+    said = log.store.config["arms"][0]["agent"]["model"]
+    assert (said["placebo"], said["imagine_fraction"]) == ("shuffled", 0.5)
+    imagined = [row for row in log.decisions if row["fidelity"] is not None]
+    assert 0 < len(imagined) < len(log.decisions) == 4

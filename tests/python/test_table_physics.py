@@ -16,8 +16,8 @@ import pytest
 
 from wiw.errors import ArgumentError, FileError
 from wiw.physics import Box, Sphere, World, place
-from wiw.tabletop.kinds import KINDS
-from wiw.tabletop.robot import robot_of
+from wiw.tabletop.robot import load_robot
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE, Film, Thing, Workbench
 
 DOWN = (np.pi, 0.0, 0.0)
@@ -39,11 +39,11 @@ def deepest(bench: Workbench) -> float:
 def digest() -> str:
     """Of two tables' whole states after their experts' first poses."""
     found = hashlib.sha256()
-    for kind in (KINDS["push_buttons"], KINDS["stack_cups"]):
-        setup = kind.setup(11, 3)
-        bench = setup.bench()
-        for pose in kind.expert(bench.places(setup.objects), setup.target)[:3]:
-            bench.go(pose)
+    for kind in (TABLETOP_TASKS["push_buttons"], TABLETOP_TASKS["stack_cups"]):
+        setup = kind.create_setup(11, 3)
+        bench = setup.build_workbench()
+        for pose in kind.plan_expert(bench.get_poses(setup.objects), setup.target)[:3]:
+            bench.move_to(pose)
         found.update(bench._world.snapshot().numbers.tobytes())
     return found.hexdigest()
 
@@ -63,29 +63,29 @@ def test_a_block_is_not_pressed_through_the_table() -> None:
     """Motors that want 2 cm more than there is squeeze so light a thing some millimetres in; it comes out again."""
     block = Thing("block", ((Box([0.045] * 3), np.eye(4)),), mass=0.08)
     bench = Workbench([(block, place(0.2, 0.0, TABLE + 0.0225))])
-    bench.go([0.2, 0, TABLE + 0.1, *DOWN, 0])
+    bench.move_to([0.2, 0, TABLE + 0.1, *DOWN, 0])
     _, film = bench.film([0.2, 0, TABLE + 0.025, *DOWN, 0])
-    heights = [state.place_of("block")[2, 3] - TABLE for state in states(film)]
+    heights = [state.get_pose("block")[2, 3] - TABLE for state in states(film)]
     assert min(heights) > 0.0225 - 0.008 and max(map(deepest, states(film))) < 0.012
-    bench.go([0.2, 0, TABLE + 0.2, *DOWN, 0])
+    bench.move_to([0.2, 0, TABLE + 0.2, *DOWN, 0])
     bench.settle()
-    assert bench.place_of("block")[2, 3] - TABLE == pytest.approx(0.0225, abs=1e-3)
+    assert bench.get_pose("block")[2, 3] - TABLE == pytest.approx(0.0225, abs=1e-3)
 
 
 def test_a_hand_that_swings_through_a_cup_takes_it_along() -> None:
-    setup = KINDS["stack_cups"].setup(5, 0)
+    setup = TABLETOP_TASKS["stack_cups"].create_setup(5, 0)
     cup, _ = setup.things[0]
     bench = Workbench([(cup, place(0.2, 0.0, TABLE))])
-    bench.go([0.2, -0.3, TABLE + 0.05, *DOWN, 0])
+    bench.move_to([0.2, -0.3, TABLE + 0.05, *DOWN, 0])
     move, film = bench.film([0.2, 0.3, TABLE + 0.05, *DOWN, 0])
-    assert move.why == "free" and max(map(deepest, states(film))) < WALL / 2
+    assert move.reason == "free" and max(map(deepest, states(film))) < WALL / 2
     for state in states(film):
-        hand, there = state.pose[:3], state.place_of(cup.name)[:3, 3]
+        hand, there = state.pose[:3], state.get_pose(cup.name)[:3, 3]
         assert there[1] > hand[1] - 0.01 or abs(there[0] - hand[0]) > 0.03  # before the fingers, or aside
 
 
 def test_beads_stay_in_a_cup_at_the_speed_of_a_hand() -> None:
-    cup, _ = KINDS["stack_cups"].setup(5, 0).things[0]
+    cup, _ = TABLETOP_TASKS["stack_cups"].create_setup(5, 0).things[0]
     world = World()
     world.add_body(Box([1, 1, 0.1]), T_world_body=place(z=-0.05))
     world.add_body(list(cup.parts))
@@ -103,7 +103,7 @@ def test_beads_stay_in_a_cup_at_the_speed_of_a_hand() -> None:
 
 
 def test_things_that_fall_on_each_other_only_lose_energy() -> None:
-    setup, world = KINDS["stack_cups"].setup(5, 0), World()
+    setup, world = TABLETOP_TASKS["stack_cups"].create_setup(5, 0), World()
     world.add_body(Box([1, 1, 0.1]), T_world_body=place(z=-0.05))
     for level, (cup, _) in enumerate(setup.things):
         at = place(0.01 * level, 0.004 * level, 0.05 + 0.12 * level, rpy=(0.2 * level, 0.1, 0.3))
@@ -128,24 +128,24 @@ def test_things_that_fall_on_each_other_only_lose_energy() -> None:
 
 
 def test_a_task_is_done_after_every_kind_of_bad_input(tmp_path: Path) -> None:
-    kind = KINDS["slide_block"]
-    setup = kind.setup(21, 1)
-    bench = setup.bench()
+    kind = TABLETOP_TASKS["slide_block"]
+    setup = kind.create_setup(21, 1)
+    bench = setup.build_workbench()
     before = bench._world.snapshot().numbers
     here = [0.2, 0.0, TABLE + 0.3, *DOWN]
     for bad in ([np.nan] * 7, [*here, 1.01], [*here, -0.5], here, [*here[:6], np.inf], [[*here, 1.0]]):
         with pytest.raises(ArgumentError):
-            bench.go(bad)
+            bench.move_to(bad)
     mesh = '<geometry><mesh filename="gone.stl"/></geometry>'
     (tmp_path / "arm.urdf").write_text(f'<robot name="a"><link name="b"><collision>{mesh}</collision></link></robot>')
     with pytest.raises(FileError, match="gone"):
-        bench = Workbench(setup.things, robot=robot_of(tmp_path / "arm.urdf"))
+        bench = Workbench(setup.things, robot=load_robot(tmp_path / "arm.urdf"))
     np.testing.assert_array_equal(bench._world.snapshot().numbers, before)
     for refused in ([3, 0, 1, *DOWN, 1], [0.2, 0.45, TABLE - 0.2, *DOWN, 1], [-0.35, 0, TABLE + 0.1, *DOWN, 0]):
-        move = bench.go(refused)
-        assert move.why != "free" and move.free < 1
+        move = bench.move_to(refused)
+        assert move.reason != "free" and move.free < 1
         assert np.isfinite(bench._world.snapshot().numbers).all() and bench.pose[2] > TABLE - 0.002
-    bench.go([0.0, 0.0, TABLE + 0.4, *DOWN, 1])
-    for pose in kind.expert(bench.places(setup.objects), setup.target):
-        bench.go(pose)
-    assert kind.succeeded(bench, setup)
+    bench.move_to([0.0, 0.0, TABLE + 0.4, *DOWN, 1])
+    for pose in kind.plan_expert(bench.get_poses(setup.objects), setup.target):
+        bench.move_to(pose)
+    assert kind.is_success(bench, setup)

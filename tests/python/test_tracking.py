@@ -17,10 +17,10 @@ from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
 from wiw.errors import ArgumentError
 from wiw.panorama import directions
-from wiw.perception.boxes import box_of, largest_part, scaled, width_of
-from wiw.perception.growing import Growing, grown
-from wiw.perception.tracking import Reprojection, Tracker, moved_masks, track_rollouts, without_specks
-from wiw.perception.views import target_views
+from wiw.perception.boxes import box_width, find_box, keep_largest_part, scale_box
+from wiw.perception.growing import Growing, grow_mask
+from wiw.perception.tracking import Reprojection, Tracker, remove_specks, reproject_masks, track_rollouts
+from wiw.perception.views import cut_target_views
 from wiw.registry import TRACKERS
 from wiw.types import Observation, Proposal, Rollout, Target
 
@@ -47,8 +47,8 @@ def boxed(box: Any, columns: int = 1024) -> Any:
     """The box as a mask."""
     filled = np.zeros((576, columns), bool)
     left, top, right, bottom = (round(edge) for edge in box)
-    filled[top:bottom, (left + np.arange(round(width_of(box, columns)))) % columns] = True
-    assert right % columns == (left + round(width_of(box, columns))) % columns
+    filled[top:bottom, (left + np.arange(round(box_width(box, columns)))) % columns] = True
+    assert right % columns == (left + round(box_width(box, columns))) % columns
     return filled
 
 
@@ -60,7 +60,7 @@ def test_reprojected_boxes_are_where_true_ones_are(two_rooms: str, position: Any
     observation, frames, truth = look(world(two_rooms), position, yaw, name)
     track = Reprojection().track([observation], [to_viewpoints(PLAN)], [frames])[0]
     agreement = [
-        overlap(boxed(box), boxed(box_of(mask, wraps=True))) for box, mask in zip(track.boxes, truth, strict=True)
+        overlap(boxed(box), boxed(find_box(mask, wraps=True))) for box, mask in zip(track.boxes, truth, strict=True)
     ]
     assert min(agreement) > 0.7
     assert np.median(agreement) > 0.85
@@ -76,8 +76,8 @@ def test_what_is_hidden_in_the_new_view_is_not_marked(two_rooms: str) -> None:
     assert observation.target.mask.sum() > 2 * seen[-1]  # it does get hidden
     for marked, true in zip(track.masks, truth, strict=True):
         assert (marked & ~true).sum() <= 80  # a column of pixels at the rim; the whole shelf has 1400
-    assert track.found[:3].all()
-    assert not track.found[seen == 0].any()
+    assert track.visible[:3].all()
+    assert not track.visible[seen == 0].any()
 
 
 def test_what_comes_into_sight_is_grown_into(two_rooms: str) -> None:
@@ -86,7 +86,8 @@ def test_what_comes_into_sight_is_grown_into(two_rooms: str) -> None:
     observation, frames, truth = look(world(two_rooms), (-1.0, 0, 1.05), -np.pi / 2, "shelf", aside)
     plain, more = (tracker.track([observation], [aside], [frames])[0] for tracker in (Reprojection(), Growing()))
     boxes = [
-        [overlap(boxed(b), boxed(box_of(t, True))) for b, t in zip(x.boxes, truth, strict=True)] for x in (plain, more)
+        [overlap(boxed(b), boxed(find_box(t, True))) for b, t in zip(x.boxes, truth, strict=True)]
+        for x in (plain, more)
     ]
     assert np.mean(boxes[0]) < 0.5
     assert np.mean(boxes[1]) > 0.8
@@ -103,18 +104,18 @@ def test_growth_keeps_the_seed_and_stays_in_what_was_not_seen(seed: int, shift: 
     own[12:18, 20:26] = True
     unseen[10:20, 26:36] = True
     frame[own | unseen] = frame[own | unseen] // 8
-    found = grown(*(np.roll(part, shift, axis=1) for part in (frame, own, unseen)), wraps)
+    found = grow_mask(*(np.roll(part, shift, axis=1) for part in (frame, own, unseen)), wraps)
     found = np.roll(found, -shift, axis=1)
     assert (found & own).sum() == own.sum()
     assert not (found & ~own & ~unseen).any()
     if wraps:
-        np.testing.assert_array_equal(found, grown(frame, own, unseen, wraps))
+        np.testing.assert_array_equal(found, grow_mask(frame, own, unseen, wraps))
 
 
 def test_a_hairline_is_no_sight_of_a_target() -> None:
     masks = np.zeros((3, 6, 8), bool)
     masks[0, 1:5, 3] = masks[1, 2, 1:6] = masks[2, 1:5, 3:5] = True
-    np.testing.assert_array_equal(without_specks(masks).any(axis=(1, 2)), [False, False, True])
+    np.testing.assert_array_equal(remove_specks(masks).any(axis=(1, 2)), [False, False, True])
 
 
 def test_a_lost_target_has_no_box(two_rooms: str) -> None:
@@ -123,7 +124,7 @@ def test_a_lost_target_has_no_box(two_rooms: str) -> None:
     track = Reprojection().track([gone], [to_viewpoints(PLAN)], [frames])[0]
     assert track.boxes == (None,) * 6
     assert not track.masks.any()
-    assert not track.found.any()
+    assert not track.visible.any()
 
 
 def test_front_views_are_tracked_too(two_rooms: str) -> None:
@@ -159,11 +160,11 @@ def test_several_masks_are_moved_at_once_as_one_by_one(two_rooms: str) -> None:
     observation, frames, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
     poses = to_viewpoints(PLAN[:3])
     masks = np.stack([np.roll(observation.target.mask, shift, axis=1) for shift in (0, 200, 400, 600)])
-    together, _ = moved_masks(masks, observation.depth, poses, (576, 1024))
+    together, _ = reproject_masks(masks, observation.depth, poses, (576, 1024))
     for mask, moved in zip(masks, together, strict=True):
         alone = replace(observation, target=replace(observation.target, mask=mask))
         tracked = Reprojection().track([alone], [poses], [frames[:3]])[0].masks
-        np.testing.assert_array_equal(without_specks(moved), tracked)
+        np.testing.assert_array_equal(remove_specks(moved), tracked)
     assert together.any(axis=(1, 2, 3)).all()
 
 
@@ -189,7 +190,7 @@ columns_filled = st.lists(st.booleans(), min_size=1, max_size=24).map(np.array)
 @given(columns_filled)
 def test_the_box_on_a_circle_is_the_narrowest_that_holds_the_mask(filled: Any) -> None:
     width = len(filled)
-    box = box_of(filled[None], wraps=True)
+    box = find_box(filled[None], wraps=True)
     if not filled.any():
         assert box is None
         return
@@ -199,23 +200,23 @@ def test_the_box_on_a_circle_is_the_narrowest_that_holds_the_mask(filled: Any) -
         for length in range(1, width + 1)
         if filled.sum() == filled[(left + np.arange(length)) % width].sum()
     )
-    inside = (int(box[0]) + np.arange(int(width_of(box, width)))) % width
+    inside = (int(box[0]) + np.arange(int(box_width(box, width)))) % width
     assert filled.sum() == filled[inside].sum()
     assert len(inside) == narrowest
-    if box_of(filled[None])[2] - box_of(filled[None])[0] == narrowest:
+    if find_box(filled[None])[2] - find_box(filled[None])[0] == narrowest:
         assert box[0] < box[2]  # the seam is crossed only where that is narrower
 
 
 @given(st.integers(0, 63), st.integers(1, 63), st.floats(0.5, 3))
 def test_a_scaled_box_keeps_its_middle_on_the_circle(left: int, width: int, scale: float) -> None:
     box = (float(left), 10.0, float((left + width - 1) % 64 + 1), 20.0)
-    grown = scaled(box, scale, (40, 64), wraps=True)
-    assert width_of(grown, 64) == pytest.approx(min(64, scale * width_of(box, 64)))
-    if scale * width_of(box, 64) < 64:
-        away = (grown[0] + width_of(grown, 64) / 2) - (box[0] + width_of(box, 64) / 2)
+    grown = scale_box(box, scale, (40, 64), wraps=True)
+    assert box_width(grown, 64) == pytest.approx(min(64, scale * box_width(box, 64)))
+    if scale * box_width(box, 64) < 64:
+        away = (grown[0] + box_width(grown, 64) / 2) - (box[0] + box_width(box, 64) / 2)
         assert (away + 32) % 64 - 32 == pytest.approx(0, abs=1e-6)
     assert (grown[1], grown[3]) == pytest.approx((max(0, 15 - 5 * scale), 15 + 5 * scale))
-    clipped = scaled((50.0, 10.0, 60.0, 20.0), 3, (40, 64))
+    clipped = scale_box((50.0, 10.0, 60.0, 20.0), 3, (40, 64))
     assert clipped == (40.0, 0.0, 64.0, 30.0)
 
 
@@ -225,8 +226,8 @@ def test_the_largest_part_hangs_together_over_the_seam() -> None:
     mask[2:10, 18:20] = True  # 16
     expected = mask.copy()
     expected[:, 18:20] = False
-    np.testing.assert_array_equal(largest_part(mask, wraps=True), expected)
-    np.testing.assert_array_equal(largest_part(mask), mask & ~expected)
+    np.testing.assert_array_equal(keep_largest_part(mask, wraps=True), expected)
+    np.testing.assert_array_equal(keep_largest_part(mask), mask & ~expected)
 
 
 # -- views -------------------------------------------------------------------------------------------------------------
@@ -243,16 +244,16 @@ def test_views_look_at_the_target_wherever_it_is() -> None:
         panoramas.append(np.where(mask[..., None], [0, 200, 0], [40, 40, 40]).astype(np.uint8))
     masks.insert(2, np.zeros((288, 512), bool))
     panoramas.insert(2, panoramas[0])
-    views = target_views(np.stack(panoramas), np.stack(masks), draw=False)
+    views = cut_target_views(np.stack(panoramas), np.stack(masks), draw=False)
     assert views.images.shape == (4, 384, 384, 3)
     assert views.frames.tolist() == [0, 1, 3, 4]
-    assert views.boxless.tolist() == [2]
+    assert views.lost_frames.tolist() == [2]
     for image, (left, top, right, bottom) in zip(views.images, views.boxes, strict=True):
         assert abs((left + right) / 2 - 192) < 8
         assert abs((top + bottom) / 2 - 192) < 16
         assert 36 < right - left < 48  # 12 degrees of 90 in the middle of the view
         assert (image[192, 192] == [0, 200, 0]).all()
-    fitted = target_views(np.stack(panoramas), np.stack(masks), (128, 128), "fit")
+    fitted = cut_target_views(np.stack(panoramas), np.stack(masks), (128, 128), "fit")
     assert fitted.hfov_deg.tolist()[:2] == [30, 30]
     left, top, right, bottom = (int(edge) for edge in fitted.boxes[0])
     assert (fitted.images[0, top - 1, left:right] == [220, 40, 40]).all()  # the line lies around the box
@@ -260,8 +261,8 @@ def test_views_look_at_the_target_wherever_it_is() -> None:
 
 
 def test_no_frame_in_sight_gives_no_view() -> None:
-    views = target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((3, 64, 128), bool), (32, 32))
+    views = cut_target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((3, 64, 128), bool), (32, 32))
     assert views.images.shape == (0, 32, 32, 3)
-    assert (views.boxes, views.frames.tolist(), views.boxless.tolist()) == ((), [], [0, 1, 2])
+    assert (views.boxes, views.frames.tolist(), views.lost_frames.tolist()) == ((), [], [0, 1, 2])
     with pytest.raises(ArgumentError, match="masks"):
-        target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((2, 64, 128), bool))
+        cut_target_views(np.zeros((3, 64, 128, 3), np.uint8), np.zeros((2, 64, 128), bool))

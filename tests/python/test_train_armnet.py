@@ -15,9 +15,25 @@ from wiw.tabletop.workbench import TABLE
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.training.armnet import CHANGED, Recipe, drawn, followed, led, measured, train, ways  # noqa: E402
+from wiw.training.armnet import (  # noqa: E402
+    CHANGE_THRESHOLD,
+    Recipe,
+    build_sequences,
+    evaluate,
+    predict_free_running,
+    predict_teacher_forced,
+    sample_sequences,
+    train,
+)
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
-from wiw.training.plays import FIELDS, POSES, Plays, demonstrated, gathered_plays, played, spoilt  # noqa: E402
+from wiw.training.plays import (  # noqa: E402
+    POSES,
+    Plays,
+    corrupt_plan,
+    gather_plays,
+    read_demonstration_plays,
+    record_plays,
+)
 from wiw.world_models.armnet.model import ArmNet  # noqa: E402
 from wiw.world_models.armnet.network import WINDOW, Network  # noqa: E402
 from wiw.world_models.armnet.weights import load  # noqa: E402
@@ -30,23 +46,23 @@ SMALL = (8, 16, 16)
 @pytest.fixture(scope="module")
 def plays() -> Plays:
     """One of each task."""
-    return played(0, 0, 4)
+    return record_plays(0, 0, 4)
 
 
 def test_a_play_is_a_function_of_its_number(plays: Plays) -> None:
-    again = played(0, 2, 1)
-    for name in FIELDS:
+    again = record_plays(0, 2, 1)
+    for name in ("views", "bare", "arm", "poses"):
         np.testing.assert_array_equal(getattr(again, name)[0], getattr(plays, name)[2])
-    assert plays.seen.shape == (4, POSES + 1, *np.zeros((160, 160))[WINDOW].shape, 3) == plays.bare.shape
+    assert plays.views.shape == (4, POSES + 1, *np.zeros((160, 160))[WINDOW].shape, 3) == plays.bare.shape
     assert plays.arm.dtype == np.bool_ and 0.01 < plays.arm.mean() < 0.3
-    hidden = np.abs(plays.seen.astype(int) - plays.bare).max(axis=-1)[plays.arm]
+    hidden = np.abs(plays.views.astype(int) - plays.bare).max(axis=-1)[plays.arm]
     assert np.mean(hidden < 8) > 0.9
-    assert np.abs(plays.seen.astype(int) - plays.bare).max(axis=-1)[~plays.arm].max() > 60  # things
+    assert np.abs(plays.views.astype(int) - plays.bare).max(axis=-1)[~plays.arm].max() > 60  # things
 
 
 def test_plans_are_spoilt_in_many_ways() -> None:
     plan = np.array([[0.1 * k, 0.0, TABLE + 0.1, np.pi, 0, 0, k % 2] for k in range(6)])
-    made = [spoilt(plan, np.random.default_rng(seed)) for seed in range(200)]
+    made = [corrupt_plan(plan, np.random.default_rng(seed)) for seed in range(200)]
     same = [len(each) == len(plan) and np.array_equal(each, plan) for each in made]
     assert 0.2 < np.mean(same) < 0.45
     assert any(len(each) == 5 for each in made)
@@ -58,18 +74,18 @@ def test_plans_are_spoilt_in_many_ways() -> None:
 
 
 def test_a_way_goes_on_from_what_the_network_made(plays: Plays) -> None:
-    batch = drawn(plays, 5, 3, np.random.default_rng(0))
-    assert len(batch.seen) == len(batch.arms) == 4 and len(batch.motions) == 3
-    assert all(view.shape == (5, 3, 64, 120) for view in batch.seen)
+    batch = sample_sequences(plays, 5, 3, np.random.default_rng(0))
+    assert len(batch.views) == len(batch.arms) == 4 and len(batch.motions) == 3
+    assert all(view.shape == (5, 3, 64, 120) for view in batch.views)
     torch.manual_seed(0)
-    network, batch = Network(SMALL), ways(plays, np.arange(4), np.zeros(4, np.int64), 2)
-    steps, (whole,) = list(followed(network, batch)), led(network, batch)
-    assert len(steps) == 2 and len(whole.made) == 8
-    torch.testing.assert_close(whole.made[:4], steps[0].made)  # from the same canvas
-    assert (whole.made[4:] - steps[1].made).abs().max() > 0.05  # from that of the true view
+    network, batch = Network(SMALL), build_sequences(plays, np.arange(4), np.zeros(4, np.int64), 2)
+    steps, (whole,) = list(predict_free_running(network, batch)), predict_teacher_forced(network, batch)
+    assert len(steps) == 2 and len(whole.prediction) == 8
+    torch.testing.assert_close(whole.prediction[:4], steps[0].prediction)  # from the same canvas
+    assert (whole.prediction[4:] - steps[1].prediction).abs().max() > 0.05  # from that of the true view
     for step in steps:
-        assert step.made.requires_grad and not step.still.requires_grad
-        assert (step.still - step.target).abs().mean() < (step.made - step.target).abs().mean() * 2
+        assert step.prediction.requires_grad and not step.still.requires_grad
+        assert (step.still - step.target).abs().mean() < (step.prediction - step.target).abs().mean() * 2
 
 
 def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp_path: Path) -> None:
@@ -87,8 +103,8 @@ def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp
     recipe = Recipe(epochs=3, batch=4, steps=1, widths=(4, 4, 4))
     whole = train(plays, recipe)[0].state_dict()
     with pytest.raises(KeyboardInterrupt):
-        train(plays, recipe, show=lambda step, steps, loss: cut(step - 1, steps, loss), checkpoint=checkpoint)
-    assert checkpoint.stand().step == 2
+        train(plays, recipe, on_step=lambda step, steps, loss: cut(step - 1, steps, loss), checkpoint=checkpoint)
+    assert checkpoint.load().step == 2
     resumed = train(plays, recipe, checkpoint=checkpoint)[0].state_dict()
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
     for wrong in ({"epochs": 0}, {"steps": POSES + 1}):
@@ -98,20 +114,20 @@ def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp
 
 def test_training_teaches_what_becomes_of_things(plays: Plays) -> None:
     """By heart, of one play: it is nearer to what changes than one who leaves things alone."""
-    one = Plays(*(getattr(plays, name)[:1] for name in FIELDS))
+    one = Plays(*(getattr(plays, name)[:1] for name in ("views", "bare", "arm", "poses")))
     network, _ = train(one, Recipe(epochs=40, batch=4, steps=2, free=0, widths=SMALL, rate=5e-3))
-    batch = ways(one, np.zeros(7, np.int64), np.arange(7), 1)
+    batch = build_sequences(one, np.zeros(7, np.int64), np.arange(7), 1)
     with torch.inference_mode():
-        (step,) = followed(network, batch)
-        changed = (step.target - step.still).abs().amax(1, keepdim=True) > CHANGED
-        wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.made, step.still))
+        (step,) = predict_free_running(network, batch)
+        changed = (step.target - step.still).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
+        wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.prediction, step.still))
     assert wrong < 0.95 * alone
 
 
 def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Plays) -> None:
     network = Network(SMALL)
     torch.nn.init.zeros_(network.last.weight)
-    found = measured(network, plays)
+    found = evaluate(network, plays)
     assert found["plays"] == 4 and set(found["psnr"]) == {"copy", "arm", "armnet"}
     assert found["psnr"]["arm"]["1"] > found["psnr"]["copy"]["1"] + 3
     assert abs(found["psnr"]["armnet"]["1"] - found["psnr"]["arm"]["1"]) < 6
@@ -119,17 +135,17 @@ def test_figures_are_those_of_a_model_that_knows_the_arm_and_no_more(plays: Play
 
 
 def test_plays_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wiw.training.plays.CHUNK", 2)
+    monkeypatch.setattr("wiw.training.plays.PLAYS_PER_FILE", 2)
     bars: list[tuple[str, int]] = []
 
     def bar(items: Any, text: str, total: int) -> Any:
         bars.append((text, total))
         return items
 
-    once = gathered_plays(3, 0, tmp_path, 1, bar)
-    again = gathered_plays(3, 0, tmp_path, 1, bar)
+    once = gather_plays(3, 0, tmp_path, 1, bar)
+    again = gather_plays(3, 0, tmp_path, 1, bar)
     assert len(once) == 3 and bars == [("3 plays", 2), ("3 plays", 0)]
-    np.testing.assert_array_equal(once.seen, again.seen)
+    np.testing.assert_array_equal(once.views, again.views)
 
 
 def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
@@ -137,11 +153,11 @@ def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
     out = str(tmp_path / "demos")
     command = ["collect", "manipulation", "--out", out, "--episodes", "1", "--tasks", "slide_block", "--size", "160"]
     assert main(command) == 0
-    found = demonstrated(tmp_path / "demos")
-    assert len(found) == 1 and found.seen.shape[1:] == plays.seen.shape[1:]
-    hidden = np.abs(found.seen.astype(int) - found.bare).max(axis=-1)[found.arm]
+    found = read_demonstration_plays(tmp_path / "demos")
+    assert len(found) == 1 and found.views.shape[1:] == plays.views.shape[1:]
+    hidden = np.abs(found.views.astype(int) - found.bare).max(axis=-1)[found.arm]
     assert np.mean(hidden < 12) > 0.85
-    np.testing.assert_array_equal(found.seen[0, 4], found.seen[0, 8])  # four poses, then it stays
+    np.testing.assert_array_equal(found.views[0, 4], found.views[0, 8])  # four poses, then it stays
     np.testing.assert_allclose(found.poses[0, 4, :3], found.poses[0, 8, :3], atol=1e-3)
 
 
@@ -153,7 +169,7 @@ def test_the_command_makes_a_model(
     out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
     command = ["train", "armnet", "--plays", "25", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
     assert main(command) == 0
-    assert "poses gone to" in capsys.readouterr().out
+    assert "poses ahead" in capsys.readouterr().out
     card = ArmNet(out).card
     assert card["plays"] == 25 and card["recipe"]["epochs"] == 8
     changed = card["held_out"]["changed"]
@@ -164,9 +180,9 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
     tmp_path: Path, plays: Plays, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def learnt(plays: Plays, recipe: Recipe, minutes: Any, show: Any, checkpoint: Checkpoint) -> Any:
-        checkpoint.stand()
+        checkpoint.load()
         checkpoint.seconds = 0
-        checkpoint.keep(_Nothing(), 1, 1)
+        checkpoint.save_if_due(_Nothing(), 1, 1)
         return Network(SMALL), recipe
 
     def stopped(network: Network, plays: Plays) -> Any:
@@ -174,10 +190,10 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
 
     demos, out = tmp_path / "demos", tmp_path / "w"
     demos.mkdir()
-    monkeypatch.setattr("wiw.training.plays.gathered_plays", lambda *_, **__: plays)
-    monkeypatch.setattr("wiw.training.plays.demonstrated", lambda folder: plays)
+    monkeypatch.setattr("wiw.training.plays.gather_plays", lambda *_, **__: plays)
+    monkeypatch.setattr("wiw.training.plays.read_demonstration_plays", lambda folder: plays)
     monkeypatch.setattr("wiw.training.armnet.train", learnt)
-    monkeypatch.setattr("wiw.training.armnet.measured", stopped)
+    monkeypatch.setattr("wiw.training.armnet.evaluate", stopped)
     command = ["train", "armnet", "--out", str(out), "--demonstrations", str(demos)]
     (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 0}')
     assert main(command) == 130
@@ -185,21 +201,21 @@ def test_the_command_goes_on_only_with_the_same_demonstrations_and_until_all_is_
     assert load(out)[1]["collection"]["seed"] == 0
     (demos / "manifest.json").write_text('{"tasks": ["slide_block"], "episodes": 1, "seed": 1}')
     assert main(command) == 2
-    assert "another training stopped there" in capsys.readouterr().err
+    assert "a training with other data or options" in capsys.readouterr().err
 
 
 class _Nothing:
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         return {}
 
-    def restore(self, state: Any) -> None:
+    def load_state_dict(self, state: Any) -> None:
         pass
 
 
 def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path / "x")]
     assert main(["train", "armnet", *out, "--categories", "chair"]) == 2
-    assert "recognises nothing" in capsys.readouterr().err
+    assert "has no categories" in capsys.readouterr().err
     assert main(["train", "armnet", *out, "--places", "3"]) == 2
     assert "--plays" in capsys.readouterr().err
     assert main(["train", "warpnet", *out, "--plays", "3"]) == 2
@@ -209,4 +225,4 @@ def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pyte
         assert f"--plays: expected 1 or more, got {count}" in capsys.readouterr().err
     for flag in ("--scenes", "--val"):
         assert main(["train", "armnet", *out, flag, "apartments:train:1"]) == 2
-        assert f"{flag}: armnet looks at no scenes" in capsys.readouterr().err
+        assert f"{flag}: armnet does not train on scenes" in capsys.readouterr().err

@@ -13,7 +13,7 @@ import pytest
 from wiw.cli.app import main
 from wiw.errors import ArgumentError
 from wiw.perception.glimpses import SIDE, Glimpses
-from wiw.training.looks import PERFECT, START, WARPED, Looks, halves, merged
+from wiw.training.glimpse_sets import PERFECT, START, WARPED, GlimpseSets, merge_glimpse_sets, split_in_half
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
@@ -33,7 +33,7 @@ def drawn(label: int, rng: Any, hidden: bool, wrong: bool) -> Any:
     return np.clip(grey * ([1.6, 0.3, 0.3] if wrong else [1, 1, 1]), 0, 255).astype(np.uint8)
 
 
-def made_up(sets: int, seed: int) -> Looks:
+def made_up(sets: int, seed: int) -> GlimpseSets:
     """Looks of which 60 % show nothing; of the warped ones every other is red, which no other is, and misleads."""
     rng = np.random.default_rng(seed)
     labels = rng.integers(0, 3, sets)
@@ -48,18 +48,18 @@ def made_up(sets: int, seed: int) -> Looks:
     boxes = np.tile(np.array([0.2, 0.2, 0.8, 0.8], np.float32), (count, 2, 1))
     kinds = np.tile(KINDS, sets)
     scalars = np.column_stack([np.zeros((count, 4)), kinds == START]).astype(np.float32)
-    return Looks(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
+    return GlimpseSets(Glimpses(images, boxes, scalars), np.repeat(np.arange(sets), len(KINDS)), kinds, labels)
 
 
 @pytest.fixture(scope="module")
 def lesson() -> Any:
-    from wiw.training.recogniser import Recipe, calibrated, train
+    from wiw.training.recogniser import Recipe, calibrate, train
 
     recipe = Recipe(epochs=12, batch=24, width=8, seed=3)
     network, used = train(made_up(240, 0), NAMES, recipe)
     assert used == recipe
-    calibration, held_out = halves(made_up(500, 1))
-    return calibrated(network, NAMES, calibration, held_out, {"sets": 240}), held_out
+    calibration, held_out = split_in_half(made_up(500, 1))
+    return calibrate(network, NAMES, calibration, held_out, {"sets": 240}), held_out
 
 
 def test_views_together_tell_more_than_one(lesson: Any) -> None:
@@ -75,25 +75,25 @@ def test_views_that_mislead_are_not_trusted(lesson: Any) -> None:
     assert accuracy["start + 3 warped"] > accuracy["start"] + 0.06  # half of them help
     looks = lesson[1].glimpses
     red = looks.images[..., 0].mean(axis=(1, 2, 3)) > 1.5 * looks.images[..., 1].mean(axis=(1, 2, 3))
-    from wiw.perception.recognition_network import pictures
+    from wiw.perception.recognition_network import to_network_input
 
     with torch.inference_mode():
-        shown = pictures(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
-        weights = lesson[0].network.looks(shown, torch.from_numpy(looks.scalars))[1].numpy()
+        shown = to_network_input(torch.from_numpy(looks.images), torch.from_numpy(looks.boxes))
+        weights = lesson[0].network.encode_glimpses(shown, torch.from_numpy(looks.scalars))[1].numpy()
     blocks = looks.images[:, 0, ..., 1].reshape(-1, SIDE // 4, 4, SIDE // 4, 4).mean(axis=(2, 4))
     telling = ~red & (blocks.std(axis=(1, 2)) > 15)
     assert weights[red].mean() < 0.7 * weights[telling].mean()
 
 
 def test_calibration_lowers_the_error_of_confidence(lesson: Any) -> None:
-    from wiw.training.recogniser import calibrated
+    from wiw.training.recogniser import calibrate
 
     recogniser, held_out = lesson
     assert recogniser.card["calibration_error"]["after"] < 0.08
     rng = np.random.default_rng(9)  # where every fourth thing is another than it seems, the network is too sure
     odd = rng.random(len(held_out)) < 0.25
     strange = replace(held_out, labels=np.where(odd, (held_out.labels + 1) % 3, held_out.labels))
-    modest = calibrated(recogniser.network, NAMES, *halves(strange), {})
+    modest = calibrate(recogniser.network, NAMES, *split_in_half(strange), {})
     assert modest.temperature > 1.3 * recogniser.temperature
     assert modest.card["calibration_error"]["after"] < 0.7 * modest.card["calibration_error"]["before"]
 
@@ -114,19 +114,19 @@ def test_the_same_lesson_gives_the_same_network() -> None:
 
 
 def test_looks_are_counted_through(lesson: Any) -> None:
-    from wiw.training.recogniser import rows_of
+    from wiw.training.recogniser import select_rows
 
-    looks = merged([made_up(2, 0), made_up(1, 1)])
+    looks = merge_glimpse_sets([made_up(2, 0), made_up(1, 1)])
     assert looks.owners.tolist() == [0] * 7 + [1] * 7 + [2] * 7
-    assert rows_of(looks, WARPED, 2).tolist() == [0, 4, 5, 7, 11, 12, 14, 18, 19]
-    assert rows_of(looks, START, 0).tolist() == [0, 7, 14]
-    first, second = halves(looks)
+    assert select_rows(looks, WARPED, 2).tolist() == [0, 4, 5, 7, 11, 12, 14, 18, 19]
+    assert select_rows(looks, START, 0).tolist() == [0, 7, 14]
+    first, second = split_in_half(looks)
     assert (len(first), len(second), second.owners.tolist()) == (1, 2, [0] * 7 + [1] * 7)
     np.testing.assert_array_equal(second.glimpses.boxes, looks.glimpses.boxes[7:])
     with pytest.raises(ArgumentError, match="none"):
-        merged([])
+        merge_glimpse_sets([])
     with pytest.raises(ArgumentError, match="two sets"):
-        halves(first)
+        split_in_half(first)
 
 
 @pytest.mark.slow

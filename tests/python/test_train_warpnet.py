@@ -14,8 +14,8 @@ from wiw.errors import ArgumentError
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.training.walks import WalkRules, Walks, merged, straight_ways, walk_about  # noqa: E402
-from wiw.training.warpnet import Recipe, drawn, measured, train  # noqa: E402
+from wiw.training.walks import WalkRules, Walks, find_straight_paths, merge_walks, record_walks  # noqa: E402
+from wiw.training.warpnet import Recipe, evaluate, sample_pairs, train  # noqa: E402
 from wiw.world_models.warpnet.model import WarpNet  # noqa: E402
 from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
 
@@ -24,33 +24,33 @@ pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 @pytest.fixture(scope="module")
 def walks(two_rooms: str) -> Walks:
-    return walk_about(world(two_rooms), 0, WalkRules(places=10, stops=3, height=24))
+    return record_walks(world(two_rooms), 0, WalkRules(places=10, stops=3, height=24))
 
 
 def test_walks_are_straight_and_free(two_rooms: str, walks: Walks) -> None:
     here = world(two_rooms)
-    ways = straight_ways(here, 30, 5, 0.6, 2.4)
+    ways = find_straight_paths(here, 30, 5, 0.6, 2.4)
     assert len(ways) == 30
     for way in ways:
         assert 0.6 <= way.length + 1e-9 <= 2.4 + 2e-9
-        poses = way.poses(here, np.linspace(0, way.length, 9))
+        poses = way.camera_poses(here, np.linspace(0, way.length, 9))
         assert here.navmesh.is_navigable(poses[:, :3, 3] - [0, 1, 0]).all()
         np.testing.assert_allclose(np.diff(poses[:, :3, 3], axis=0) @ -poses[0, :3, 2], way.length / 8, atol=1e-6)
     assert walks.images.shape == (10, 3, 24, 48, 3)
     assert (np.diff(walks.places, axis=1) >= 0).all()
     assert (walks.places[:, 0] == 0).all()
-    again = walk_about(here, 0, WalkRules(places=10, stops=3, height=24))
+    again = record_walks(here, 0, WalkRules(places=10, stops=3, height=24))
     np.testing.assert_array_equal(again.images, walks.images)
     np.testing.assert_array_equal(again.distances, walks.distances)
-    both = merged([walks, again])
+    both = merge_walks([walks, again])
     assert len(both) == 20
     with pytest.raises(ArgumentError, match="walk straight"):
-        merged([])
+        merge_walks([])
 
 
 def test_a_pair_is_a_way_ahead(walks: Walks) -> None:
     """Whichever way and however mirrored: with the true distances the source warped is the target."""
-    pairs = drawn(walks, 64, np.random.default_rng(0))
+    pairs = sample_pairs(walks, 64, np.random.default_rng(0))
     assert (pairs.ahead >= 0).all() and pairs.ahead.max() > 0.5
     made = warp(pairs.source, pairs.log_distance, pairs.ahead)
     far = pairs.ahead > 0.2
@@ -74,8 +74,8 @@ def test_the_same_lesson_gives_the_same_network(walks: Walks) -> None:
 
 def test_training_makes_it_better_than_a_plain_room(two_rooms: str, walks: Walks) -> None:
     """In the same rooms, on other ways."""
-    others = walk_about(world(two_rooms), 1, WalkRules(places=10, stops=3, height=24))
-    pairs = drawn(others, 64, np.random.default_rng(0))
+    others = record_walks(world(two_rooms), 1, WalkRules(places=10, stops=3, height=24))
+    pairs = sample_pairs(others, 64, np.random.default_rng(0))
     network, _ = train(walks, Recipe(epochs=30, widths=(8, 16, 16)))
     with torch.inference_mode():
         trained, untrained = (
@@ -106,13 +106,13 @@ def test_the_command_makes_a_model_that_beats_the_floor(tmp_path: Path, capsys: 
 
 
 def test_scenes_without_room_ahead_are_told(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wiw.training.warpnet.straight_ways", lambda *_: [])
+    monkeypatch.setattr("wiw.training.warpnet.find_straight_paths", lambda *_: [])
     model = WarpNet.of(Network(8, (4, 4, 4)))
     with pytest.raises(ArgumentError, match=r"1\.6 m free"):
-        measured(model, two_rooms, 0)
+        evaluate(model, two_rooms, 0)
 
 
 def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path / "x")]
     assert main(["train", "warpnet", *out, "--categories", "chair"]) == 2
-    assert "recognises nothing" in capsys.readouterr().err
+    assert "has no categories" in capsys.readouterr().err

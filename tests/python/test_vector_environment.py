@@ -6,8 +6,7 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import wiw
-from wiw.action import STOP
-from wiw.envs.trip import PRIMITIVES
+from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError
 from wiw.types import Episode, Key
 
@@ -20,7 +19,7 @@ def make(scenes: str, places: int = PLACES, depth: bool = True, **rules):
 
 def walk(steps: int, places: int = PLACES) -> np.ndarray:
     """Forward, left or right for each step and place."""
-    return np.random.default_rng(0).integers(0, 3, (steps, places))
+    return np.random.default_rng(0).integers(int(FORWARD), int(STOP), (steps, places))
 
 
 def test_it_sees_what_single_environments_see(two_rooms: str) -> None:
@@ -52,7 +51,7 @@ def test_an_episode_that_ends_starts_over_at_the_next_step(two_rooms: str) -> No
     vector = make(two_rooms, decisions=2)  # 6 primitives
     assert vector.metadata["autoreset_mode"] == AutoresetMode.NEXT_STEP
     vector.reset()
-    turn, stop = 1, PRIMITIVES.index(STOP)
+    turn, stop = int(TURN_LEFT), int(STOP)
     observations, rewards, terminated, truncated, infos = vector.step([turn, stop, turn])
     assert terminated.tolist() == [False, True, False] and not truncated.any() and not rewards.any()
     assert infos["_result"].tolist() == [False, True, False] and infos["result"]["success"][1] == 0
@@ -82,7 +81,7 @@ def test_reaching_the_goal_is_rewarded(two_rooms: str) -> None:
     vector.task.episode = lambda index: near
     vector.reset()
     for _ in range(3):  # 1 m away: after 0.6 m the agent is within 0.5 m
-        _, rewards, terminated, _, infos = vector.step([0, 1])
+        _, rewards, terminated, _, infos = vector.step([FORWARD, TURN_LEFT])
     assert rewards.tolist() == [1.0, 0.0] and terminated.tolist() == [True, False]
     assert infos["result"]["success"][0] == 1 and vector.result(0)["actions"] == 3
 
@@ -104,7 +103,7 @@ def test_no_privileged_truth_in_observations_and_infos(two_rooms: str) -> None:
         vector.task.episode = lambda index, episode=episode: episode
         observations, infos = vector.reset()
         handed = [(observations["odometry"].tobytes(), repr(infos))]
-        for actions in ([1, 2], [0, 1], [2, 2]):
+        for actions in ([TURN_LEFT, TURN_RIGHT], [FORWARD, TURN_LEFT], [TURN_RIGHT, TURN_RIGHT]):
             observations, *outcome, infos = vector.step(actions)
             handed.append((observations["odometry"].tobytes(), repr((outcome, infos))))
         assert set(observations) == {"panorama", "front", "odometry", "depth"}
@@ -123,12 +122,12 @@ def test_a_fork_moves_alone(two_rooms: str) -> None:
 
 def test_wrong_use_says_what_was_expected(two_rooms: str) -> None:
     vector = make(two_rooms)
-    for use in (lambda: vector.step([0] * PLACES), vector.render, lambda: vector.truth(0), lambda: vector.goals):
+    for use in (lambda: vector.step([1] * PLACES), vector.render, lambda: vector.truth(0), lambda: vector.goals):
         with pytest.raises(ArgumentError, match="reset"):
             use()
     vector.reset()
-    for actions in ([0, 0], [0, 0, 4], [0, 0, -1], [0.0, 0.0, 0.0]):
-        with pytest.raises(ArgumentError, match="expected 3 actions from 0 to 3"):
+    for actions in ([1, 1], [1, 1, 5], [1, 1, 0], [1.0, 1.0, 1.0]):
+        with pytest.raises(ArgumentError, match="expected 3 actions from 1 to 4"):
             vector.step(actions)
     with pytest.raises(ArgumentError, match="expected 3 episodes, got 1"):
         vector.reset(options={"episode": [1]})

@@ -202,10 +202,9 @@ def test_sizes_and_frames_are_rounded_to_what_the_networks_divide(name, asked, s
 
 
 def test_long_plans_go_on_from_the_last_frame(made, two_rooms):
-    from wiw.loop.agent import Query
-    from wiw.loop.attempts import Attempts
     from wiw.loop.clock import Clock
-    from wiw.loop.imagine import imagine
+    from wiw.loop.imagination import ModelInput, Request
+    from wiw.loop.plan_space import plan_space
     from wiw.policies.base import FrameSpec
     from wiw.tasks.imagenav import ImageNav
     from wiw.types import Key, Proposal
@@ -221,9 +220,11 @@ def test_long_plans_go_on_from_the_last_frame(made, two_rooms):
     model.rollout = watched
     task = ImageNav(scenes=two_rooms)
     env = task.environment(depth=False)
-    query = Query(env.begin(task.episode(0)), env.goal, Key(0, 0))
+    observation = env.begin(task.episode(0))
     plan = Proposal([FORWARD] * 10)
-    futures = imagine(Attempts(model), [query], [[plan]], [range(1)], FrameSpec("front", (32, 32)), Clock())
+    space, asked = plan_space("discrete"), ([Key(0, 0)], [observation], [ModelInput(observation)])
+    request = Request(space, *asked, [[plan]], [range(1)], FrameSpec("front", (32, 32)), Clock())
+    futures = space.imagine(model, request)
     assert len(futures.rollouts[0][0].frames) == 10
     assert len(answers) == 3, "four actions a clip"
     np.testing.assert_array_equal(starts[1], answers[0][:, 4])

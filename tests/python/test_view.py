@@ -40,7 +40,7 @@ class EvilTask(LineTask):
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """Nine episodes of three arms, two failed in each; all keep pictures, and one decision knows what was true."""
+    """Nine episodes of three arms, two of them errors; all have pictures, one decision has its true future."""
     arms = dict(zip(ARMS, (LineAgent(0.4), LineAgent(0.9), LineAgent(0.6)), strict=True))
     out = tmp_path_factory.mktemp("view") / "run"
     log = run_arms(EvilTask(broken=("0004", "0007")), arms, 9, out=out, progress=False, keep_images="all")
@@ -116,12 +116,12 @@ def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):
 def test_a_picture_that_cannot_be_made_is_told(tmp_path):
     with ThreadPoolExecutor(2) as pool:
         album = Beside(tmp_path / "images", pool)
-        assert [album.draw(name, lambda name=name: name.encode()) for name in "ab"] == [
-            "../images/a.jpg",
-            "../images/b.jpg",
+        assert [album.draw(name, lambda name=name: name.encode()).source for name in "ab"] == [
+            "../images/a.webp",
+            "../images/b.webp",
         ]
         album.finish()
-        assert (tmp_path / "images/b.jpg").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
+        assert (tmp_path / "images/b.webp").read_bytes() == b"b" and (album.count, album.size) == (2, 2)
         album.draw("c", lambda: decode_jpeg(b"no picture"))
         with pytest.raises(StoreError, match="no JPEG"):
             album.finish()
@@ -137,7 +137,7 @@ def test_a_run_that_goes_on_shows_what_has_ended(tmp_path):
 
 
 def test_keeping_pictures_of_every_episode_is_asked_by_name(log, tmp_path):
-    assert log.store.info["pictures"] == list(range(9))
+    assert sorted(log.store.info["pictures"]) == list(range(9))
     with pytest.raises(ArgumentError, match="keep_images of at least 0, got -1"):
         run_arms(LineTask(), {"none": LineAgent()}, 1, out=tmp_path / "run", progress=False, keep_images=-1)
     task = f"{__file__.replace('test_view', 'fakes')}:line_task"
@@ -172,7 +172,7 @@ def listed(browser):
 def states(log, arm):
     ended = {row["episode"]: row for row in log.episodes if row["arm"] == arm}
     return [
-        "failed" if ended[i]["status"] == "failed" else "reached" if ended[i]["metrics"]["success"] else "missed"
+        "error" if ended[i]["status"] == "error" else "success" if ended[i]["metrics"]["success"] else "failure"
         for i in range(9)
     ]
 
@@ -180,22 +180,22 @@ def states(log, arm):
 def test_filters_find_episodes_in_a_browser(log, site, browser):
     browser.open(site.index.as_uri())
     none, warp = states(log, "none"), states(log, "warp")
-    assert {"reached", "failed"} <= set(warp) and "missed" in none
+    assert {"success", "error"} <= set(warp) and "failure" in none
     assert listed(browser) == list(range(9))
-    choose(browser, arm="1", state="reached")
-    assert listed(browser) == [i for i in range(9) if warp[i] == "reached"]
-    choose(browser, arm="", state="failed")
+    choose(browser, arm="1", state="success")
+    assert listed(browser) == [i for i in range(9) if warp[i] == "success"]
+    choose(browser, arm="", state="error")
     assert listed(browser) == [4, 7]
     choose(browser, state="", won="1", lost="0")
-    better = [i for i in range(9) if (warp[i], none[i]) == ("reached", "missed")]
+    better = [i for i in range(9) if (warp[i], none[i]) == ("success", "failure")]
     assert better and listed(browser) == better
     choose(browser, won="", lost="", scene="2")
     assert listed(browser) == [2, 5, 8]
     assert browser.ask("document.getElementById('count').textContent") == "3 of 9"
     assert browser.ask("location.hash") == "#scene=2"
     browser.open("about:blank")
-    browser.open(site.index.as_uri() + "#scene=2&arm=0&state=reached")
-    assert listed(browser) == [i for i in (2, 5, 8) if none[i] == "reached"]
+    browser.open(site.index.as_uri() + "#scene=2&arm=0&state=success")
+    assert listed(browser) == [i for i in (2, 5, 8) if none[i] == "success"]
     assert browser.ask("document.title") == "line · run" and browser.complaints() == []
 
 

@@ -22,10 +22,10 @@ pytest.importorskip("json_repair")
 
 from wiw.errors import ArgumentError, FileError, VlmError, WeightsError  # noqa: E402
 from wiw.vlm import Request, choices, connect, user  # noqa: E402
-from wiw.vlm.base import Completion  # noqa: E402
-from wiw.vlm.cache import ReplyCache, reply_cache  # noqa: E402
+from wiw.vlm.cache import ReplyCache, open_reply_cache  # noqa: E402
 from wiw.vlm.images import from_data_uri, to_data_uri  # noqa: E402
-from wiw.vlm.instances import instance  # noqa: E402
+from wiw.vlm.instances import generate_instance  # noqa: E402
+from wiw.vlm.messages import Completion  # noqa: E402
 from wiw.vlm.mock import MockClient  # noqa: E402
 from wiw.vlm.prices import Prices  # noqa: E402
 
@@ -59,7 +59,7 @@ def slow_choice(listed: dict[str, float], labels: str) -> list[float]:
     )
 )
 def test_choices_equal_their_slow_twin(listed: dict[str, float]) -> None:
-    found = choices.from_logprobs(list(listed.items()), "ABCD")
+    found = choices.read_logprobs(list(listed.items()), "ABCD")
     named = [token for token in listed if token.strip(" (.)") in set("ABCD")]
     if not named:
         assert found is None
@@ -70,7 +70,7 @@ def test_choices_equal_their_slow_twin(listed: dict[str, float]) -> None:
 
 
 def test_tokens_that_a_server_forbids_count_nothing() -> None:
-    found = choices.from_logprobs([("A", -0.1), ("B", -9999.0), ("x", -math.inf), ("y", math.nan)], "ABC")
+    found = choices.read_logprobs([("A", -0.1), ("B", -9999.0), ("x", -math.inf), ("y", math.nan)], "ABC")
     assert found is not None
     np.testing.assert_allclose(found[0], [1, 0, 0], atol=1e-12)
 
@@ -84,7 +84,7 @@ def test_tokens_that_a_server_forbids_count_nothing() -> None:
     ],
 )  # fmt: skip
 def test_votes_are_letters_that_stand_alone(text: str, vote: int | None) -> None:
-    found = choices.from_votes([text], tuple("ABC"))
+    found = choices.count_votes([text], tuple("ABC"))
     assert found is None if vote is None else found is not None and found[0].argmax() == vote and found[1] == 1
 
 
@@ -94,7 +94,7 @@ def test_a_server_without_logprobs_is_asked_for_votes_and_the_reply_says_so() ->
     reply = ask(client, "Which?", choices=("x", "y"))
     assert (reply.by, reply.mass) == ("votes", 0.8) and reply.problem is None
     assert reply.probabilities.tolist() == [0.25, 0.75]
-    assert len({call.seed for call in client.asked}) == 6 and {call.temperature for call in client.asked[1:]} == {1.0}
+    assert len({call.seed for call in client.calls}) == 6 and {call.temperature for call in client.calls[1:]} == {1.0}
 
 
 @pytest.mark.parametrize("finish", ["content_filter", "refusal"])
@@ -157,7 +157,7 @@ def test_an_unusable_answer_is_asked_for_again_then_it_is_the_outcome() -> None:
     client = MockClient(lambda call: next(texts))
     reply = ask(client, "Plan!", schema=Plan, tries=2)
     assert reply.value.actions == ["forward"] and [said.used for said in reply.said] == [False, True]
-    first, second = client.asked
+    first, second = client.calls
     assert first.temperature == 0 and second.temperature > 0 and first.seed != second.seed
     reply = ask(MockClient(lambda call: "nonsense"), "Plan!", schema=Plan, tries=2)
     assert reply.value is None and reply.problem.kind == "malformed" and reply.problem.raw == "nonsense"
@@ -199,7 +199,7 @@ def test_the_cache_answers_what_was_of_use(tmp_path: Path) -> None:
     assert second.value == reply.value and again.spent["vlm_calls"] == 1 and again.spent["vlm_cached"] == 1
     assert "vlm_usd" not in again.spent
     assert pickle.loads(pickle.dumps(ReplyCache(tmp_path))).folder == tmp_path
-    assert reply_cache("off") is None
+    assert open_reply_cache("off") is None
 
 
 def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -237,7 +237,10 @@ def test_prices_come_from_a_file(tmp_path: Path) -> None:
     path = tmp_path / "prices.yaml"
     path.write_text("big: [2.5, 10]\n")
     prices = Prices.load(path)
-    assert prices.of("big", 1_000_000, 100_000) == pytest.approx(3.5) and prices.of("small", 1, 1) is None
+    assert (
+        prices.compute_cost("big", 1_000_000, 100_000) == pytest.approx(3.5)
+        and prices.compute_cost("small", 1, 1) is None
+    )
     for wrong in ("big: 3", "- big", "big: [1, x]", "{", ""):
         path.write_text(wrong)
         with pytest.raises(FileError, match="dollars per million tokens"):
@@ -276,7 +279,7 @@ class Tree(pydantic.BaseModel):
 
 @given(st.randoms(use_true_random=False))
 def test_instances_fit_their_schema(random: Any) -> None:
-    text = instance(Tree.model_json_schema(), lambda before, options: random.randrange(len(options)))
+    text = generate_instance(Tree.model_json_schema(), lambda before, options: random.randrange(len(options)))
     Tree.model_validate(json.loads(text))
 
 
@@ -316,7 +319,7 @@ def test_a_local_model_answers_by_the_scores_of_the_first_token(tiny: Path) -> N
     reply = ask(client, "Which?", IMAGE, choices=("a", "b", "c"))
     mock = MockClient()
     ask(mock, "Which?", IMAGE, choices=("a", "b", "c"))
-    inputs = client._inputs(mock.asked[0].messages)
+    inputs = client._prepare_inputs(mock.calls[0].messages)
     with torch.inference_mode():
         scores = torch.softmax(client._network(**inputs).logits[0, -1].double(), -1)
     words = client._tokenizer.get_vocab()
@@ -347,15 +350,15 @@ def test_a_local_model_weighs_the_ways_to_go_on(tiny: Path) -> None:
 
     def after(begun: str) -> Any:
         with torch.inference_mode():
-            return torch.softmax(client._network(**client._inputs(messages, begun)).logits[0, -1].double(), -1)
+            return torch.softmax(client._network(**client._prepare_inputs(messages, begun)).logits[0, -1].double(), -1)
 
     words = client._tokenizer.get_vocab()
     first, second = after('["'), after('["turn_')
     turn = float(first[words["t"]] / (first[words["t"]] + first[words["f"]]))
     left = float(second[words["l"]] / (second[words["l"]] + second[words["r"]]))
-    found = client._chances(messages, "[", texts).exp().numpy()
+    found = client._compute_logprobs(messages, "[", texts).exp().numpy()
     np.testing.assert_allclose(found, [1 - turn, turn * left, turn * (1 - left)], rtol=1e-4)
-    numbers = client._chances(messages, "[", [str(number) for number in range(12)])
+    numbers = client._compute_logprobs(messages, "[", [str(number) for number in range(12)])
     assert float(numbers.exp().sum()) == pytest.approx(1, abs=1e-5)
 
 

@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm import VLM
-from wiw.policies.vlm.arm import ArmVLM, looks, plans
+from wiw.policies.vlm.arm import ArmVLM, plans, prompt_images
 from wiw.policies.vlm.arm.plans import GRID
 from wiw.policies.vlm.prompts import ARM_SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
-from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.tabletop.workbench import CAMERAS, TABLE
-from wiw.tasks.manipulation import KINDS, Manipulation
+from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 from wiw.types import Goal, Key, Proposal
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 ABOVE, BELOW = [50, 50, 30, 0, 60, 60, 1], [50, 50, 25, 0, 60, 60, 0]
@@ -58,9 +58,8 @@ def words(call: Call) -> str:
 def decided(policy: Any, model: Any = None, kind: str = "push_buttons", **options: Any) -> Any:
     env = Manipulation(kind, seed=1).environment()
     env.reset(options={"episode": 1})
-    agent = wiw.Agent(policy, model, cache="off", **options).settled(env.task.defaults)
-    simulator = env.fork() if "simulator" in agent.needs else None
-    return agent.decide(env.observation, env.goal, Key(0, 1), simulator)
+    agent = agent_for(env.task, wiw.Agent(policy, model, **options), cache="off")
+    return agent.decide(env.observation, env.goal, Key(0, 1))
 
 
 class Reader(wiw.WorldModel):
@@ -79,12 +78,12 @@ class Reader(wiw.WorldModel):
 def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
     answers = iter([said(ABOVE), said(BELOW, words="Down."), said(ABOVE, BELOW), said(ABOVE), said(BELOW), said(BELOW)])
     client, model = MockClient(lambda call: next(answers)), Reader()
-    decision = decided(VLM(client), model)
-    *proposing, revising = client.asked
+    decision = decided(ArmVLM(client), model)
+    *proposing, revising = client.calls
     assert len(proposing) == 5 and len({call.seed for call in proposing}) == 5
     assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
     told = words(proposing[0])
-    numbers = plans.dictionary(decision.observation.places)
+    numbers = plans.encode_objects(decision.observation.places)
     assert f"Instruction: {decision.goal.text}" in told and "1 to 5 actions" in told and "{{" not in told
     assert all(f"object {index}: {place}" in told for index, place in numbers.items())
     assert "from 0 to 100" in told and "from 0 to 120; one unit is 3 degrees" in told and '"executable_plan"' in told
@@ -96,27 +95,27 @@ def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
     assert [strip.shape[1] // 384 for strip in strips] == [1, 1, 2] and all(len(strip) > 384 for strip in strips)
     assert f"Plan 3: Go there.\nActions: [{ABOVE}, {BELOW}]" in words(revising)
     assert decision.chosen == 1 and decision.scores.tolist() == [0.0, 1.0, 0.0] and decision.note == ""
-    assert model.read == [plans.SCENE + spoken for spoken in ("Go there.", "Down.", "Go there.")]
+    assert model.read == [plans.SCENE_WORDS + spoken for spoken in ("Go there.", "Down.", "Go there.")]
     assert [each.purpose for each in decision.exchanges] == [*(f"propose/{k}" for k in range(5)), "revise"]
 
 
 def test_without_a_world_model_one_plan_is_asked_for() -> None:
     client = MockClient(lambda call: said(ABOVE, BELOW))
-    decision = decided(VLM(client))
-    assert len(client.asked) == 1 and decision.chosen == 0 and decision.execute == 2
+    decision = decided(ArmVLM(client))
+    assert len(client.calls) == 1 and decision.chosen == 0 and decision.execute == 2
 
 
 def test_a_plan_may_be_written_anew_or_chosen_and_plans_may_be_listed() -> None:
     both = json.dumps({"plans": [answer(ABOVE), answer(ABOVE, BELOW)]})
     client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(ABOVE, ABOVE))
-    decision = decided(VLM(client, proposals="listed"), "copy")
-    assert len(client.asked) == 2 and "Give 5 plans" in words(client.asked[0])
-    assert client.asked[0].max_tokens == 5 * client.asked[1].max_tokens
+    decision = decided(ArmVLM(client, proposals="listed"), "copy")
+    assert len(client.calls) == 2 and "Give 5 plans" in words(client.calls[0])
+    assert client.calls[0].max_tokens == 5 * client.calls[1].max_tokens
     assert decision.chosen is None and decision.scores.tolist() == [0.5, 0.5]
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE, ABOVE]))
     client = MockClient(lambda call: {"B": 0.7, "A": 0.3} if call.labels else both)
-    decision = decided(VLM(client, proposals="listed", revision="select"), "copy")
-    assert decision.chosen == 1 and "B. plan 2" in words(client.asked[-1])
+    decision = decided(ArmVLM(client, proposals="listed", revision="select"), "copy")
+    assert decision.chosen == 1 and "B. plan 2" in words(client.calls[-1])
 
 
 class Glider(wiw.Policy):
@@ -132,8 +131,8 @@ class Glider(wiw.Policy):
 
 def test_of_another_policys_plans_one_is_chosen_by_some_of_its_poses() -> None:
     client = MockClient(lambda call: {"B": 0.8, "A": 0.2})
-    decision = decided(Glider(), "copy", revision=VLM(client), horizon=12, execute=12)
-    (call,) = client.asked
+    decision = decided(Glider(), "copy", reviser=ArmVLM(client), horizon=12, execute=12)
+    (call,) = client.calls
     assert decision.chosen == 1 and call.labels == ("A", "B")
     assert [strip.shape[1] // 384 for strip in images(call)[1:]] == [5, 5]
     last = GRID.encode(decision.proposals[1].actions[-1]).tolist()
@@ -145,22 +144,22 @@ def test_a_long_plan_that_may_be_written_again_is_told_whole() -> None:
     long = [[50, 50, height, 0, 60, 60, 1] for height in range(30, 23, -1)]
     both = json.dumps({"plans": [answer(*long), answer(ABOVE)]})
     client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(*long))
-    decision = decided(VLM(client, proposals="listed"), "copy", horizon=7)
-    assert f"Plan 1: Go there.\nActions: {long}" in words(client.asked[-1])
-    assert [strip.shape[1] // 384 for strip in images(client.asked[-1])[1:]] == [5, 1]
+    decision = decided(ArmVLM(client, proposals="listed"), "copy", horizon=7)
+    assert f"Plan 1: Go there.\nActions: {long}" in words(client.calls[-1])
+    assert [strip.shape[1] // 384 for strip in images(client.calls[-1])[1:]] == [5, 1]
     assert decision.chosen == 0
 
 
 @pytest.mark.parametrize(("count", "places"), [(1, [0]), (4, [0, 1, 2, 3]), (50, [9, 19, 29, 39, 49]), (7, None)])
 def test_the_end_of_a_plan_is_always_shown(count: int, places: Any) -> None:
-    found = plans.shown(count)
+    found = plans.select_shown(count)
     assert len(found) == min(count, 5) and found[-1] == count - 1 and (np.diff(found) > 0).all()
     assert places is None or found.tolist() == places
 
 
 def test_numbers_out_of_range_are_understood_and_counted() -> None:
     odd = [100, -3, 250, 120, -60, 180, 2]
-    decision = decided(VLM(MockClient(lambda call: said(ABOVE, odd))))
+    decision = decided(ArmVLM(MockClient(lambda call: said(ABOVE, odd))))
     np.testing.assert_array_equal(decision.actions[1], GRID.decode([99, 0, 99, 0, 60, 60, 1]))
     assert decision.exchanges[0].result["out_of_range"] == 5 and decision.note == ""
 
@@ -180,38 +179,38 @@ def test_numbers_out_of_range_are_understood_and_counted() -> None:
 )
 def test_unusable_answers_are_asked_for_again_and_then_a_pose_is_drawn(text: str, problem: str) -> None:
     client = MockClient(lambda call: text)
-    decision = decided(VLM(client, tries=2))
-    assert len(client.asked) == 2 and decision.exchanges[0].problem.startswith(problem)
+    decision = decided(ArmVLM(client, tries=2))
+    assert len(client.calls) == 2 and decision.exchanges[0].problem.startswith(problem)
     assert "a pose was drawn" in decision.note and decision.actions.shape == (1, 7)
-    assert plans.on_grid(decision.actions) and "drawn" in decision.proposals[0].note
+    assert plans.is_on_grid(decision.actions) and "drawn" in decision.proposals[0].note
     some = iter(["junk", said(ABOVE), text.replace("'", ""), *["junk"] * 3])
-    decision = decided(VLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
+    decision = decided(ArmVLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
     assert len(decision.proposals) == 1 and decision.chosen == 0
     assert "the plan was left out" in decision.note and "the first plan was taken" in decision.note
 
 
 def test_slips_of_syntax_are_mended() -> None:
     slip = said(ABOVE).replace('"language_plan"', "language_plan")
-    decision = decided(VLM(MockClient(lambda call: f"Here you are:\n{slip}")))
+    decision = decided(ArmVLM(MockClient(lambda call: f"Here you are:\n{slip}")))
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE]))
     assert decision.exchanges[0].result["repaired"] is True
 
 
 @pytest.mark.parametrize("size", [480, 448])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TABLETOP_TASKS)
 def test_marks_are_on_their_objects_and_hide_little_of_them(kind: str, size: int) -> None:
     task = Manipulation(kind, seed=2)
     for index in range(4):
-        table = task.table(task.episode(index))
-        seen = table.bench.picture("front", (size, size), ("color", "instance"))
+        table = task.set_table(task.episode(index))
+        seen = table.bench.render_view("front", (size, size), ("color", "instance"))
         observation = wiw.types.ArmObservation(
-            seen["color"], table.bench.pose, places=table.bench.places(table.objects)
+            seen["color"], table.bench.pose, places=table.bench.get_poses(table.objects)
         )
-        drawn = looks.now(observation)
+        drawn = prompt_images.render_observation(observation)
         changed = (drawn != seen["color"]).any(-1)
         assert changed.mean() < 0.03
-        spots = plans.indexed(observation.places)
-        points = CAMERAS["front"].pixels_of(np.array([*spots.values()]), (size, size))
+        spots = plans.index_objects(observation.places)
+        points = CAMERAS["front"].project_points(np.array([*spots.values()]), (size, size))
         for name, (column, row) in zip(sorted(observation.places), np.floor(points).astype(int), strict=True):
             near = drawn[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).astype(int)
             assert (np.abs(near - (220, 40, 40)).max(-1) < 70).any(), f"{name} has no point"
@@ -229,8 +228,8 @@ def _pixels_of(ids: Any, row: int, column: int) -> Any:
 
 def test_indices_follow_no_order_of_the_task_and_stay() -> None:
     places = {name: np.eye(4) + np.eye(4, k=3) * x for name, x in (("teal", 0.1), ("azure", 0.2), ("rose", 0.3))}
-    assert [spot[0] for spot in plans.indexed(places).values()] == [0.2, 0.3, 0.1]
-    assert plans.dictionary({"cup": np.eye(4)}) == {1: GRID.encode([0] * 7)[:3].tolist()}
+    assert [spot[0] for spot in plans.index_objects(places).values()] == [0.2, 0.3, 0.1]
+    assert plans.encode_objects({"cup": np.eye(4)}) == {1: GRID.encode([0] * 7)[:3].tolist()}
     assert plans.SURFACE == 15 and GRID.decode([0, 0, plans.SURFACE, 0, 0, 0, 0])[2] == pytest.approx(TABLE + 0.005)
 
 
@@ -238,41 +237,41 @@ EXAMPLES = {"push_buttons": (12, 1), "slide_block": (11, 1), "insert_peg": (12, 
 """Seed and variation of the tables that the examples were taken from."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", TABLETOP_TASKS)
 def test_examples_are_true_and_work(kind: str) -> None:
     seed, variation = EXAMPLES[kind]
-    setup = KINDS[kind].setup(seed, variation)
-    text = Prompts().text("manipulation", "examples", **{**ARM_SLOTS, "instruction": setup.instruction})
+    setup = TABLETOP_TASKS[kind].create_setup(seed, variation)
+    text = Prompts().render("manipulation", "examples", **{**ARM_SLOTS, "instruction": setup.instruction})
     assert text.count("Example") == 1 and f"Instruction: {setup.instruction}\n" in text
-    bench = setup.bench()
-    places = plans.dictionary(bench.places(setup.objects))
+    bench = setup.build_workbench()
+    places = plans.encode_objects(bench.get_poses(setup.objects))
     assert re.findall(r"object (\d+): (\[.*\])", text) == [(str(index), str(place)) for index, place in places.items()]
     shown = plans.plan_schema(5).model_validate_json(text.split("Answer:\n")[1])
-    (plan,) = plans.plans_in(shown)
+    (plan,) = plans.parse_plans(shown)
     sight = shown.visual_state_description
     for index, name in enumerate(sorted(setup.objects), 1):
         assert re.search(rf"object {index}\b[^,]* {name}|{name}, object {index}\b", sight), f"{name} is not named"
     for pose in plan.actions:
-        bench.go(pose)
+        bench.move_to(pose)
     if kind == "stack_cups":  # five actions stack one of two
-        assert np.linalg.norm((bench.place_of("navy") - bench.place_of("gray"))[:2, 3]) < 0.015
+        assert np.linalg.norm((bench.get_pose("navy") - bench.get_pose("gray"))[:2, 3]) < 0.015
     else:
-        assert KINDS[kind].succeeded(bench, setup)
+        assert TABLETOP_TASKS[kind].is_success(bench, setup)
 
 
 def test_each_instruction_has_the_example_of_its_sort() -> None:
     prompts, texts = Prompts(), set()
 
     def shown(**slots: Any) -> str:
-        return prompts.text("manipulation", "examples", **{**ARM_SLOTS, **slots})
+        return prompts.render("manipulation", "examples", **{**ARM_SLOTS, **slots})
 
-    for kind in KINDS.values():
-        setups = (kind.setup(seed, variation) for seed in range(3) for variation in range(kind.variations))
+    for kind in TABLETOP_TASKS.values():
+        setups = (kind.create_setup(seed, variation) for seed in range(3) for variation in range(kind.variations))
         found = {shown(instruction=setup.instruction) for setup in setups}
         assert len(found) == 1
         texts |= found
-    assert len(texts) == len(KINDS)
-    assert shown(instruction="open the drawer").count("Example") == len(KINDS)
+    assert len(texts) == len(TABLETOP_TASKS)
+    assert shown(instruction="open the drawer").count("Example") == len(TABLETOP_TASKS)
     assert shown(look_ahead_action_num=2).count('"action"') == 2
 
 
@@ -281,39 +280,43 @@ def test_a_users_own_prompts_have_the_tasks_slots(tmp_path: Path) -> None:
     file = tmp_path / "manipulation/planner.j2"
     file.write_text("Up to {{ position_bins }}, {{ rotation_bins }}, {{ rotation_degrees }}!")
     client = MockClient(lambda call: said(ABOVE))
-    decided(VLM(client, prompts=tmp_path))
-    assert words(client.asked[0]).startswith("Up to 100, 120, 3!")
+    decided(ArmVLM(client, prompts=tmp_path))
+    assert words(client.calls[0]).startswith("Up to 100, 120, 3!")
     file.write_text("{{ obs_key }}")
     with pytest.raises(PromptError, match="unknown slot 'obs_key'; the slots are look_ahead_action_num"):
-        VLM("mock", prompts=tmp_path)
+        ArmVLM("mock", prompts=tmp_path)
 
 
 def test_one_name_for_primitives_and_poses() -> None:
-    policy = VLM("mock")
-    agent = wiw.Agent(policy, "oracle", revision=policy)
-    assert agent.policy is policy and agent.model.accepts.space == "discrete"
-    settled = agent.settled(Manipulation().defaults)
-    assert isinstance(settled.policy, ArmVLM) and isinstance(settled.revision, ArmVLM)
-    assert settled.model.accepts.space == "pose7" and settled.policy.needs == ()
-    assert settled.policy.for_space("discrete") is policy and settled.but(candidates=2).policy.space == "pose7"
-    assert settled.policy.describe()["policy"] == "ArmVLM" and "tracker" not in settled.policy.describe()
-    recipe = AgentRecipe("vlm", "oracle", policy_options={"vlm": {"vlm": "mock"}})
-    assert recipe.build(Manipulation().defaults).policy.space == "pose7"
-    with pytest.raises(ArgumentError, match="asked for in poses of a gripper, but policy Heuristic makes them of disc"):
-        wiw.Agent("heuristic").settled(Manipulation().defaults)
+    mock = {"vlm": {"vlm": "mock"}}
+    agent = wiw.Agent(wiw.policy("vlm", vlm="mock"), "oracle", reviser=VLM("mock"))
+    assert type(agent.policy) is VLM and agent.policy.space == agent.model.accepts.space == "discrete"
+    posing = agent_for(Manipulation(), AgentRecipe("vlm", "oracle", reviser="vlm", policy_options=mock))
+    assert isinstance(posing.policy, ArmVLM) and isinstance(posing.reviser, ArmVLM)
+    assert posing.model.accepts.space == "pose7" and posing.policy.needs == ()
+    assert posing.replace(candidates=2).policy.space == "pose7"
+    assert isinstance(wiw.policy("vlm", vlm="mock", space="pose7"), ArmVLM)
+    assert posing.policy.describe()["policy"] == "ArmVLM" and "tracker" not in posing.policy.describe()
+    for policy, name in (("heuristic", "Heuristic"), (agent.policy, "VLM")):
+        with pytest.raises(
+            ArgumentError, match=f"asked for in poses of a gripper, but policy {name} makes them of discrete primitives"
+        ):
+            agent_for(Manipulation(), wiw.Agent(policy))
     with pytest.raises(ArgumentError, match="among ar, imagenav, got 'manipulation'"):
-        policy.begin(Goal("manipulation"), Key(0, 0))
+        agent.policy.begin(Goal("manipulation"), Key(0, 0))
     with pytest.raises(ArgumentError, match="among manipulation, got 'ar'"):
-        policy.for_space("pose7").begin(Goal("ar"), Key(0, 0))
+        posing.policy.begin(Goal("ar"), Key(0, 0))
 
 
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None:
     """With drawn answers, over HTTP with faults; what was said is enough to run it again."""
     faults = Misbehaviour({"429": 0.1, "malformed": 0.2, "refusal": 0.1, "truncated": 0.1}, seed=0, retry_after=0.01)
-    with VlmServer(MockClient(), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=faults) as server:
         options = {"vlm": server.url, "dialect": "vllm", "tries": 1, "cache": "off"}
         recipe = AgentRecipe("vlm", "copy", candidates=2, policy_options={"vlm": options})
-        log = evaluate("manipulation", recipe, 1, 0, tmp_path / "run", progress=False, tasks="slide_block", actions=6)
+        log = evaluate(
+            "manipulation", recipe, 1, seed=0, out=tmp_path / "run", progress=False, tasks="slide_block", actions=6
+        )
     assert not any(episode["error"] for episode in log.episodes), "".join(e["error"] for e in log.episodes)
     rows = list(log.store.decisions("copy"))
     exchanges = [each for row in rows for each in row["exchanges"]]
@@ -326,11 +329,11 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None
 
 
 def test_a_server_that_is_too_slow_is_infrastructure(tmp_path: Path) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
-        policy = VLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
+        policy = ArmVLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
         log = evaluate(Manipulation(), wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/timeout"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/timeout"
 
 
 def test_the_tiny_random_model_writes_plans() -> None:
@@ -342,5 +345,5 @@ def test_the_tiny_random_model_writes_plans() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         client = TransformersClient(make_tiny(Path(folder) / "tiny"), device="cpu")
-        decision = decided(VLM(client, tries=1), horizon=1, execute=1)
+        decision = decided(ArmVLM(client, tries=1), horizon=1, execute=1)
     assert decision.note == "" and decision.actions.shape == (1, 7)

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 pytest.importorskip("pydantic")
 pytest.importorskip("json_repair")
 
-from wiw.policies.vlm.plans import plan_schema, plans_in
+from wiw.policies.vlm.plans import parse_plans, plan_schema
 from wiw.vlm import Request, user
-from wiw.vlm.base import Completion, Kind
+from wiw.vlm.messages import Completion, Kind
 from wiw.vlm.mock import MockClient
 
 ACTIONS = ["forward", "turn_left", "turn_right", "forward"]
@@ -116,7 +116,7 @@ def held(text: str, finish: str = "stop") -> None:
         assert len(reply.problem.raw) <= 500 and text.startswith(reply.problem.raw)
         json.dumps([reply.problem.raw, reply.text])
         return
-    ((actions, reason),) = plans_in(reply.value)
+    ((actions, reason),) = parse_plans(reply.value)
     assert 1 <= len(actions) <= 5 and isinstance(reason, str)
     rest = text[text.index("actions") :] if text.index("actions") > text.index("reason") else text
     for name in reply.value.actions:

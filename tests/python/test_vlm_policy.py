@@ -10,24 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fakes import agent_for
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
 import wiw
+from misbehaviour import MisbehavingVlmServer, Misbehaviour
 from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
-from wiw.loop.agent import Query
-from wiw.policies.vlm import VLM, looks, presets
+from wiw.loop.memory import Query
+from wiw.policies.vlm import VLM, presets, prompt_images
 from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.misbehaviour import Misbehaviour
 from wiw.serving.vlm_server import VlmServer
 from wiw.studies.evaluate import evaluate
 from wiw.types import Rollout
-from wiw.vlm.base import Call
+from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
 
 FORWARD, LEFT, RIGHT = 1, 2, 3
@@ -60,21 +61,21 @@ def imagenav(scene: str) -> Any:
 
 def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
     _, info = env.reset(options={"episode": 0})
-    agent = wiw.Agent(policy, model, **options).settled(env.unwrapped.task.defaults)
+    agent = agent_for(env.unwrapped.task, wiw.Agent(policy, model, **options))
     return agent.decide(env.observation, env.goal, info["key"])
 
 
 def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms: str) -> None:
     client = MockClient(script)
     decision = decided(imagenav(two_rooms), VLM(client), "copy")
-    *proposing, revising = client.asked
+    *proposing, revising = client.calls
     assert len(proposing) == 3 and len({call.seed for call in proposing}) == 3
     assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
     assert [image.shape for image in images(proposing[0])] == [(480, 480, 3), (576, 1024, 3), (480, 480, 3)]
     assert "next 5 action(s)" in words(proposing[0]) and "{{" not in words(proposing[0])
     goal, strip = images(revising)
     np.testing.assert_array_equal(goal, decision.goal.image)
-    assert strip.shape[0] > looks.VIEW and strip.shape[1] >= 3 * looks.VIEW
+    assert strip.shape[0] > prompt_images.VIEW and strip.shape[1] >= 3 * prompt_images.VIEW
     assert "Plan 1: ['forward', 'forward', 'turn_left']" in words(revising)
     assert [plan.actions.tolist() for plan in decision.proposals] == [[FORWARD, FORWARD, LEFT]], "equal plans are one"
     assert decision.chosen == 0 and decision.scores.tolist() == [1.0] and decision.note == ""
@@ -85,7 +86,7 @@ def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms
 def test_without_a_world_model_one_plan_is_asked_for(two_rooms: str) -> None:
     client = MockClient(script)
     decision = decided(imagenav(two_rooms), VLM(client))
-    assert len(client.asked) == 1 and decision.actions.tolist() == [FORWARD, FORWARD, LEFT] and decision.chosen == 0
+    assert len(client.calls) == 1 and decision.actions.tolist() == [FORWARD, FORWARD, LEFT] and decision.chosen == 0
 
 
 def test_answers_do_not_depend_on_who_else_is_asked_for(two_rooms: str) -> None:
@@ -116,14 +117,14 @@ def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
     decision = decided(imagenav(two_rooms), VLM(chooser, revision="select"), "copy")
     assert decision.actions.tolist() == [LEFT, FORWARD] and decision.chosen == 1
     np.testing.assert_allclose(decision.scores, [0.3, 0.6, 0.1])
-    assert "B. plan 2: turn_left, forward" in words(chooser.asked[-1])
+    assert "B. plan 2: turn_left, forward" in words(chooser.calls[-1])
 
 
 def test_plans_may_be_listed_in_one_answer(two_rooms: str) -> None:
     answer = json.dumps({"plans": [{"reason": "r", "actions": [name]} for name in ("forward", "turn_left", "forward")]})
     client = MockClient(lambda call: answer if "plans" in call.schema["properties"] else WALK)
     decision = decided(imagenav(two_rooms), VLM(client, proposals="listed"), "copy")
-    assert len(client.asked) == 2 and "Give 3 plans" in words(client.asked[0])
+    assert len(client.calls) == 2 and "Give 3 plans" in words(client.calls[0])
     assert [plan.actions.tolist() for plan in decision.proposals] == [[FORWARD], [LEFT]]
 
 
@@ -140,13 +141,15 @@ def redness(image: Any) -> int:
 def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
     client = MockClient(script)
     decision = decided(recognition, VLM(client), "warp")
-    proposing, (moving, answering) = client.asked[:-2], client.asked[-2:]
+    proposing, (moving, answering) = client.calls[:-2], client.calls[-2:]
     assert [each.purpose for each in decision.exchanges] == ["propose/0", "propose/1", "move", "answer"]
     assert len(proposing) == 2 and "next 4 action(s)" in words(proposing[0])
     assert "next 1 action(s)" in words(moving) and "Plan 1:" in words(moving)
     assert [image.shape[:2] for image in images(moving)[:2]] == [(480, 480), (576, 1024)] and len(images(moving)) == 3
     shapes = [image.shape[:2] for image in images(answering)]
-    assert shapes[0] == (looks.VIEW, looks.VIEW) and len(shapes) == 2 and shapes[1][1] > looks.VIEW
+    assert (
+        shapes[0] == (prompt_images.VIEW, prompt_images.VIEW) and len(shapes) == 2 and shapes[1][1] > prompt_images.VIEW
+    )
     for image in (*images(moving), *images(answering), *images(proposing[0])):
         assert redness(image) > 20, "the target is not boxed"
     assert "turn left" not in words(answering) and moving.labels == ("A", "B", "C")
@@ -161,7 +164,7 @@ def test_recognition_without_a_world_model_is_two_questions(recognition: Any) ->
     decision = decided(recognition, VLM(client))
     assert [each.purpose for each in decision.exchanges] == ["move", "answer"]
     assert decision.actions.tolist() == [RIGHT] and decision.chosen == 0
-    assert [len(images(call)) for call in client.asked] == [2, 1]
+    assert [len(images(call)) for call in client.calls] == [2, 1]
 
 
 def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: Any) -> None:
@@ -179,7 +182,7 @@ def test_a_target_out_of_sight_is_not_asked_about(tmp_path: Path, two_rooms: str
     assert not env.unwrapped.observation.target.mask.any(), "the test needs a hidden target"
     client = MockClient(lambda call: {letter_of(call, "go straight for 0.20 m"): 1.0})
     decision = decided(env, VLM(client))
-    assert len(client.asked) == 1 and "nothing was asked, no choice was preferred" in decision.note
+    assert len(client.calls) == 1 and "nothing was asked, no choice was preferred" in decision.note
     assert decision.answer.confidence == pytest.approx(0.25, abs=1e-6)
 
 
@@ -214,16 +217,21 @@ def test_strips_name_actions_and_show_where_the_target_is() -> None:
     masks = np.zeros((2, 576, 1024), bool)
     masks[0, 250:300, 500:540] = True
     rollout = Rollout(frames, np.zeros(2, bool), "panorama")
-    strip = looks.plan_strip(Proposal([FORWARD, LEFT]), rollout, Track(masks, ((500, 250, 540, 300), None)))
+    strip = prompt_images.render_plan_strip(
+        Proposal([FORWARD, LEFT]), rollout, Track(masks, ((500, 250, 540, 300), None))
+    )
     half = strip.shape[1] // 2
     assert redness(strip[:, :half]) > 50 and redness(strip[:, half:]) == 0
-    bar = strip.shape[0] - looks.VIEW
-    assert bar > 10 and not np.array_equal(strip[:bar, : looks.VIEW], strip[:bar, -looks.VIEW :])
-    views = looks.target_strip(rollout, Track(masks, ((500, 250, 540, 300), None)))
-    assert views is not None and views.shape[1] == looks.VIEW and redness(views) > 50
-    assert looks.target_strip(Rollout(frames, np.ones(2, bool), "panorama"), Track(masks, (None, None))) is None
+    bar = strip.shape[0] - prompt_images.VIEW
+    assert bar > 10 and not np.array_equal(strip[:bar, : prompt_images.VIEW], strip[:bar, -prompt_images.VIEW :])
+    views = prompt_images.render_target_strip(rollout, Track(masks, ((500, 250, 540, 300), None)))
+    assert views is not None and views.shape[1] == prompt_images.VIEW and redness(views) > 50
+    assert (
+        prompt_images.render_target_strip(Rollout(frames, np.ones(2, bool), "panorama"), Track(masks, (None, None)))
+        is None
+    )
     front = Rollout(frames[:, :384, :384], np.zeros(2, bool), "front")
-    boxed = looks.target_strip(front, Track(masks[:, :384, :384], ((9, 9, 50, 50), None)))
+    boxed = prompt_images.render_target_strip(front, Track(masks[:, :384, :384], ((9, 9, 50, 50), None)))
     assert boxed is not None and redness(boxed) > 50
 
 
@@ -235,7 +243,7 @@ def test_shipped_prompts_have_the_papers_slots() -> None:
     ):
         source = (FOLDER / task / f"{name}.j2").read_text()
         assert all(f"{{{{ {slot} }}}}" in source for slot in slots)
-    text = Prompts().text("ar", "planner", **{**SLOTS, "look_ahead_action_num": 7, "obs_key": "a painting"})
+    text = Prompts().render("ar", "planner", **{**SLOTS, "look_ahead_action_num": 7, "obs_key": "a painting"})
     assert "next 7 action(s)" in text and "a painting" in text
 
 
@@ -244,11 +252,11 @@ def test_a_users_own_prompts_are_checked(tmp_path: Path, two_rooms: str) -> None
     file = tmp_path / "imagenav/planner.j2"
     file.write_text("Walk {{ look_ahead_action_num }} steps!")
     own, shipped = Prompts(tmp_path), Prompts()
-    assert own.text("imagenav", "planner", **SLOTS) == "Walk 5 steps!" and own.digest != shipped.digest
-    assert own.text("ar", "answerer", **SLOTS) == shipped.text("ar", "answerer", **SLOTS)
+    assert own.render("imagenav", "planner", **SLOTS) == "Walk 5 steps!" and own.digest != shipped.digest
+    assert own.render("ar", "answerer", **SLOTS) == shipped.render("ar", "answerer", **SLOTS)
     client = MockClient(script)
     decided(imagenav(two_rooms), VLM(client, prompts=tmp_path))
-    assert words(client.asked[0]).startswith("Walk 5 steps!")
+    assert words(client.calls[0]).startswith("Walk 5 steps!")
     for source, said in (
         ("{{ goal_colour }}", "unknown slot 'goal_colour'; the slots are obs_key"),
         ("{{ actions.fly.high }}", "UndefinedError"),
@@ -277,18 +285,18 @@ def test_options_out_of_range_and_tasks_without_prompts() -> None:
 
 def test_presets_name_a_model_and_how_it_is_served() -> None:
     docs = (Path(__file__).parents[2] / "docs/vlm.md").read_text()
-    for name in presets.names():
-        options = presets.client_options(name)
-        assert options["model"] in presets.serve_command(name) and options["dialect"] == "vllm"
-        assert " ".join(presets.serve_command(name).split()) in " ".join(docs.replace("\\\n", " ").split()), name
+    for name in presets.list_names():
+        options = presets.get_client_options(name)
+        assert options["model"] in presets.get_serve_command(name) and options["dialect"] == "vllm"
+        assert " ".join(presets.get_serve_command(name).split()) in " ".join(docs.replace("\\\n", " ").split()), name
         assert VLM("http://localhost:1/v1", model=name).client.model == options["model"]
-    assert presets.names() == ["internvl3-78b-awq", "qwen2.5-vl-72b-awq"]
+    assert presets.list_names() == ["internvl3-78b-awq", "qwen2.5-vl-72b-awq"]
 
 
 def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_rooms: str) -> None:
     """Both tasks, with the scripted model, over HTTP with faults; what was said is enough to run them again."""
     faults = Misbehaviour({"429": 0.1, "500": 0.05, "malformed": 0.05, "refusal": 0.05}, seed=1, retry_after=0.01)
-    with VlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
+    with MisbehavingVlmServer(MockClient(script, model="scripted"), misbehaviour=faults) as server:
         file = a_file(tmp_path, two_rooms)
         preset = tmp_path / "short.yaml"
         preset.write_text("decisions: 4\n")
@@ -296,7 +304,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
             recipe = AgentRecipe(
                 "vlm", "copy", policy_options={"vlm": {"vlm": server.url, "dialect": "vllm", "tries": 2}}
             )
-            log = evaluate(task, recipe, 1, 0, tmp_path / task, progress=False, preset=str(preset), **options)
+            log = evaluate(task, recipe, 1, seed=0, out=tmp_path / task, progress=False, preset=str(preset), **options)
             (episode,) = log.episodes
             assert episode["status"] == "done"
             rows = list(log.store.decisions("copy"))
@@ -311,18 +319,18 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path, two_roo
 
 def test_recipes_that_name_no_server_are_replayed_too() -> None:
     assert AgentRecipe("vlm").replaying(Path("r")).policy_options == {"vlm": {"vlm": "replay:r", "cache": "off"}}
-    recipe = AgentRecipe("heuristic", revision="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
+    recipe = AgentRecipe("heuristic", reviser="vlm", policy_options={"vlm": {"vlm": "http://x", "tries": 2}})
     assert recipe.replaying(Path("r")).policy_options["vlm"] == {"vlm": "replay:r", "cache": "off", "tries": 2}
     assert recipe.describe()["policy_options"] == {"vlm": {"tries": 2}}, "the address is no part of the identity"
     assert AgentRecipe("matcher").replaying(Path("r")) == AgentRecipe("matcher")
 
 
 def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
-    with VlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
+    with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
         log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
-        assert episode["status"] == "failed" and episode["kind"] == "vlm/status"
+        assert episode["status"] == "error" and episode["kind"] == "vlm/status"
 
 
 def test_the_command_line_against_the_tiny_random_model(

@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as npst
 
 from wiw.action import TextTemplate
 from wiw.errors import RemoteError
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, History
 from wiw.wire.arrays import DTYPES, pack_array, unpack_array
 from wiw.wire.messages import VERSION, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import pack_row, row_id, stack, unpack_row
@@ -52,7 +52,13 @@ def observations(batch=2):
         draw.integers(0, 256, (*size, 3), np.uint8),
         depth=draw.random(size, np.float32),
         semantic=draw.integers(0, 9, size).astype(np.uint32),
-        history=[draw.integers(0, 256, (n + 1, HEIGHT, WIDTH, 3), np.uint8) for n in range(batch)],
+        history=History(
+            draw.integers(0, 256, (batch, 3, HEIGHT, WIDTH, 3), np.uint8),
+            draw.random((batch, 3, 3)),
+            np.array([[[1, 2], [3, 0]], [[1, 0], [2, 0]]], np.int8)[:batch],
+            np.array([[2, 1], [1, 1]])[:batch],
+            np.array([3, 2])[:batch],
+        ),
     )
 
 
@@ -88,8 +94,11 @@ def test_a_row_comes_out_as_it_went_in_and_stacks_to_the_batch():
     found, controls, seeds = stack(rows)
     for name in ("image", "depth", "semantic"):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
-    for ours, theirs in zip(found.history, whole.history, strict=True):
+    assert rows[1].history.actions.shape == (1, 2, 1)  # the second row needs no more
+    for field in dataclasses.fields(History):
+        ours, theirs = getattr(found.history, field.name), getattr(whole.history, field.name)
         np.testing.assert_array_equal(ours, theirs)
+        assert ours.dtype == theirs.dtype
     assert seeds.dtype == np.uint64 and seeds.tolist() == [2**64 - 1, 2**64 - 2]
     for field in dataclasses.fields(Control):
         np.testing.assert_array_equal(getattr(controls[1], field.name), getattr(plan(), field.name))
@@ -113,8 +122,9 @@ def test_equal_questions_have_equal_ids_and_others_do_not():
     "model",
     [
         accepts("image"),
-        accepts("trajectory", view="perspective", frames=14, needs=("depth", "history"), causal=True, cacheable=True),
+        accepts("trajectory", "perspective", frames=14, needs=("depth", "history"), history=7, causal=True),
         accepts("action", vocabulary={1: [0.5, -1.0], 2: np.array([0.0, 1.0])}, null_first=True, best_batch=3),
+        accepts("viewpoint", cacheable=True),
         accepts("text", size=(64, 128), template=TextTemplate("Go: {actions}", separator=" - ", merge_runs=True)),
     ],
     ids=lambda model: model.control,
@@ -215,7 +225,19 @@ LIES = {
     "objects": {"image": {**ROW_VALUES["image"], "dtype": "|O"}},
     "records": {"image": {**ROW_VALUES["image"], "dtype": "|V3"}},
     "another dtype": {"depth": ROW_VALUES["semantic"]},
-    "another rank": {"image": ROW_VALUES["history"]},
+    "another rank": {"image": ROW_VALUES["history"]["images"]},
+    "a history without poses": {"history": {k: v for k, v in ROW_VALUES["history"].items() if k != "poses"}},
+    "a history that is an array": {"history": ROW_VALUES["history"]["images"]},
+    "poses for other images": {"history": {**ROW_VALUES["history"], "poses": pack_array(np.zeros((2, 3)))}},
+    "gripper poses between primitives": {"history": {**ROW_VALUES["history"], "poses": pack_array(np.zeros((3, 7)))}},
+    "poses that are nowhere": {"history": {**ROW_VALUES["history"], "poses": pack_array(np.full((3, 3), np.inf))}},
+    "actions of other gaps": {"history": {**ROW_VALUES["history"], "actions": pack_array(np.zeros((1, 1), np.int8))}},
+    "no room for actions": {"history": {**ROW_VALUES["history"], "actions": pack_array(np.zeros((2, 0), np.int8))}},
+    "actions of another kind": {"history": {**ROW_VALUES["history"], "actions": pack_array(np.zeros((2, 1)))}},
+    "more actions than there are": {"history": {**ROW_VALUES["history"], "lengths": pack_array(np.array([1, 2]))}},
+    "fewer than no actions": {"history": {**ROW_VALUES["history"], "lengths": pack_array(np.array([1, -1]))}},
+    "more frames than there are": {"history": {**ROW_VALUES["history"], "count": 4}},
+    "no frame": {"history": {**ROW_VALUES["history"], "count": 0}},
     "a list of bytes": {"image": {**ROW_VALUES["image"], "data": [1] * 30}},
     "nan": {"trajectory": pack_array(np.full((3, 3), np.nan))},
     "other lengths": {"viewpoints": pack_array(np.zeros((2, 4, 4)))},
@@ -257,3 +279,12 @@ def test_what_unpacks_to_much_more_takes_no_memory(bomb):
 
 def test_only_binary_frames_are_read():
     refused("text")
+
+
+def test_a_history_of_gripper_poses_comes_out_as_it_went_in():
+    whole = observations(1)
+    poses = np.arange(21.0).reshape(1, 3, 7)
+    history = dataclasses.replace(whole.history, poses=poses, actions=np.arange(28.0).reshape(1, 2, 2, 7))
+    found = unpack_row(pack_row(dataclasses.replace(whole, history=history), 0, plan(), 1)).history
+    for field in dataclasses.fields(History):
+        np.testing.assert_array_equal(getattr(found, field.name), getattr(history, field.name))

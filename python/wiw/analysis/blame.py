@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which stage failures are due to, from the failed episodes run again with stages told the truth (`wiw.attribute`).
+"""Which stage of the loop causes an agent's failures, from reruns with ground truth in one stage at a time.
 
-A stage is acquitted where a failure is mended while it stays as it is. So the verdict is the first of these swaps that
-mends, in the order of how much it gives away:
-imagination: with the true futures, the agent's own scores of its own plans suffice.
-scoring: with the true worth of each plan, its own plans suffice.
-proposals: it would have recognised a good plan, had it had one.
-joint: all three together mend it, none alone.
-beyond: not even all three do: the budget, the actions, or an answer that is wrong from the best view.
+`wiw.blame` reruns failures; this module reads the reruns. A verdict is the first of these that turns the failure into a
+success, ordered by how much it gives away:
+imagination: ground-truth futures; the agent's own plans and scores are good enough.
+scoring: ground-truth scores; the agent's own plans are good enough.
+proposals: a ground-truth plan among the proposals; the agent recognises a good plan when it has one.
+joint: ground truth in all three stages, but in no single one.
+beyond: not even all three: the budget, the actions, or an answer that is wrong from the best view.
 """
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,40 +22,40 @@ from typing import Any
 from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
+from wiw.experiments.ground_truth import STAGES
 from wiw.files import whole_file
-from wiw.loop.swaps import STAGES
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore
 
 FOLDER = "blame"
-"""In the run's folder, where the episodes that were run again are kept: a run store with an arm for each swap."""
-SWAPS: Mapping[str, tuple[str, ...]] = {**{stage: (stage,) for stage in STAGES}, "all": STAGES}
-"""What is told the truth, by the swap's name."""
+"""Folder inside the run's that holds the reruns: a run store with one arm per arm and rerun."""
+RERUNS: Mapping[str, tuple[str, ...]] = {**{stage: (stage,) for stage in STAGES}, "all": STAGES}
+"""Stages that use ground truth, by the rerun's name."""
 VERDICTS = {
-    "imagination": "the true futures would have sufficed",
-    "scoring": "a good plan was proposed and not chosen",
-    "proposals": "no good plan was proposed",
-    "joint": "only all three together mend it",
-    "beyond": "not even all three do",
+    "imagination": "ground-truth futures are enough",
+    "scoring": "ground-truth scores of the agent's own plans are enough",
+    "proposals": "a ground-truth plan among the proposals is enough",
+    "joint": "only ground truth in all three stages is enough",
+    "beyond": "not even ground truth in all three stages is enough",
 }
 
 
 @dataclass(frozen=True)
 class EpisodeBlame:
-    """One failed episode that was run again."""
+    """One failure that was rerun."""
 
     arm: str
     episode: int
     scene: str
-    mended: Mapping[str, bool]
-    """By swap, whether the episode succeeds with it; a swap that changes nothing is left out."""
+    success: Mapping[str, bool]
+    """By rerun, whether the episode succeeds; a rerun that changes nothing is left out."""
 
     @property
     def verdict(self) -> str:
         """One of `VERDICTS`."""
-        single = next((stage for stage in STAGES if self.mended.get(stage)), None)
-        return single or ("joint" if self.mended["all"] else "beyond")
+        single = next((stage for stage in STAGES if self.success.get(stage)), None)
+        return single or ("joint" if self.success["all"] else "beyond")
 
 
 @dataclass(frozen=True)
@@ -64,113 +64,91 @@ class ArmBlame:
 
     arm: str
     judged: int
-    """Episodes of the run that count."""
-    failed: int
+    """Episodes of the run that ended without an error."""
+    failures: int
     """Of those, the ones without success."""
-    infrastructure: tuple[int, ...]
-    """Episodes of the run whose infrastructure failed: nobody knows what the agent would have done."""
+    errors: tuple[int, ...]
+    """Episodes of the run that ended with an error; nothing is blamed for them."""
     episodes: tuple[EpisodeBlame, ...]
-    """Those of the failed ones that were run again with every swap."""
-    broken: Mapping[int, str]
-    """Those where the infrastructure of a swapped run failed, by episode: which swap, and why."""
-    mended: Mapping[str, Estimate]
-    """By swap, percent of `episodes` that succeed with it; empty where there are none."""
+    """Failures that were rerun with ground truth in each stage."""
+    rerun_errors: Mapping[int, str]
+    """Failures whose rerun ended with an error, by episode: which rerun, and why."""
+    recovery: Mapping[str, Estimate]
+    """By rerun, percent of `episodes` that succeed; empty where there are none."""
 
     @property
-    def open(self) -> int:
-        """Failed episodes that have not been run again with every swap yet."""
-        return self.failed - len(self.episodes) - len(self.broken)
+    def remaining(self) -> int:
+        """Failures that have not been rerun yet."""
+        return self.failures - len(self.episodes) - len(self.rerun_errors)
 
     @property
     def verdicts(self) -> dict[str, int]:
-        """How many failures each of `VERDICTS` explains."""
+        """Number of failures by verdict."""
         found = Counter(episode.verdict for episode in self.episodes)
         return {verdict: found[verdict] for verdict in VERDICTS}
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values: `mended_<swap>` with `_low` and `_high` in percent, `blame_<verdict>` in episodes."""
-        line: dict[str, Any] = {"arm": self.arm, "judged": self.judged, "failed": self.failed}
-        line |= {"examined": len(self.episodes), "open": self.open}
-        line |= {"infrastructure": list(self.infrastructure), "broken": dict(self.broken)}
-        for swap, found in self.mended.items():
-            name = f"mended_{swap}"
+        """Return plain values: `mended_<rerun>` with `_low` and `_high` in percent, `blame_<verdict>` in episodes."""
+        line: dict[str, Any] = {"arm": self.arm, "judged": self.judged, "failures": self.failures}
+        line |= {"examined": len(self.episodes), "remaining": self.remaining}
+        line |= {"errors": list(self.errors), "rerun_errors": dict(self.rerun_errors)}
+        for rerun, found in self.recovery.items():
+            name = f"mended_{rerun}"
             line |= {name: found.value, f"{name}_low": found.low, f"{name}_high": found.high}
         return line | {f"blame_{verdict}": count for verdict, count in self.verdicts.items()}
 
 
 @dataclass(frozen=True)
 class Blame:
-    """What `wiw.attribute` found."""
+    """The result of `wiw.blame`."""
 
     run: Path
     arms: tuple[ArmBlame, ...]
 
     def __getitem__(self, arm: str) -> ArmBlame:
-        """One arm's failures."""
+        """Return one arm's failures."""
         for line in self.arms:
             if line.arm == arm:
                 return line
         raise KeyError(f"no failures of '{arm}' were examined; those of {', '.join(a.arm for a in self.arms)} were")
 
     def verdicts(self) -> dict[tuple[str, int], str]:
-        """By arm and episode."""
+        """Return the verdicts by arm and episode."""
         return {(one.arm, one.episode): one.verdict for line in self.arms for one in line.episodes}
 
     def notes(self) -> list[str]:
-        """What a reader must know, a sentence each."""
+        """Return sentences that a reader of the tables needs."""
         found = []
         for line in self.arms:
-            if line.infrastructure:
-                text = "failed for infrastructure, so nothing is blamed for them"
-                found.append(_named(line.arm, text, line.infrastructure))
-            if line.broken:
-                episode, cause = next(iter(line.broken.items()))
-                text = "could not be run again, as infrastructure failed"
-                found.append(f"{_named(line.arm, text, line.broken)} The first, {episode}, {cause}")
-            if line.open:
-                found.append(f"{line.arm}: {line.open} of {line.failed} failed episodes were not examined.")
-        if any(line.mended for line in self.arms):
-            found.append("Mended: percent of the examined failures that succeed with the swap, 95 % interval.")
+            if line.errors:
+                text = "ended with an infrastructure error in the run, so no stage is blamed for them"
+                found.append(_name_episodes(line.arm, text, line.errors))
+            if line.rerun_errors:
+                episode, cause = next(iter(line.rerun_errors.items()))
+                text = "could not be rerun because of an infrastructure error"
+                found.append(f"{_name_episodes(line.arm, text, line.rerun_errors)} The first, {episode}, {cause}")
+            if line.remaining:
+                found.append(f"{line.arm}: {line.remaining} of {line.failures} failures have not been rerun.")
+        if any(line.recovery for line in self.arms):
+            found.append("Recovery: percent of the rerun failures that succeed with that ground truth, 95 % interval.")
         return found
 
     def to_json(self) -> str:
-        """Arms and episodes as JSON."""
+        """Return arms and episodes as JSON."""
         arms = [line.as_dict() for line in self.arms]
         episodes = [
-            {"arm": one.arm, "episode": one.episode, "scene": one.scene, "verdict": one.verdict, "mended": one.mended}
+            {"arm": one.arm, "episode": one.episode, "scene": one.scene, "verdict": one.verdict, "mended": one.success}
             for line in self.arms
             for one in line.episodes
         ]
         return json.dumps(json.loads(to_json({"arms": arms, "episodes": episodes})), indent=2)
 
     def save(self) -> Path:
-        """Writes blame.json into the run's folder."""
+        """Write blame.json into the run's folder and return its path."""
         path = self.run / "blame.json"
         with whole_file(path) as draft:
             draft.write_text(self.to_json(), encoding="utf-8")
         return path
-
-    def summary(self) -> None:
-        """Prints both tables."""
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-
-        console = Console()
-        console = Console(width=None if console.is_terminal else max(console.width, 120))
-        for title, columns, cells in (
-            ("Failures that a swap turns into successes, %", (*SWAPS,), _mended_cells),
-            ("Which stage is to blame, episodes", (*VERDICTS,), _verdict_cells),
-        ):
-            table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-            table.add_column("arm", style="bold")
-            for column in ("failed", "examined", *columns):
-                table.add_column(column, justify="right")
-            for line in self.arms:
-                table.add_row(line.arm, str(line.failed), str(len(line.episodes)), *cells(line))
-            console.print(table)
-        for note in self.notes():
-            console.print(note, style="dim", highlight=False)
 
     def __str__(self) -> str:
         lines = [
@@ -179,32 +157,60 @@ class Blame:
         ]
         return "\n".join(lines)
 
+    def summary(self) -> None:
+        """Print both tables."""
+        from rich import box
+        from rich.console import Console
+        from rich.table import Table
 
-def _mended_cells(line: ArmBlame) -> list[str]:
-    """For each swap, e.g. "46.3 [38.9, 54.0]"; a dash where it changes nothing or nothing was examined."""
-    return [show_estimate(line.mended[swap]) if swap in line.mended else "–" for swap in SWAPS]
+        console = Console()
+        gap = " " if console.width >= ROOMY or not console.is_terminal else "\n"
+        console = Console(width=None if console.is_terminal else max(console.width, ROOMY))
+        for title, columns, cells in (
+            ("Failures that succeed with ground truth in one stage, %", (*RERUNS,), _recovery_cells),
+            ("Stage to blame, episodes", (*VERDICTS,), _verdict_cells),
+        ):
+            table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+            table.add_column("arm", style="bold", overflow="fold")
+            for column in ("failures", "rerun", *columns):
+                table.add_column(column, justify="right", no_wrap=True)
+            for line in self.arms:
+                shown = [cell.replace(" ", gap, 1) for cell in cells(line)]
+                table.add_row(line.arm, str(line.failures), str(len(line.episodes)), *shown)
+            console.print(table)
+        for note in self.notes():
+            console.print(note, style="dim", highlight=False)
+
+
+ROOMY = 120
+"""Terminal columns from which on an estimate and its interval stand on one line."""
+
+
+def _recovery_cells(line: ArmBlame) -> list[str]:
+    """Return a cell per rerun, e.g. "46.3 [38.9, 54.0]"; a dash where it changes nothing or nothing was rerun."""
+    return [show_estimate(line.recovery[rerun]) if rerun in line.recovery else "–" for rerun in RERUNS]
 
 
 def _verdict_cells(line: ArmBlame) -> list[str]:
-    """For each verdict how many failures it explains."""
+    """Return the number of failures per verdict."""
     return [str(count) for count in line.verdicts.values()]
 
 
-def blame(run: RunStore) -> Blame | None:
-    """What the failed episodes that were run again say, of the arms that have any; None where none was."""
+def read_blame(run: RunStore) -> Blame | None:
+    """Return the verdicts on a run's failures so far; None where none was rerun."""
     folder = run.path.parent / FOLDER
-    if not RunStore.begun(folder):
+    if not RunStore.exists(folder):
         return None
     with RunStore.read(folder) as store:
-        if store.config["attributes"] != run.created:  # of a run that lay here before
+        if store.config["attributes"] != run.created:  # of an older run in the same folder
             return None
-        again = {(row["arm"], row["episode"]): row for row in store.outcomes()}
-    lines = [_arm(run, one["name"], again) for one in run.config["arms"]]
-    return Blame(run.path.parent, tuple(line for line in lines if line.episodes or line.broken))
+        reruns = {(row["arm"], row["episode"]): row for row in store.outcomes()}
+    lines = [_read_arm(run, one["name"], reruns) for one in run.config["arms"]]
+    return Blame(run.path.parent, tuple(line for line in lines if line.episodes or line.rerun_errors))
 
 
-def failed_episodes(run: RunStore, arm: str) -> list[int]:
-    """Episodes of an arm that were judged and did not succeed.
+def list_failures(run: RunStore, arm: str) -> list[int]:
+    """Return the episodes of an arm that ended without success and without an error.
 
     Raises:
         ArgumentError: the task does not say what success is.
@@ -215,55 +221,56 @@ def failed_episodes(run: RunStore, arm: str) -> list[int]:
     return [row["episode"] for row in judged if row["metrics"]["success"] < 1]
 
 
-def swaps_of(run: RunStore, arm: str) -> list[str]:
-    """The swaps that change something of an arm: where the oracle imagines already, its stage is told the truth."""
+def list_reruns(run: RunStore, arm: str) -> list[str]:
+    """Return the reruns that change something of an arm: the oracle's futures are the ground truth already."""
     agent = next(one["agent"] for one in run.config["arms"] if one["name"] == arm)
-    told = agent.get("model") == "oracle" and "placebo" not in agent
-    return [swap for swap in SWAPS if not (told and swap == "imagination")]
+    exact = agent.get("model") == "oracle" and "placebo" not in agent
+    return [rerun for rerun in RERUNS if not (exact and rerun == "imagination")]
 
 
-def swapped(arm: str, swap: str) -> str:
-    """Name of the arm in the store of swapped episodes."""
-    return f"{arm}/{swap}"
+def name_rerun(arm: str, rerun: str) -> str:
+    """Return the name of an arm in the store of reruns."""
+    return f"{arm}/{rerun}"
 
 
-def _arm(run: RunStore, arm: str, again: Mapping[tuple[str, int], Mapping[str, Any]]) -> ArmBlame:
+def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[str, Any]]) -> ArmBlame:
     ended = [row for row in run.outcomes() if row["arm"] == arm]
     scenes = {row["episode"]: row["scene"] for row in ended}
-    failed, swaps = failed_episodes(run, arm), swaps_of(run, arm)
-    examined, broken = [], dict[int, str]()
-    for episode in failed:
-        rows = {swap: again.get((swapped(arm, swap), episode)) for swap in swaps}
-        if cause := _cause(rows):
-            broken[episode] = cause
+    failures, names = list_failures(run, arm), list_reruns(run, arm)
+    examined, errors = [], dict[int, str]()
+    for episode in failures:
+        rows = {name: reruns.get((name_rerun(arm, name), episode)) for name in names}
+        if cause := _find_error(rows):
+            errors[episode] = cause
         elif all(row is not None for row in rows.values()):
-            mended = {swap: bool(row["metrics"]["success"]) for swap, row in rows.items() if row is not None}
-            examined.append(EpisodeBlame(arm, episode, scenes[episode], mended))
+            success = {name: bool(row["metrics"]["success"]) for name, row in rows.items() if row is not None}
+            examined.append(EpisodeBlame(arm, episode, scenes[episode], success))
     return ArmBlame(
         arm,
         sum(row["status"] == "done" for row in ended),
-        len(failed),
-        tuple(row["episode"] for row in ended if row["status"] == "failed"),
+        len(failures),
+        tuple(row["episode"] for row in ended if row["status"] == "error"),
         tuple(examined),
-        broken,
-        {swap: _share(examined, swap, run.config["seed"]) for swap in swaps} if examined else {},
+        errors,
+        {name: _estimate_recovery(examined, name, run.config["seed"]) for name in names} if examined else {},
     )
 
 
-def _cause(rows: Mapping[str, Mapping[str, Any] | None]) -> str:
-    """Why an episode could not be run again with every swap; empty where it could, or has not been."""
-    for swap, row in rows.items():
-        if row is not None and row["status"] == "failed":
-            return f"{swap}: {(row['error'].strip().splitlines() or ['unknown'])[-1]}"
+def _find_error(rows: Mapping[str, Mapping[str, Any] | None]) -> str:
+    """Return the error that kept an episode from being rerun; empty where there was none."""
+    for rerun, row in rows.items():
+        if row is not None and row["status"] == "error":
+            return f"{rerun}: {(row['error'].strip().splitlines() or ['unknown'])[-1]}"
     return ""
 
 
-def _share(examined: list[EpisodeBlame], swap: str, seed: int) -> Estimate:
-    values = [float(one.mended[swap]) for one in examined]
+def _estimate_recovery(examined: list[EpisodeBlame], rerun: str, seed: int) -> Estimate:
+    values = [float(one.success[rerun]) for one in examined]
     return estimate_mean(values, [one.scene for one in examined], SUCCESS, seed=seed)
 
 
-def _named(arm: str, what: str, episodes: Any) -> str:
-    """E.g. "warp: 2 episodes failed for infrastructure, so nothing is blamed for them: 3, 8."."""
-    count = "1 episode" if len(episodes) == 1 else f"{len(episodes)} episodes"
-    return f"{arm}: {count} {what}: {', '.join(map(str, episodes))}."
+def _name_episodes(arm: str, text: str, episodes: Iterable[int]) -> str:
+    """Return e.g. "warp: 2 episodes could not be rerun because of an infrastructure error: 3, 8."."""
+    numbers = list(episodes)
+    count = "1 episode" if len(numbers) == 1 else f"{len(numbers)} episodes"
+    return f"{arm}: {count} {text}: {', '.join(map(str, numbers))}."

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cost ledger: what each arm asked of its world model, how long it took, and what a success came to."""
+"""Costs: what each arm asked of its world model, how long it took, and the cost of a success."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from typing import Any
 from wiw.runs.run import Run
 
 COLUMNS = (
-    ("decisions", "Decisions an episode."),
-    ("consulted", "Decisions an episode for which the world model was consulted."),
-    ("rollouts", "Imagined futures an episode, whether the model or the cache gave them."),
-    ("frames", "Frames of them."),
-    ("calls", "Batches an episode that the model was asked for; episodes that share one divide it."),
-    ("cached", "Share of the rollouts that came from the cache."),
-    ("tokens", "Tokens an episode that a language model has read and written."),
-    ("model s", "Seconds an episode inside the world model."),
-    ("all s", "Seconds an episode, all stages."),
-    ("rollouts / success", "All rollouts of the arm over its successes."),
-    ("s / success", "All seconds of the arm over its successes."),
+    ("decisions", "Decisions per episode."),
+    ("consulted", "Decisions per episode that consulted the world model."),
+    ("rollouts", "Imagined futures per episode, from the model or the cache."),
+    ("frames", "Frames of these rollouts."),
+    ("calls", "Batches per episode sent to the model; episodes that share a batch divide it."),
+    ("cached", "Share of the rollouts from the cache."),
+    ("tokens", "Tokens per episode that a language model read and wrote."),
+    ("model s", "Seconds per episode inside the world model."),
+    ("all s", "Seconds per episode, all stages."),
+    ("rollouts / success", "Rollouts of the arm divided by its successes."),
+    ("s / success", "Seconds of the arm divided by its successes."),
 )
-"""Columns of the table and what they mean."""
+"""Columns of the table and their meaning."""
 LOST_COLUMNS = (
-    ("lost calls", "Calls an episode for decisions that failed or were begun again; in no other column."),
-    ("lost s", "Seconds an episode on them."),
+    ("lost calls", "Calls per episode for decisions that were interrupted by an error; in no other column."),
+    ("lost s", "Seconds per episode on them."),
 )
-"""The same, where anything was lost."""
+"""Further columns, where anything was lost."""
 
 
 @dataclass(frozen=True)
@@ -37,29 +37,29 @@ class Costs:
 
     arm: str
     episodes: int
-    """That have ended, judged or not: what a failed one had asked for until then counts."""
+    """Ended episodes, scored or not: one with an error counts with its costs until then."""
     successes: float
     decisions: int
     calls: Mapping[str, float]
-    """Asked for: consultations, rows (rollouts), frames. A function of the decisions alone."""
+    """Requested: consultations, rows (rollouts), frames. A function of the decisions alone."""
     spent: Mapping[str, float]
-    """Taken: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens, credits of a service."""
+    """Spent: calls of the model with their rows and frames, retries, cached_rows, vlm_tokens, credits of a service."""
     seconds: Mapping[str, float]
     """Wall time by stage; it depends on the machine and on what else ran."""
     lost: Mapping[str, float] = field(default_factory=dict)
-    """Spent on decisions that failed or were begun again, as `spent`, and their seconds; in no other figure."""
+    """Spent on decisions that were interrupted by an error, as `spent`, and their seconds; in no other figure."""
 
     @property
     def all_seconds(self) -> float:
-        """Wall time of all stages, but for replays, which only measure."""
+        """Wall time of all stages except replays, which only measure."""
         return sum(seconds for stage, seconds in self.seconds.items() if stage != "replay")
 
     def per_success(self, total: float) -> float:
-        """A total over the number of successes; inf where there is none."""
+        """Return a total divided by the number of successes; inf where there is none."""
         return total / self.successes if self.successes else math.inf
 
     def as_dict(self) -> dict[str, Any]:
-        """Totals as plain values: `asked_<what>`, `spent_<what>`, `seconds_<stage>`, `lost_<what>`, two a success."""
+        """Return totals: `asked_<name>`, `spent_<name>`, `seconds_<stage>`, `lost_<name>`, and two per success."""
         return {
             "arm": self.arm,
             "episodes": self.episodes,
@@ -75,7 +75,7 @@ class Costs:
         }
 
     def cells(self) -> list[str]:
-        """The columns of the table, in words, with those of what was lost."""
+        """Return the cells of the table, with those of `LOST_COLUMNS`."""
         each = max(1, self.episodes)
         asked, spent = self.calls, self.spent
         rows = asked.get("rows", 0.0)
@@ -97,7 +97,7 @@ class Costs:
 
 
 def costs(run: Run) -> list[Costs]:
-    """What each arm of a run cost, in the order of its table; arms without an ended episode are left out."""
+    """Return the costs of each arm of a run; arms without an ended episode are left out."""
     calls, spent, seconds = (run.store.totals(column) for column in ("calls", "spent", "seconds"))
     lost = run.store.lost()
     ended: dict[str, list[float]] = {}
@@ -117,28 +117,8 @@ def costs(run: Run) -> list[Costs]:
     ]
 
 
-def print_costs(run: Run) -> None:
-    """Prints the ledger; nothing where no episode has ended."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table
-
-    lines = costs(run)
-    if not lines:
-        return
-    table = Table(title="Costs, an episode", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-    table.add_column("arm", style="bold")
-    columns = cost_columns(lines)
-    for title, _ in columns:
-        table.add_column(title, justify="right")
-    for line in lines:
-        table.add_row(line.arm, *line.cells()[: len(columns)])
-    console = Console()
-    Console(width=None if console.is_terminal else max(console.width, 160)).print(table)
-
-
 def cost_columns(lines: Sequence[Costs]) -> tuple[tuple[str, str], ...]:
-    """The columns that these arms need."""
+    """Return the columns that these arms need."""
     return COLUMNS + LOST_COLUMNS if any(line.lost for line in lines) else COLUMNS
 
 

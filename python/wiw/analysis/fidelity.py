@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How true each arm's imagination was, next to how often the agent succeeded with it."""
+"""Fidelity: how accurate each arm's imagination was, next to its success rate."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from wiw.runs.run import Run
 
 @dataclass(frozen=True)
 class Column:
-    """Of the table."""
+    """A column of the table."""
 
     title: str
     about: str
     name: str
-    """Of the figure in `ArmFidelity`."""
+    """Field of `ArmFidelity`."""
     form: str
 
 
@@ -28,32 +28,32 @@ COLUMNS = (
     Column("SR %", "Success rate.", "success", ".1f"),
     Column(
         "rank",
-        "Kendall's tau: how far imagined futures put the plans into the order that the true ones give.",
+        "Kendall's tau between the ranks of the plans by imagined and by true futures.",
         "rank",
         ".2f",
     ),
-    Column("best chosen %", "Decisions for the plan whose true future scores best.", "best", ".0f"),
-    Column("regret", "By how much the chosen plan's true future scores less than the best one.", "regret", ".3f"),
+    Column("best chosen %", "Decisions that chose the plan whose true future scores best.", "best", ".0f"),
+    Column("regret", "Score of the best true future minus that of the chosen plan's.", "regret", ".3f"),
     Column(
         "PSNR dB",
-        "Of imagined frames against what would have been seen, open loop, at the size the reviser sees.",
+        "Imagined against true frames, open loop, at the resolution that the reviser sees.",
         "psnr",
         ".1f",
     ),
-    Column("SSIM", "The same, structural similarity.", "ssim", ".3f"),
-    Column("LPIPS", "The same of perspective views of 256x256: perceptual distance, lower is truer.", "lpips", ".3f"),
+    Column("SSIM", "Structural similarity of the same frames.", "ssim", ".3f"),
+    Column("LPIPS", "Perceptual distance of perspective views of 256x256; lower is better.", "lpips", ".3f"),
 )
 
 
 @dataclass(frozen=True)
 class ArmFidelity:
-    """Means over an arm's decisions; NaN where no decision says."""
+    """Means over an arm's decisions; NaN where none was measured."""
 
     arm: str
     decisions: int
-    """That were replayed."""
+    """Decisions that were replayed."""
     success: float
-    """Percent of the judged episodes."""
+    """Percent of the scored episodes."""
     rank: float
     best: float
     """Percent."""
@@ -63,21 +63,21 @@ class ArmFidelity:
     lpips: float
 
     def cells(self, columns: Sequence[Column]) -> list[str]:
-        """Columns of the table, in words."""
-        return [_shown(getattr(self, column.name), column.form) for column in columns]
+        """Return the cells of the table."""
+        return [_format(getattr(self, column.name), column.form) for column in columns]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """Return plain values."""
         return asdict(self)
 
 
 def fidelity(run: Run) -> list[ArmFidelity]:
-    """One line for each arm that imagined and was replayed, in the order of the run's table."""
+    """Return one line per arm whose imagined plans were replayed, in the order of the run's table."""
     return [line for arm in run.arms if (line := _arm(run, arm)) is not None]
 
 
 def shown_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
-    """All columns but LPIPS where no arm has it."""
+    """Return all columns, without LPIPS where no arm has it."""
     return [column for column in COLUMNS if column.name != "lpips" or not all(math.isnan(o.lpips) for o in lines)]
 
 
@@ -105,5 +105,5 @@ def _mean(values: Sequence[float | None]) -> float:
     return float(np.mean(known)) if known else math.nan
 
 
-def _shown(value: float, form: str) -> str:
+def _format(value: float, form: str) -> str:
     return "–" if math.isnan(value) else f"{value:{form}}"

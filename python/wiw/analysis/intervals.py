@@ -28,7 +28,7 @@ FEW = 5
 
 
 def wilson(mean: float, n: int, confidence: float = 0.95) -> Interval:
-    """Score interval of a proportion (Wilson 1927).
+    """Return the score interval of a proportion (Wilson 1927).
 
     Also holds, conservatively, for the mean of any values in [0, 1]: their variance is at most mean * (1 - mean).
     """
@@ -39,7 +39,7 @@ def wilson(mean: float, n: int, confidence: float = 0.95) -> Interval:
 
 
 def student(values: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Student's t interval of a mean; (nan, nan) for a single value."""
+    """Return Student's t interval of a mean; (nan, nan) for a single value."""
     data = np.asarray(values, np.float64)
     if len(data) < 2:
         return float("nan"), float("nan")
@@ -48,7 +48,7 @@ def student(values: ArrayLike, confidence: float = 0.95) -> Interval:
 
 
 def agresti_min(differences: ArrayLike, confidence: float = 0.95) -> Interval:
-    """Interval of the mean of paired differences in [-1, 1]: half a win and half a loss more, half a tie of each kind.
+    """Return the interval of a mean paired difference in [-1, 1], with half a win, half a loss and a tie added.
 
     Source: Agresti and Min, Statistics in Medicine 24 (2005), where differences are -1, 0 or 1. A difference in between
     counts as that share of a win or a loss, which overstates its variance and so errs on the safe side.
@@ -62,7 +62,7 @@ def agresti_min(differences: ArrayLike, confidence: float = 0.95) -> Interval:
 
 
 def clustered_t(values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95) -> Interval:
-    """Interval of the pooled mean when whole clusters are drawn: Student's t over clusters.
+    """Return the interval of the pooled mean when whole clusters are drawn: Student's t over clusters.
 
     Args:
         values: float [n], one an episode.
@@ -74,7 +74,7 @@ def clustered_t(values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: 
         ArgumentError: fewer than two clusters.
     """
     data = np.asarray(values, np.float64)
-    sums, counts = per_cluster(data, np.asarray(clusters))
+    sums, counts = sum_by_cluster(data, np.asarray(clusters))
     if len(sums) < 2:
         raise ArgumentError(f"clustered_t: expected at least 2 clusters, got {len(sums)}")
     low, high = t_of_sums(sums, np.square(data).sum(), counts, kind, confidence)
@@ -88,7 +88,7 @@ def t_of_sums(
     kind: Kind,
     confidence: float = 0.95,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Both ends of `clustered_t`, for many runs at once.
+    """Return both ends of `clustered_t`, for many runs at once.
 
     The variance of the mean is that of leaving out one cluster at a time. It is blind where few episodes differ (five
     scenes without a success have no variance), so rates and differences get a few made-up episodes more, as Agresti
@@ -105,19 +105,19 @@ def t_of_sums(
         confidence: e.g. 0.95.
     """
     mean = sums.sum(-1) / counts.sum()
-    center, variance = steadied(sums, squares, counts, kind)
+    center, variance = stabilise_mean(sums, squares, counts, kind)
     half = stats.t.ppf(0.5 + confidence / 2, len(counts) - 1) * np.sqrt(variance)
     low, high = np.minimum(center - half, mean), np.maximum(center + half, mean)
     least, most = {"rate": (0.0, 1.0), "difference": (-1.0, 1.0), "length": (-np.inf, np.inf)}[kind]
     return np.maximum(low, least), np.minimum(high, most)
 
 
-def steadied(
+def stabilise_mean(
     sums: NDArray[np.float64], squares: ArrayLike, counts: NDArray[np.float64], kind: Kind
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and its variance by clusters, over the episodes and the made-up ones; see `t_of_sums`."""
+    """Return the mean and its variance by clusters, over the episodes and the made-up ones; see `t_of_sums`."""
     n, total = counts.sum(), sums.sum(-1)
-    mean, variance = total / n, left_out_covariance(sums, sums, counts)
+    mean, variance = total / n, jackknife_covariance(sums, sums, counts)
     if kind == "length":
         return mean, variance
     squares = np.asarray(squares, np.float64)
@@ -127,20 +127,20 @@ def steadied(
     if len(counts) < FEW:
         effect = np.maximum(effect, 1.0)
     coin, coin_square = COINS[kind]
-    weight = made_up(len(counts))
+    weight = count_pseudo_episodes(len(counts))
     center = (total + weight * coin) / (n + weight)
     return center, effect * ((squares + weight * coin_square) / (n + weight) - center**2) / (n + weight)
 
 
-def made_up(clusters: int) -> float:
-    """How many made-up episodes steady an interval over so many clusters."""
+def count_pseudo_episodes(clusters: int) -> float:
+    """Return the number of pseudo-episodes that stabilise an interval over `clusters` clusters."""
     return float(2 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, clusters - 1)) ** 2)
 
 
-def left_out_covariance(
+def jackknife_covariance(
     first: NDArray[np.float64], second: NDArray[np.float64], counts: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Covariance of two pooled means, from leaving out one cluster at a time (jackknife).
+    """Return the covariance of two pooled means, from leaving out one cluster at a time (jackknife).
 
     Args:
         first: float [..., clusters], sums of one quantity in each cluster.
@@ -163,7 +163,7 @@ def clustered_bootstrap(
     seed: int = 0,
     method: str = "bca",
 ) -> Interval:
-    """Interval of the pooled mean when whole clusters are drawn with replacement.
+    """Return the interval of the pooled mean when whole clusters are drawn with replacement.
 
     Args:
         values: float [n], one an episode.
@@ -178,7 +178,7 @@ def clustered_bootstrap(
     """
     if method not in ("bca", "percentile"):
         raise ArgumentError(f"clustered_bootstrap: method is '{method}', expected bca or percentile")
-    sums, counts = per_cluster(np.asarray(values, np.float64), np.asarray(clusters))
+    sums, counts = sum_by_cluster(np.asarray(values, np.float64), np.asarray(clusters))
     if len(sums) < 2:
         raise ArgumentError(f"clustered_bootstrap: expected at least 2 clusters, got {len(sums)}")
     draws = np.random.Generator(np.random.Philox(key=seed)).integers(len(sums), size=(resamples, len(sums)))
@@ -190,10 +190,10 @@ def clustered_bootstrap(
     return float(low), float(high)
 
 
-def per_cluster(
+def sum_by_cluster(
     values: NDArray[np.float64], clusters: NDArray[np.generic]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums of the values and numbers of episodes, by cluster."""
+    """Return the sums of the values and numbers of episodes, by cluster."""
     _, members = np.unique(clusters, return_inverse=True)
     return np.bincount(members, values).astype(np.float64), np.bincount(members).astype(np.float64)
 
@@ -201,7 +201,7 @@ def per_cluster(
 def _bca_levels(
     means: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], tails: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Quantile levels corrected for median bias and for skewness; the latter from leaving out one cluster at a time."""
+    """Return quantile levels corrected for median bias and, from leaving out one cluster at a time, for skewness."""
     estimate = sums.sum() / counts.sum()
     below = np.mean(means < estimate) + np.mean(means == estimate) / 2
     left_out = (sums.sum() - sums) / (counts.sum() - counts)

@@ -81,7 +81,7 @@ def power(
     arms: int = 1,
     seed: int = 0,
 ) -> Power:
-    """Scenes that a run needs to show a paired difference of success rates, or the least that a run can show.
+    """Return the scenes that a run needs to show a paired difference of success rates, or what a run can show.
 
         wiw.power(10)              # +10 points to 20 %, in apartments
         wiw.power(10, arms=4)      # the same as one of four arms, whose p values Holm adjusts
@@ -136,18 +136,18 @@ class _Plan:
     seed: int
 
     def scenes_for(self, difference: float) -> tuple[int, tuple[float, float]]:
-        """Fewest scenes, and what they give by interval and by test."""
+        """Return the fewest scenes, and their power by interval and by test."""
         rng = self._rng()
         scenes = self._fewest(difference)
-        while (shares := self._simulated(difference, scenes, rng))[0] < self.chance:
+        while (shares := self._simulate(difference, scenes, rng))[0] < self.chance:
             scenes += max(1, scenes // 25)
         return scenes, shares
 
     def difference_for(self, scenes: int, most: float) -> tuple[float, tuple[float, float]]:
-        """Least difference up to `most`, to a tenth of a point, and what the scenes give for it."""
+        """Return the least difference up to `most`, to a tenth of a point, and its power."""
 
         def shown(tenths: int) -> tuple[float, float]:
-            return self._simulated(tenths / 10, scenes, self._rng())
+            return self._simulate(tenths / 10, scenes, self._rng())
 
         least, end = 1, int(10 * most + 1e-9)
         if end < least or shown(end)[0] < self.chance:
@@ -163,12 +163,12 @@ class _Plan:
     def _rng(self) -> np.random.Generator:
         return np.random.Generator(np.random.Philox(key=self.seed))
 
-    def _simulated(self, difference: float, scenes: int, rng: np.random.Generator) -> tuple[float, float]:
+    def _simulate(self, difference: float, scenes: int, rng: np.random.Generator) -> tuple[float, float]:
         lost, won = self.losses / 100, (self.losses + difference) / 100
-        return simulated_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
+        return simulate_power(won, lost, scenes, self.per_scene, self.correlation, self.confidence, rng)
 
     def _fewest(self, difference: float) -> int:
-        """Fewest scenes by the formula."""
+        """Return the fewest scenes by the formula."""
         least, most = 2, 2
         while not self._enough(difference, most):
             if most > MOST_SCENES:
@@ -182,7 +182,7 @@ class _Plan:
         return most
 
     def _enough(self, difference: float, scenes: int) -> bool:
-        """Whether scenes show a difference often enough, by the noncentral t distribution of the mean over scenes."""
+        """Return whether scenes show a difference often enough, by the noncentral t distribution."""
         gain, discordant = difference / 100, (2 * self.losses + difference) / 100
         spread = (discordant - gain**2) * (1 + (self.per_scene - 1) * self.correlation) / self.per_scene
         limit = stats.t.ppf(0.5 + self.confidence / 2, scenes - 1)
@@ -190,7 +190,7 @@ class _Plan:
         return bool(stats.nct.sf(limit, scenes - 1, shift) >= self.chance)
 
 
-def simulated_power(
+def simulate_power(
     won: float,
     lost: float,
     scenes: int,
@@ -199,7 +199,7 @@ def simulated_power(
     confidence: float,
     rng: np.random.Generator,
 ) -> tuple[float, float]:
-    """Shares of simulated runs in which the interval, and McNemar's test, show that the better arm is better."""
+    """Return the shares of simulated runs whose interval, and whose McNemar test, show which arm is better."""
     runs = max(400, min(8000, _DRAWS // scenes))
     counts = draw([won, lost, 1 - won - lost], scenes, per_scene, correlation, runs, rng)
     sums, squares = total(counts, [1, -1, 0])

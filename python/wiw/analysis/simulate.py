@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 def draw(
     shares: ArrayLike, scenes: int, per_scene: int, correlation: float, runs: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """How many episodes of each scene end in each way, int64 [runs, scenes, ways].
+    """Draw the number of episodes per scene and outcome, int64 [runs, scenes, ways].
 
     Each scene has its own shares, drawn from a Dirichlet distribution around the true ones, so that any number made of
     the ways (a success rate, a difference of arms) has the same correlation between episodes of a scene.
@@ -32,6 +32,6 @@ def draw(
 
 
 def total(counts: NDArray[np.int64], values: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums by scene, [runs, scenes], and sums of squares, [runs], of a number that each way of ending stands for."""
+    """Return sums by scene, [runs, scenes], and sums of squares, [runs], of each outcome's value."""
     worth = np.asarray(values, np.float64)
     return counts @ worth, (counts @ worth**2).sum(-1)

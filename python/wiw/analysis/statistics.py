@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run shows: means with intervals for each arm, and paired differences between arms."""
+"""Means with confidence intervals per arm, and paired differences between arms."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 from wiw.analysis.intervals import Interval, Kind, agresti_min, clustered_bootstrap, clustered_t, student, wilson
-from wiw.metrics.headlines import Headline
+from wiw.metrics.metric import Metric
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Difference:
-    """One arm against another on the episodes that both have finished."""
+    """One arm against another on the episodes scored in both."""
 
     arm: str
     base: str
@@ -53,42 +53,42 @@ class Difference:
     """The same, adjusted by Holm for all arms that are compared with this base."""
 
 
-def estimate_mean(values: ArrayLike, scenes: Sequence[str], headline: Headline, *, seed: int = 0) -> Estimate:
-    """Mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
+def estimate_mean(values: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0) -> Estimate:
+    """Return the mean over episodes with a 95 % interval over scenes (`intervals`); `seed` is the bootstrap's."""
     data = np.asarray(values, np.float64)
-    found = _estimate(data, scenes, headline, "rate" if headline.kind == "rate" else "length", seed)
-    return replace(found, low=max(found.low, headline.scale * headline.least))
+    found = _estimate(data, scenes, metric, "rate" if metric.kind == "rate" else "length", seed)
+    return replace(found, low=max(found.low, metric.scale * metric.least))
 
 
 def estimate_difference(
-    arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], headline: Headline, *, seed: int = 0
+    arm: ArrayLike, base: ArrayLike, scenes: Sequence[str], metric: Metric, *, seed: int = 0
 ) -> Estimate:
-    """Mean of paired differences, arm minus base, with a 95 % interval over scenes; `seed` is the bootstrap's."""
+    """Return the mean paired difference, arm minus base, with a 95 % interval over scenes."""
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
-    return _estimate(data, scenes, headline, "difference" if headline.kind == "rate" else "length", seed)
+    return _estimate(data, scenes, metric, "difference" if metric.kind == "rate" else "length", seed)
 
 
 def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
-    """Two-sided p of the exact McNemar test on paired 0/1 outcomes: a fair coin over the pairs that differ."""
+    """Return the two-sided p of the exact McNemar test on paired 0/1 outcomes."""
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
     wins, differing = int((data > 0).sum()), int((data != 0).sum())
     return 1.0 if differing == 0 else float(stats.binomtest(wins, differing).pvalue)
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
-    """P values adjusted for being several (Holm 1979): the smallest times their number, the next times one less, ...
+    """Return Holm-adjusted p values (1979): the smallest times their number, the next times one less, and so on.
 
     Rejecting where the adjusted value is at most 0.05 keeps the chance of any false rejection at 5 %.
     """
-    given = np.asarray(p_values, np.float64)
-    order = np.argsort(given)
-    adjusted = np.empty_like(given)
-    adjusted[order] = np.maximum.accumulate(given[order] * np.arange(len(given), 0, -1)).clip(max=1.0)
+    raw = np.asarray(p_values, np.float64)
+    order = np.argsort(raw)
+    adjusted = np.empty_like(raw)
+    adjusted[order] = np.maximum.accumulate(raw[order] * np.arange(len(raw), 0, -1)).clip(max=1.0)
     return adjusted
 
 
-def adjusted(differences: Sequence[Difference]) -> tuple[Difference, ...]:
-    """The same differences with their p values adjusted, each metric for itself: one family of tests."""
+def adjust_p_values(differences: Sequence[Difference]) -> tuple[Difference, ...]:
+    """Return the differences with Holm-adjusted p values; the arms of one metric are a family of tests."""
     found = list(differences)
     for metric in {difference.metric for difference in found}:
         family = [i for i, d in enumerate(found) if d.metric == metric and d.p_value is not None]
@@ -99,30 +99,30 @@ def adjusted(differences: Sequence[Difference]) -> tuple[Difference, ...]:
 
 
 def compare(
-    arm: str, base: str, outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]], headline: Headline, seed: int = 0
+    arm: str, base: str, outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]], metric: Metric, seed: int = 0
 ) -> Difference | None:
-    """The paired difference of two arms, None without common episodes.
+    """Return the paired difference of two arms, or None without common episodes.
 
     Args:
         arm: name of the arm under test.
         base: name of the arm it is compared with.
-        outcomes: for each arm, finished episodes by index with "scene" and "metrics".
-        headline: which metric.
+        outcomes: for each arm, scored episodes by index with "scene" and "metrics".
+        metric: which metric.
         seed: of the bootstrap.
     """
     both = sorted(set(outcomes[arm]) & set(outcomes[base]))
     if not both:
         return None
-    ours, theirs = ([outcomes[name][i]["metrics"][headline.metric] for i in both] for name in (arm, base))
+    ours, theirs = ([outcomes[name][i]["metrics"][metric.name] for i in both] for name in (arm, base))
     scenes = [outcomes[arm][i]["scene"] for i in both]
-    sign = 1 if headline.higher_is_better else -1
+    sign = 1 if metric.higher_is_better else -1
     gains = sign * (np.asarray(ours) - np.asarray(theirs))
-    binary = headline.kind == "rate" and set(ours) | set(theirs) <= {0, 1}
+    binary = metric.kind == "rate" and set(ours) | set(theirs) <= {0, 1}
     return Difference(
         arm,
         base,
-        headline.metric,
-        estimate_difference(ours, theirs, scenes, headline, seed=seed),
+        metric.name,
+        estimate_difference(ours, theirs, scenes, metric, seed=seed),
         int((gains > 0).sum()),
         int((gains < 0).sum()),
         mcnemar(ours, theirs) if binary else None,
@@ -136,8 +136,8 @@ _OVER_EPISODES: dict[Kind, tuple[str, Callable[[NDArray[np.float64]], Interval]]
 }
 
 
-def _estimate(data: NDArray[np.float64], scenes: Sequence[str], headline: Headline, kind: Kind, seed: int) -> Estimate:
-    groups, scale = len(set(scenes)), headline.scale
+def _estimate(data: NDArray[np.float64], scenes: Sequence[str], metric: Metric, kind: Kind, seed: int) -> Estimate:
+    groups, scale = len(set(scenes)), metric.scale
     second = None
     if groups > 1:
         name, (low, high) = f"t over {groups} scenes", clustered_t(data, list(scenes), kind)

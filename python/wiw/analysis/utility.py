@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where an arm stands between the floor and the ceiling of its run: U = (SR - floor) / (ceiling - floor)."""
+"""Utility of a world model between the floor and the ceiling of its run: U = (SR - floor) / (ceiling - floor)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from wiw.analysis.intervals import Interval, left_out_covariance, made_up, per_cluster, steadied
+from wiw.analysis.intervals import (
+    Interval,
+    count_pseudo_episodes,
+    jackknife_covariance,
+    stabilise_mean,
+    sum_by_cluster,
+)
 
 FLOOR, CEILING = "copy", "oracle"
 UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
@@ -20,31 +26,31 @@ UNKNOWN: tuple[float, Interval] = (math.nan, (math.nan, math.nan))
 
 @dataclass(frozen=True)
 class Utility:
-    """The share of what a perfect world model would bring over a motionless one that an arm brings."""
+    """An arm's share of the gain that a perfect world model brings over a static one."""
 
     arm: str
     value: float
-    """0: as the floor; 1: as the ceiling; nan where the run cannot tell floor and ceiling apart."""
+    """0: as the floor; 1: as the ceiling; nan where the interval for ceiling - floor includes 0."""
     low: float
     high: float
     n: int
-    """Episodes that arm, floor and ceiling have all finished."""
+    """Episodes scored in arm, floor and ceiling."""
     scenes: int
     reference: bool
-    """Whether the arm stands beside the world models for comparison, rather than being one under test."""
+    """Whether the arm is a reference rather than a world model under test."""
 
     @property
-    def identifiable(self) -> bool:
-        """Whether ceiling - floor is surely not 0 on these episodes: its paired 95 % interval lies above."""
+    def is_defined(self) -> bool:
+        """Whether the paired 95 % interval for ceiling - floor lies above 0."""
         return not math.isnan(self.value)
 
 
 def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], reference: bool = False) -> Utility | None:
-    """An arm's utility, on the episodes that it, the floor and the ceiling have finished; None if there are none.
+    """Return an arm's utility on the episodes scored in it, the floor and the ceiling; None if there are none.
 
     Args:
         arm: its name.
-        done: by arm, finished episodes by index with "scene" and "metrics".
+        done: by arm, scored episodes by index with "scene" and "metrics".
         reference: see `Utility`.
     """
     names = (arm, FLOOR, CEILING)
@@ -61,10 +67,10 @@ def utility(arm: str, done: Mapping[str, Mapping[int, Mapping[str, Any]]], refer
 
 
 def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: float = 0.95) -> tuple[float, Interval]:
-    """mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is not identifiable.
+    """Return mean(gains) / mean(spans) with Fieller's interval (1954) over clusters, all nan where it is undefined.
 
     It holds every u for which the mean of gains - u spans is within t standard errors of 0, so it is as good as the t
-    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is identifiable where
+    interval of a difference; a bootstrap of the quotient is too narrow (`docs/statistics.md`). It is defined where
     that interval of mean(spans) lies above 0.
 
     Args:
@@ -75,12 +81,12 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
     """
     labels = np.asarray(clusters)
     both = [np.asarray(values, np.float64) for values in (gains, spans)]
-    (over, counts), (under, _) = (per_cluster(values, labels) for values in both)
+    (over, counts), (under, _) = (sum_by_cluster(values, labels) for values in both)
     if len(counts) < 2:
         return UNKNOWN
     squares = [float(np.square(values).sum()) for values in both]
-    a, var_a = map(float, steadied(over, squares[0], counts, "difference"))
-    b, var_b = map(float, steadied(under, squares[1], counts, "difference"))
+    a, var_a = map(float, stabilise_mean(over, squares[0], counts, "difference"))
+    b, var_b = map(float, stabilise_mean(under, squares[1], counts, "difference"))
     apart = [
         all_squares - float(sums.sum() ** 2 / counts.sum())
         for all_squares, sums in zip(squares, (over, under), strict=True)
@@ -97,13 +103,13 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
 def _correlation(
     over: NDArray[np.float64], under: NDArray[np.float64], counts: NDArray[np.float64], apart: list[float]
 ) -> float:
-    """Of the two means over clusters; `apart` are sums of squared distances from the mean, over episodes.
+    """Return the correlation of the two means over clusters; `apart` are sums of squared deviations over episodes.
 
     The made-up episodes count too: three fair coins, floor, arm and ceiling, give either difference a variance of 1/2
     and both a covariance of 1/4. So an arm that did as the ceiling in every episode is not certain to be its equal.
     """
-    shared, *own = (float(left_out_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
-    scale, weight = math.sqrt(own[0] * own[1]), made_up(len(counts))
+    shared, *own = (float(jackknife_covariance(x, y, counts)) for x, y in ((over, under), (over, over), (under, under)))
+    scale, weight = math.sqrt(own[0] * own[1]), count_pseudo_episodes(len(counts))
     seen = min(1.0, max(-1.0, shared / scale)) if scale > 1e-12 else 0.0
     more = [one + weight / 2 for one in apart]
     return (seen * math.sqrt(max(0.0, apart[0] * apart[1])) + weight / 4) / math.sqrt(more[0] * more[1])

@@ -19,6 +19,7 @@ from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
 from wiw.cli.names import list_names
+from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
@@ -35,9 +36,17 @@ from wiw.errors import Error
 
 DESCRIPTION = """Does a world model help an agent succeed, and by how much?
 
-  $ wiw demo                                              world models from the floor to the ceiling, side by side
+An agent uses a world model to imagine the outcome of each candidate plan, picks one plan and acts. `wiw run` does this
+on a task, for one world model or several on the same episodes, and measures how much each raises task success.
+
+  $ wiw demo                                              five world models side by side, in some minutes
+  $ wiw list                                              world models, policies, tasks, metrics, presets
   $ wiw run imagenav --world-model warp --episodes 50     one world model
-  $ wiw run imagenav --world-model my_model.py:MyModel    your own
+  $ wiw check-model my_model.py:MyModel                   is your own model ready to run?
+  $ wiw run imagenav --world-model my_model.py:MyModel --arms none,copy,oracle
+                                                          your own, beside floor and ceiling
+  $ wiw report runs/NAME                                  table and HTML report of a run
+  $ wiw compare runs/NAME runs/OTHER                      is the difference more than chance?
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
@@ -46,10 +55,10 @@ within 5 seconds; after both of these everything recorded is kept and `wiw resum
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
-    (list_names, "list", "Names of world models, policies, tasks, metrics and presets."),
+    (list_names, "list", "World models, policies, trackers, tasks, presets and metrics by name."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Go on with a run that was stopped."),
-    (blame, "blame", "Which stage of the loop a run's failures are due to."),
+    (blame, "blame", "Find the stage of the loop that causes a run's failures."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "How many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),
@@ -64,7 +73,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
     (collect, "collect", "Collect demonstrations of manipulation tasks, to learn from."),
-    (train, "train", "Train the recogniser of Active Recognition."),
+    (train, "train", "Train a network: recogniser, warpnet, armnet or diffuser."),
 )
 
 EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130
@@ -89,11 +98,15 @@ def run_process() -> NoReturn:
     end_process(code)
 
 
+RENAMED_OPTIONS = {"--retry-failed": "--retry-errors"}
+"""Old names of options, which still work but are not shown."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code: 0, 1 (the run is invalid), 2 (error), 75 or 130 (stopped)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
-    given = [argument for argument in given if argument != "--debug"]
+    given = [RENAMED_OPTIONS.get(argument, argument) for argument in given if argument != "--debug"]
     if given == ["--version"]:
         print(f"wiw {wiw.__version__}")
         return 0
@@ -120,4 +133,5 @@ def _dispatch(arguments: Sequence[str]) -> Any:
     for function, name, line in COMMANDS:
         app.command(name=name, help=None if named else line)(function)  # None: the function's own docstring
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
-    return app.cli(prog="wiw", description=DESCRIPTION, args=arguments or ["--help"], config=config)
+    with make_registry():
+        return app.cli(prog="wiw", description=DESCRIPTION, args=arguments or ["--help"], config=config)

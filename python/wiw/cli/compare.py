@@ -13,7 +13,7 @@ Arm = Annotated[str | None, arg(metavar="NAME")]
 
 
 def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -> int:
-    """Compares two runs on the same episodes, the second minus the first.
+    """Compare two runs on the same episodes, the second minus the first.
 
       $ wiw compare runs/old runs/new                          # every arm that both have
       $ wiw compare runs/old /elsewhere/new --arm warp         # one

@@ -22,6 +22,7 @@ def episodes(
     seed: Annotated[int, arg(metavar="N")] = 0,
     backend: Literal["auto", "cpu", "gpu"] | None = None,
     task_option: Options = (),
+    overwrite: bool = False,
 ) -> int:
     """Generates the episodes of a task and writes them to a file, which `wiw run --episode-file` takes.
 
@@ -41,23 +42,26 @@ def episodes(
         per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
         seed: The episodes are a function of it and the scenes.
         backend: Renderer, which sees to it that goals are out of sight; auto if not given.
-        task_option: Another option of the task, such as categories=bed,sofa; may be given again.
+        task_option: Another option of the task, such as categories=bed,sofa or, for scans, goal_instances=1; may be
+            given again.
+        overwrite: Whether to replace a file that is there.
     """
     from wiw.datasets.episodes import save
     from wiw.errors import ArgumentError, FileError
     from wiw.registry import TASKS
 
+    if out.exists() and not overwrite:
+        raise ArgumentError(f"{out} is there already; give --overwrite to replace it, or another name with --out")
     flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene}
     made = TASKS.make(task, **task_options(task, task_option, flags))
-    if not hasattr(made, "episode_file"):
+    if made.file_header is None:
         raise ArgumentError(
             f"episodes: task '{task}' reads no episode file; its episodes are a function of the seed, so "
             f"`wiw run {task} --seed {seed} --episodes {episodes}` has the same ones anywhere"
         )
     found = made.episodes(episodes)
-    choices = {"categories": list(made.choices)} if getattr(made, "choices", ()) else {}
     try:
-        save(out, found, task, seed=seed, scenes=scenes or made.scenes, **choices)
+        save(out, found, task, **made.file_header)
     except OSError as error:
         raise FileError(f"{out}: cannot be written ({error.strerror}); choose another with --out") from error
     places = len({episode.scene for episode in found})

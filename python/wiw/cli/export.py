@@ -19,7 +19,7 @@ def export(
     parquet: Folder = None,
     rerun: Annotated[Path | None, arg(metavar="FILE.rrd")] = None,
 ) -> int:
-    """Writes a run as plain tables for other programs, or as a recording for the Rerun viewer.
+    """Write a run as plain tables for other programs, or as a recording for the Rerun viewer.
 
     $ wiw export runs/first --csv tables
     $ wiw export runs/first --parquet tables --rerun first.rrd

@@ -4,61 +4,91 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any, Literal
 
 from rich.markup import escape
 from tyro.conf import Positional
 
+What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models"]
 
-def list_names(what: Positional[Literal["all", "world-models"]] = "all", /) -> int:
-    """Lists world models, policies, tasks, metrics and presets: built-in ones, and those of installed packages.
+
+def list_names(what: Positional[What] = "all", /) -> int:
+    """List what can be named: world models, policies, trackers, tasks, presets, metrics and VLMs.
 
     $ wiw list
     $ wiw list world-models
+    $ wiw list presets
 
-    A package adds its own by entry points in the groups named beside the headings.
+    Built-in names come first, then those of installed packages. A package adds its own by entry points in the group
+    that is shown beside a heading.
 
     Args:
-        what: world-models tells more of each: what it takes and gives, and what it lacks on this machine.
+        what: one kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
+            machine.
     """
     from rich.console import Console
 
     from wiw.cli.world_models import world_models
 
     console = Console()
-    console.print(world_models(console.width) if what == "world-models" else _everything())
+    console.print(world_models(console.width) if what == "world-models" else _make_table(what))
     return 0
 
 
-def _everything() -> Any:
+def _make_table(what: str) -> Any:
     from rich.table import Table
 
-    from wiw.policies.vlm import presets as vlms
-    from wiw.registry import METRICS, POLICIES, TASKS, WORLD_MODELS
-    from wiw.tasks import presets
+    from wiw.registry import METRICS, POLICIES, TASKS, TRACKERS, WORLD_MODELS
 
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(no_wrap=True)
     table.add_column()
-    sections = {"World models": WORLD_MODELS, "Policies": POLICIES, "Tasks": TASKS, "Metrics": METRICS}
-    for title, registry in sections.items():
-        table.add_row(f"[bold]{title}[/]", f"[dim]{registry.group}[/]")
-        for name in registry.names():
-            table.add_row(f"  {name}", _first_line(registry, name))
-        table.add_row()
-    for task in TASKS.built_in:
-        table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
-        for name in presets.names(task):
-            table.add_row(f"  {name}", escape(presets.about(task, name)))
-    table.add_row()
-    table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
-    for name in vlms.names():
-        table.add_row(f"  {name}", escape(vlms.about(name)))
+    registries = {
+        "world-models": WORLD_MODELS,
+        "policies": POLICIES,
+        "trackers": TRACKERS,
+        "tasks": TASKS,
+        "metrics": METRICS,
+    }
+    sections: dict[str, Callable[[Any], None]] = {
+        name: lambda table, name=name, registry=registry: _add_registry(table, name, registry)  # type: ignore[misc]
+        for name, registry in registries.items()
+    }
+    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models}
+    for name in sections if what == "all" else [what]:
+        sections[name](table)
     return table
 
 
+def _add_registry(table: Any, title: str, registry: Any) -> None:
+    table.add_row(f"[bold]{title.replace('-', ' ').capitalize()}[/]", f"[dim]{registry.group}[/]")
+    for name in registry.names():
+        table.add_row(f"  {name}", _first_line(registry, name))
+    table.add_row()
+
+
+def _add_presets(table: Any) -> None:
+    from wiw.registry import TASKS
+    from wiw.tasks import presets
+
+    for task in TASKS.built_in:
+        table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
+        for name in presets.list_presets(task):
+            table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
+    table.add_row()
+
+
+def _add_vlm_models(table: Any) -> None:
+    from wiw.policies.vlm import presets as vlms
+
+    table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
+    for name in vlms.list_names():
+        table.add_row(f"  {name}", escape(vlms.describe(name)))
+
+
 def _first_line(registry: Any, name: str) -> str:
-    """What a thing is, in its own words; or why it cannot be loaded."""
+    """Return the first line of a thing's description, or why it cannot be loaded."""
     try:
         thing = registry.find(name)
         text = str(getattr(thing, "about", "") or inspect.getdoc(thing) or "")

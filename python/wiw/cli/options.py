@@ -121,9 +121,9 @@ def default_policy(task: str) -> str:
     Raises:
         ArgumentError: the task names none either.
     """
-    from wiw.registry import TASKS
+    from wiw.registry import task_class
 
-    name = getattr(TASKS.find(task), "default_policy", None)
+    name = task_class(task).default_policy
     if name is None:
         raise ArgumentError(f"--policy: task '{task}' names no default; choose one of `wiw list policies`")
     return str(name)

@@ -15,22 +15,23 @@ def report(
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Prints the table of a run and writes its HTML report: one file that needs nothing else.
+    """Print the tables of a run and writes its HTML report: one self-contained file.
 
     $ wiw report runs/first
     $ wiw report runs/first --out first.html
 
-    Also works while the run is going on.
+    Also works during the run.
 
     Args:
         run: The run's folder.
         out: Where to write; report.html in the run's folder if not given.
     """
-    from wiw.analysis.costs import print_costs
+    from wiw.report.tables import print_costs, print_fidelity
     from wiw.studies.run_log import load_run
 
     log = load_run(run)
     log.summary()
     print_costs(log)
+    print_fidelity(log)
     print(f"\nreport  {log.report(out)}")
     return 0

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -13,7 +14,11 @@ from tyro.conf import Positional, arg
 from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
 from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
+from wiw.loop.config import AgentConfig
+from wiw.runs.config import RunConfig
 
+SEARCH, SETTINGS = AgentConfig(), RunConfig()
+"""What holds where the command line says nothing."""
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
@@ -36,26 +41,11 @@ def run(
     per_scene: MaybeCount = None,
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None,
     scene_folder: Folder = None,
-    episodes: MaybeCount = None,
-    seed: Count = 0,
-    workers: Count = 1,
-    out: Folder = None,
-    candidates: Annotated[int | None, arg(metavar="M")] = None,
-    horizon: Annotated[int | None, arg(metavar="L")] = None,
-    depth: Count = 1,
-    width: MaybeCount = None,
     motion: Literal["refuse", "slide"] | None = None,
     robot: Annotated[Path | None, arg(metavar="URDF")] = None,
-    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
-    live: Count = 4,
-    keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2,
-    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
-    cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
-    cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
-    fidelity: bool = False,
-    lpips: Annotated[str | None, arg(metavar="auto|DIR")] = None,
     vlm: Annotated[str | None, arg(metavar="URL")] = None,
     vlm_model: MaybeName = None,
     vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None,
@@ -63,6 +53,8 @@ def run(
     semantics: MaybeName = None,
     semantics_option: Options = (),
     report: bool = True,
+    search: Annotated[AgentConfig, arg(name="")] = SEARCH,
+    config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
     """Runs an agent on a task, with one world model or with several on the same episodes.
 
@@ -93,31 +85,13 @@ def run(
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
         scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
-        episodes: How many; if not given, 20, for manipulation what the preset says: 50 of each task.
-        seed: All randomness is a function of it.
-        workers: Processes; results do not depend on it.
-        out: Folder of the run; runs/TASK-TIME if not given.
-        candidates: Plans imagined at each decision; the task's own number if not given.
-        horizon: Primitives or poses in a plan; the task's own number if not given.
-        depth: Levels of the beam search; each one after the first extends the best plans by another horizon.
-        width: Plans kept and extended at each level; as many as candidates if not given.
         motion: What happens to a blocked move; the preset's rule if not given.
         robot: For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given.
-        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
+            given. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as
             categories=bed,sofa; may be given again.
         backend: Renderer; auto if not given.
-        live: Episodes kept live at a time in a process, so that model calls are batched.
-        keep_images: Episodes that keep pictures for `wiw report` and `wiw view`, of manipulation one of each kind at
-            least; all: every one, at 0.2 MB a decision.
-        deadline: Most seconds for a call of the world model, 300 if not given; it is asked three times before the
-            episode is recorded as failed for infrastructure, which is never a failure of the task.
-        cache: Where rollouts are kept, so that no question is put to a model twice: auto for models that declare
-            themselves cacheable, in ~/.cache/wiw/rollouts; a folder for every model that declares a version; or off.
-        cache_gb: Most gigabytes of that folder; what was not used for longest goes first.
-        fidelity: Whether every imagined plan is also replayed in the simulator, to tell how true imagination was.
-        lpips: Folder with the weights of LPIPS, to measure fidelity by it as well (auto: ~/.cache/wiw/weights). Where
-            they are not there it says which files are needed.
         vlm: For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock;
             http://localhost:8000/v1 if not given.
         vlm_model: Its name at the server, or a preset of `wiw list`; not needed where the server has one model.
@@ -126,10 +100,16 @@ def run(
         semantics_option: An option of --semantics, such as weights=FILE; may be given again.
         prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
+        search: Numbers of the search.
+        config: How the run goes.
     """
-    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
-    from wiw.studies.evaluate import evaluate
+    from wiw.cli.announcement import announce
+    from wiw.errors import ArgumentError
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
 
+    if search.width is not None and search.depth == 1:
+        raise ArgumentError("--width: a search of one level extends no plan; give --depth 2 or more, or leave it out")
+    seed = config.seed or 0
     flags = {
         "tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "motion": motion,
         "per_scene": per_scene, "episode_file": episode_file, "scene_folder": scene_folder, "robot": robot,
@@ -139,23 +119,19 @@ def run(
     model = None if world_model == "none" else absolute(world_model)
     names = _arms(arms, world_model)
     speaking = [policy, revision or "", *(name.partition("+")[0] for name in names or [])]
-    given = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
+    asked = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
-        absolute(policy), model, revision and absolute(revision), candidates, horizon, None, depth, width,
+        absolute(policy), model, revision and absolute(revision), **search.numbers,
         model_options=model_options(model, world_model_option), semantics=semantics and absolute(semantics),
         semantics_options=semantics_options(semantics, semantics_option),
-        policy_options=policy_options(absolute(policy), policy_option, vlm_options(given, speaking)),
+        policy_options=policy_options(absolute(policy), policy_option, vlm_options(asked, speaking)),
     )  # fmt: skip
-    folder = out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
+    settings = replace(config, seed=seed, out=folder)
+    announce(recipe.build(), arm_recipes(agent, names), settings)
+    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
 
-    def work() -> Any:
-        return evaluate(
-            recipe, agent, episodes, seed, folder, workers,
-            arms=names, live=live, keep_images=keep_images, deadline=deadline,
-            cache=cache, cache_gb=cache_gb, fidelity=fidelity, lpips=lpips,
-        )  # fmt: skip
-
-    return finish(stoppable(work, folder), report)
+    return finish(stoppable(lambda: evaluate(recipe, agent, arms=names, config=settings), folder), report)
 
 
 def resume(
@@ -163,7 +139,7 @@ def resume(
     /,
     *,
     workers: MaybeCount = None,
-    retry_failed: bool = False,
+    retry_errors: bool = False,
     report: bool = True,
 ) -> int:
     """Goes on with a run that was stopped: only the episodes that have not ended are run.
@@ -173,26 +149,30 @@ def resume(
     Args:
         run: The run's folder.
         workers: Processes; as many as it was begun with if not given.
-        retry_failed: Whether to run episodes again whose infrastructure failed.
+        retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         report: Whether to write report.html at the end.
     """
     from wiw.studies.evaluate import resume_run
 
-    return finish(stoppable(lambda: resume_run(run, workers, retry_failed=retry_failed), run), report)
+    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors), run), report)
 
 
 def finish(log: Any, report: bool) -> int:
-    """Prints the table and what went wrong, writes the report; 1 if the run is invalid."""
+    """Print tables and errors, write the report; return 1 if the run is invalid."""
+    from wiw.report.tables import print_fidelity
+
     numbers = log.summary()
-    failed = [episode for episode in log.episodes if episode["status"] == "failed"]
-    if failed:
-        count = "1 episode" if len(failed) == 1 else f"{len(failed)} episodes"
-        first, cause = failed[0], failed[0]["error"].strip().splitlines()[-1]
+    print_fidelity(log)
+    errors = [episode for episode in log.episodes if episode["status"] == "error"]
+    if errors:
+        count = "1 infrastructure error" if len(errors) == 1 else f"{len(errors)} infrastructure errors"
+        first, cause = errors[0], errors[0]["error"].strip().splitlines()[-1]
         print(
-            f"\n{count} failed for infrastructure. The first, {first['arm']} {first['episode']}: {printable(cause)}",
+            f"\n{count}, excluded from scores. "
+            f"The first, {first['arm']} episode {first['episode']}: {printable(cause)}",
             file=sys.stderr,
         )
-        print(f"Once mended:  wiw resume {log.path} --retry-failed", file=sys.stderr)
+        print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
     if report:
         print(f"report  {log.report()}")

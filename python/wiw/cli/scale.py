@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,10 +11,13 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
+from wiw.runs.config import RunConfig
 
 Name = Annotated[str, arg(metavar="NAME")]
 Count = Annotated[int, arg(metavar="N")]
 Values = Annotated[str | None, arg(metavar="A,B,...")]
+SETTINGS = RunConfig()
+"""What holds where the command line says nothing."""
 
 
 def scale(
@@ -30,22 +34,15 @@ def scale(
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
     robot: Annotated[Path | None, arg(metavar="URDF")] = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
-    episodes: Count = 20,
-    seed: Count = 0,
-    workers: Count = 1,
-    out: Annotated[Path | None, arg(metavar="DIR")] = None,
     horizon: Annotated[int | None, arg(metavar="L")] = None,
-    preset: Annotated[str, arg(metavar="NAME|FILE")] = "paper",
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None,
     task_option: Options = (),
     backend: Literal["auto", "cpu", "gpu"] | None = None,
-    live: Count = 4,
-    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None,
-    cache: Annotated[str, arg(metavar="auto|off|DIR")] = "auto",
-    cache_gb: Annotated[float, arg(metavar="N")] = 20.0,
     vlm: Annotated[str | None, arg(metavar="URL")] = None,
     vlm_model: Annotated[str | None, arg(metavar="NAME")] = None,
     semantics: Annotated[str | None, arg(metavar="NAME")] = None,
     semantics_option: Options = (),
+    config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
     """Success against the number of futures that a world model imagines, all amounts on the same episodes.
 
@@ -69,24 +66,17 @@ def scale(
         robot: For manipulation: description of an arm to work with, as in `wiw run`.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
             apartments:val if not given.
-        episodes: How many.
-        seed: All randomness is a function of it.
-        workers: Processes; results do not depend on it.
-        out: Folder of the run; runs/scale-TIME if not given.
         horizon: Primitives or poses in a plan; the task's own number if not given.
-        preset: Rules of the task: paper, official (its published code), or a YAML file of your own. See `wiw list`.
+        preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
+            given. See `wiw list`.
         task_option: A rule of the preset, such as decisions=10, or another option of the task, such as per_scene=2; may
             be given again.
         backend: Renderer; auto if not given.
-        live: Episodes kept live at a time in a process, so that model calls are batched.
-        deadline: Most seconds for a call of the world model, 300 if not given.
-        cache: Where rollouts are kept and shared by the amounts: auto for models that declare themselves cacheable; a
-            folder for every model that declares a version; or off.
-        cache_gb: Most gigabytes of that folder.
         vlm: For policy vlm, as in `wiw run`.
         vlm_model: Likewise.
         semantics: Tells world models that need it what each pixel is, as in `wiw run`.
         semantics_option: An option of --semantics; may be given again.
+        config: How the run goes; a folder as cache is shared by the amounts.
     """
     from wiw.cli.run import stoppable, vlm_options
     from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute
@@ -102,24 +92,19 @@ def scale(
             absolute(policy), policy_option, vlm_options({"vlm": vlm, "model": vlm_model}, [policy, revision or ""])
         ),
     )  # fmt: skip
+    seed = config.seed or 0
     flags = {"tasks": tasks, "scenes": scenes, "seed": seed, "preset": preset, "backend": backend, "robot": robot}
     recipe = TaskRecipe(task, task_options(task, task_option, flags))
-    folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
+    settings = replace(config, seed=seed, out=folder)
     counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")
-
-    def work() -> Any:
-        return run_scale(
-            recipe, agent, counts, shares, episodes, seed, folder, workers,
-            live=live, deadline=deadline, cache=cache, cache_gb=cache_gb,
-        )  # fmt: skip
-
-    found = stoppable(work, folder)
+    found = stoppable(lambda: run_scale(recipe, agent, counts, shares, config=settings), folder)
     found.summary()
     for path in found.save():
         print(path)
     problems = found.log.numbers().invalid
     for reason in problems:
-        print(f"INVALID RUN, not to be quoted: {reason}")
+        print(f"INVALID RUN, do not report: {reason}")
     return 1 if problems else 0
 
 

@@ -28,9 +28,11 @@ def scenes(
         views: Panoramas of each scene.
         backend: Renderer.
     """
+    from PIL import Image
     from rich.console import Console
     from rich.table import Table
 
+    from wiw.files import whole_file
     from wiw.scenes import resolve
     from wiw.viz.contact_sheet import contact_sheet
 
@@ -49,7 +51,9 @@ def scenes(
         table.add_row(*_facts(place))
         rows.append(place)
     Console().print(table)
-    contact_sheet(rows, views, backend).save(out)
+    with whole_file(out) as draft:
+        kind = Image.registered_extensions().get(out.suffix.lower(), "PNG")
+        contact_sheet(rows, views, backend).save(draft, format=kind)
     print(f"\nsheet  {out}")
     return 0
 

@@ -12,14 +12,12 @@ def serve_vlm(
     *,
     model: Annotated[str, arg(metavar="tiny|mock|PATH|FILE.py:FUNCTION")] = "tiny",
     port: Annotated[int, arg(metavar="N")] = 8000,
-    misbehave: Annotated[str | None, arg(metavar="FAULT[:RATE],...")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
     """Serves a vision-language model to this machine, in the way of OpenAI and vLLM, for tests and trials.
 
       $ wiw serve-vlm
       $ wiw serve-vlm --model my_script.py:answer --port 8001
-      $ wiw serve-vlm --misbehave 429,500,slow:0.05,malformed:0.2
 
     Then, in another terminal:  wiw run ar --policy vlm --vlm http://localhost:8000/v1
 
@@ -27,18 +25,14 @@ def serve_vlm(
         model: tiny, a model of random weights made on the spot; mock, which draws its answers; a folder or hub name for
             transformers; or a function that is given each call and returns text or a probability for each first token.
         port: On 127.0.0.1; 0 takes a free one.
-        misbehave: Faults and how often they come (0.1 if not given): 429, 500, slow, truncated, malformed, refusal,
-            huge.
-        seed: Of the random weights, and of which request meets which fault.
+        seed: Of the random weights.
     """
     import tempfile
 
-    from wiw.serving.misbehaviour import Misbehaviour
     from wiw.serving.vlm_server import VlmServer
 
-    faults = Misbehaviour.parse(misbehave or "", seed)
     with tempfile.TemporaryDirectory() as folder:
-        server = VlmServer(_client(model, seed, folder), port, faults)
+        server = VlmServer(_client(model, seed, folder), port)
         print(f"{server.client.model} at {server.url}", flush=True)
         server.serve()
     return 0

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -13,19 +14,19 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.stop import begun_again
 
-TRAIN, VAL, PLAYS = "apartments:train:80", "apartments:val:20", 2000
-"""What is learnt from and measured on where nothing else is asked for."""
-SEEING, PLAYING = ("recogniser", "warpnet"), ("armnet",)
+DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
+ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet"), ("armnet",), ("armnet", "diffuser")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
-    "scenes": (SEEING, "looks at no scenes"),
-    "val": (SEEING, "looks at no scenes"),
-    "places": (SEEING, "looks at no scenes"),
-    "categories": (("recogniser",), "recognises nothing"),
-    "plays": (PLAYING, "plays at no tables"),
-    "demonstrations": ((*PLAYING, "diffuser"), "learns from scenes"),
-    "cache": ((*SEEING, *PLAYING), "looks at no scenes and plays at no tables"),
+    "scenes": (ON_SCENES, "does not train on scenes"),
+    "val": (ON_SCENES, "does not train on scenes"),
+    "places": (ON_SCENES, "does not train on scenes"),
+    "categories": (("recogniser",), "has no categories"),
+    "plays": (ON_PLAYS, "does not train on plays"),
+    "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
+    "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
+    "cache": ((*ON_SCENES, *ON_PLAYS), "caches no training data"),
 }
-"""By flag: what has a use for it, and why the rest has none."""
+"""For each option that not all networks use: those that do, and why the others refuse it."""
 
 
 def train(
@@ -44,15 +45,17 @@ def train(
     places: Annotated[int | None, arg(metavar="N")] = None,
     plays: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
-    workers: Annotated[int, arg(metavar="N")] = 2,
+    workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Trains a network on generated apartments or on scenes of your own, at the table of an arm, or on demonstrations.
+    """Train one of four networks: recogniser, warpnet, armnet or diffuser.
 
-    recogniser: the policy of Active Recognition, which tells what is in a red box from any number of real and imagined
-    views. warpnet: a world model that shows what a panorama would look like from near by. armnet: a world model that
-    shows what the front view of an arm would look like after it has gone to each pose of a plan. diffuser: the 3D
-    diffusion policy of manipulation.
+    recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
+    imagined views. Trained on scenes.
+    warpnet: a world model of navigation; it predicts the panorama that is seen from a place nearby. Trained on scenes.
+    armnet: a world model of manipulation; it predicts the front view after each gripper pose of a plan. Trained on
+    simulated play at the tables of the manipulation tasks, and on demonstrations if there are any.
+    diffuser: the 3D diffusion policy of manipulation. Trained on demonstrations.
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
@@ -62,60 +65,74 @@ def train(
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
-    recogniser and warpnet look around all scenes first, armnet plays at the tables of the manipulation tasks, mostly
-    badly; a command that was stopped does not do so again. Then they train: a quarter of an hour to half of one on two
-    idle cores. diffuser learns from demonstrations, for a night (--minutes makes it shorter).
+    First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
+    it again. Training then takes 15 to 30 minutes on two idle cores; diffuser takes a night, or less with --minutes.
+    An interrupted training of armnet or diffuser resumes from its checkpoint, which lies beside FILE.
 
-    Recipe and figures on what was not learnt from are kept in the file: the recogniser's accuracy and calibration error
-    on one half of the val scenes, its confidence being calibrated on the other; warpnet's PSNR and SSIM there beside
-    those of copy and warp; armnet's errors on plays of its own beside those of copy and of a table on which nothing but
-    the arm moves. diffuser is not measured. The weights that come with the package were made by this command as it
-    stands.
+    The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
+    one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
+    beside copy and warp; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
+    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults.
 
     Args:
         what: recogniser, warpnet, armnet or diffuser.
-        out: Weights, as safetensors of a few MB; WHAT.safetensors if not given.
-        scenes: To learn from: apartments:train[:N], a mesh or a Gazebo world; apartments:train:80 if not given.
-        val: To measure on, and for the recogniser to calibrate with: it halves them, or the looks of a single one;
-            apartments:val:20 if not given.
-        categories: What there is to recognise; the built-in list if none is given.
-        demonstrations: Of `wiw collect manipulation`: for diffuser to learn from, with depth; for armnet beside plays.
-        epochs: How often each look is shown, on average; 25 for the recogniser, 6 for warpnet, 4 for armnet, 400 for
-            diffuser if not given.
-        minutes: Fewer epochs where so many would take longer than this to train.
-        places: From which a scene is looked at, or that it is walked through from; 16 and 24 if not given.
-        plays: For armnet: at tables, of eight poses each; 2000 if not given.
-        seed: The looks are a function of it and the scenes, the weights of it, the looks and the epochs.
-        workers: Processes that look around.
-        cache: Where looks and plays are kept; $WIW_CACHE/looks if not given. Deleting it is always safe.
+        out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors.
+        scenes: Training scenes of recogniser and warpnet: apartments:train[:N], a mesh or a Gazebo world. Default:
+            apartments:train:80.
+        val: Held-out scenes of recogniser and warpnet. recogniser splits them, or the samples of a single one, into
+            halves for calibration and evaluation. Default: apartments:val:20.
+        categories: What recogniser tells apart. Default: the built-in list of 26 categories.
+        demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 4 for armnet,
+            400 for diffuser.
+        minutes: Train fewer epochs if all of them would take longer than this.
+        places: Places sampled in each scene, for recogniser (default: 16), or walks recorded in each scene, for warpnet
+            (default: 24).
+        plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
+        seed: Seed of the training data and of the weights.
+        workers: Processes that prepare training data from scenes or plays. Default: 2.
+        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks.
     """
     from wiw.scenes.store import folder
 
     out = out or Path(f"{what}.safetensors")
-    flags = {"scenes": scenes, "val": val, "categories": categories or None, "demonstrations": demonstrations}
-    _check_use(what, _given(**flags, places=places, plays=plays, cache=cache))
+    _check_numbers(epochs=epochs, minutes=minutes, places=places, plays=plays, seed=seed, workers=workers)
+    options: dict[str, Any] = {
+        "scenes": scenes,
+        "val": val,
+        "categories": categories or None,
+        "demonstrations": demonstrations,
+    }
+    options |= {"places": places, "plays": plays, "workers": workers, "cache": cache}
+    _check_use(what, _drop_none(options))
     _require_torch(what)
     _check_out(out)
-    from_where = TRAIN if scenes is None else scenes, VAL if val is None else val
-    asked = _Asked(*from_where, seed, cache or folder().parent / "looks", workers)
-    if what in SEEING:
-        _check_scenes(asked.scenes, asked.val)
+    data = _DataOptions(
+        scenes=DEFAULT_SCENES if scenes is None else scenes,
+        val=DEFAULT_VAL if val is None else val,
+        seed=seed,
+        cache=cache or folder().parent / "looks",
+        workers=DEFAULT_WORKERS if workers is None else workers,
+    )
+    rules, recipe = _drop_none({"places": places}), _drop_none({"epochs": epochs})
+    if what in ON_SCENES:
+        _check_scenes(data.scenes, data.val)
     with begun_again():
         if what == "recogniser":
-            _recogniser(out, asked, categories, minutes, _given(places=places), _given(epochs=epochs))
+            _train_recogniser(out, data, categories, minutes, rules, recipe)
         elif what == "diffuser":
-            _diffuser(out, demonstrations, minutes, _given(epochs=epochs, seed=seed))
+            _train_diffuser(out, demonstrations, minutes, {**recipe, "seed": seed})
         elif what == "armnet":
-            _armnet(out, asked, minutes, PLAYS if plays is None else plays, demonstrations, _given(epochs=epochs))
+            _train_armnet(out, data, minutes, DEFAULT_PLAYS if plays is None else plays, demonstrations, recipe)
         else:
-            _warpnet(out, asked, minutes, _given(places=places), _given(epochs=epochs))
+            _train_warpnet(out, data, minutes, rules, recipe)
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
     return 0
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """From where, and how, what is learnt from is gathered."""
+class _DataOptions:
+    """Where training data comes from, and how it is prepared."""
 
     scenes: str
     val: str
@@ -125,7 +142,8 @@ class _Asked:
 
     @property
     def gathering(self) -> dict[str, Any]:
-        return {"folder": self.cache, "workers": self.workers, "bar": _bar}
+        """Keyword arguments of the functions in `wiw.training.gather`."""
+        return {"folder": self.cache, "workers": self.workers, "bar": _show_bar}
 
 
 def _require_torch(what: str) -> None:
@@ -144,149 +162,186 @@ def _require_torch(what: str) -> None:
         devices.require(WORLD_MODELS.find(what).requires)
 
 
-def _recogniser(
+def _train_recogniser(
     out: Path,
-    asked: _Asked,
+    data: _DataOptions,
     categories: tuple[str, ...],
     minutes: float | None,
-    rule: dict[str, Any],
-    how: dict[str, Any],
+    rule_options: dict[str, Any],
+    recipe_options: dict[str, Any],
 ) -> None:
     from wiw.datasets.ar import CATEGORIES
     from wiw.training import recogniser as training
-    from wiw.training.gather import gathered
-    from wiw.training.looks import LookRules, halves
+    from wiw.training.gather import gather_glimpse_sets
+    from wiw.training.glimpse_sets import GlimpseSetRules, split_in_half
 
-    names, rules, recipe = categories or CATEGORIES, LookRules(**rule), training.Recipe(seed=asked.seed, **how)
-    looks = gathered(asked.scenes, names, asked.seed, rules, **asked.gathering)
-    calibration, held_out = halves(gathered(asked.val, names, asked.seed, rules, **asked.gathering))
-    with _Steps() as steps:
+    names, rules, recipe = (
+        categories or CATEGORIES,
+        GlimpseSetRules(**rule_options),
+        training.Recipe(seed=data.seed, **recipe_options),
+    )
+    looks = gather_glimpse_sets(data.scenes, names, data.seed, rules, **data.gathering)
+    calibration, held_out = split_in_half(gather_glimpse_sets(data.val, names, data.seed, rules, **data.gathering))
+    with _StepBar() as steps:
         network, recipe = training.train(looks, names, recipe, minutes, steps)
-    card = {"scenes": asked.scenes, "val": asked.val, "sets": len(looks)}
+    card = {"scenes": data.scenes, "val": data.val, "sets": len(looks)}
     card |= {"looks": asdict(rules), "recipe": asdict(recipe)}
-    made = training.calibrated(network, names, calibration, held_out, card)
-    made.save(out)
-    _report(made.card, made.temperature)
+    calibrated = training.calibrate(network, names, calibration, held_out, card)
+    calibrated.save(out)
+    _report_recogniser(calibrated.card, calibrated.temperature)
 
 
-def _warpnet(out: Path, asked: _Asked, minutes: float | None, rule: dict[str, Any], how: dict[str, Any]) -> None:
+def _train_warpnet(
+    out: Path, data: _DataOptions, minutes: float | None, rule_options: dict[str, Any], recipe_options: dict[str, Any]
+) -> None:
     from wiw.training import warpnet as training
-    from wiw.training.gather import gathered_walks
+    from wiw.training.gather import gather_walks
     from wiw.training.walks import WalkRules
     from wiw.world_models.warpnet.model import WarpNet
     from wiw.world_models.warpnet.weights import load, save
 
-    rules, recipe = WalkRules(**rule), training.Recipe(seed=asked.seed, **how)
-    walks = gathered_walks(asked.scenes, asked.seed, rules, **asked.gathering)
-    with _Steps() as steps:
+    rules, recipe = WalkRules(**rule_options), training.Recipe(seed=data.seed, **recipe_options)
+    walks = gather_walks(data.scenes, data.seed, rules, **data.gathering)
+    with _StepBar() as steps:
         network, recipe = training.train(walks, recipe, minutes, steps)
-    card: dict[str, Any] = {"scenes": asked.scenes, "val": asked.val, "ways": len(walks)}
+    card: dict[str, Any] = {"scenes": data.scenes, "val": data.val, "ways": len(walks)}
     card |= {"walks": asdict(rules), "recipe": asdict(recipe)}
-    save(out, network, card)  # before measuring, which takes another minute
-    card["held_out"] = training.measured(WarpNet(out), asked.val, asked.seed, bar=_bar)
+    save(out, network, card)  # before the evaluation, which takes another minute
+    card["held_out"] = training.evaluate(WarpNet(out), data.val, data.seed, bar=_show_bar)
     save(out, load(out)[0], card)
     _report_warpnet(card)
 
 
-def _diffuser(out: Path, demonstrations: Path | None, minutes: float | None, how: dict[str, Any]) -> None:
+def _train_diffuser(
+    out: Path, demonstrations: Path | None, minutes: float | None, recipe_options: dict[str, Any]
+) -> None:
     from wiw.datasets.demonstrations import Demonstrations
     from wiw.envs.sensors import Sensors
     from wiw.errors import ArgumentError
-    from wiw.networks import one_thread
-    from wiw.policies.diffuser.sight import Lens
+    from wiw.networks import single_thread
     from wiw.policies.diffuser.weights import save
+    from wiw.policies.diffuser.workspace import PinholeCamera
     from wiw.training import diffuser as training
     from wiw.training.checkpoint import Checkpoint
 
     if demonstrations is None:
-        raise ArgumentError("diffuser learns from demonstrations: give a folder of `wiw collect` with --demonstrations")
-    shown, recipe = Demonstrations(demonstrations), training.Recipe(**how)
-    if shown.config.get("size") != Sensors.size:
         raise ArgumentError(
-            f"--demonstrations: diffuser is run on views of {Sensors.size} pixels a side, got demonstrations of "
-            f"{shown.config.get('size')}; collect with --size {Sensors.size}"
+            "diffuser trains on demonstrations; give a folder of `wiw collect manipulation --depth` by --demonstrations"
         )
-    lens = Lens(shown.camera.intrinsics, shown.camera.T_world_camera)
-    moments = training.moments(_bar(shown, "looking", len(shown)), lens)
-    card: dict[str, Any] = {"demonstrations": shown.config, "moments": len(moments)}
-    asked = {**card, "recipe": asdict(recipe), "minutes": minutes}
-    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), asked)
-    with one_thread(), _Steps() as steps:
-        network, recipe = training.train(moments, recipe, minutes, steps, checkpoint)
+    collection, recipe = Demonstrations(demonstrations), training.Recipe(**recipe_options)
+    if collection.config.get("size") != Sensors.size:
+        raise ArgumentError(
+            f"--demonstrations: diffuser needs views of {Sensors.size} x {Sensors.size} pixels, got demonstrations of "
+            f"{collection.config.get('size')}; collect with --size {Sensors.size}"
+        )
+    camera = PinholeCamera(collection.camera.intrinsics, collection.camera.T_world_camera)
+    samples = training.extract_samples(_show_bar(collection, "reading", len(collection)), camera)
+    card: dict[str, Any] = {"demonstrations": collection.config, "moments": len(samples)}
+    identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
+    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
+    with single_thread(), _StepBar() as steps:
+        network, recipe = training.train(samples, recipe, minutes, steps, checkpoint)
     save(out, network, {**card, "recipe": asdict(recipe)})
     checkpoint.remove()
-    print(f"{len(shown)} demonstrations, {len(moments)} paths, {recipe.epochs} epochs")
+    print(f"{len(collection)} demonstrations, {len(samples)} samples, {recipe.epochs} epochs")
 
 
-def _armnet(
-    out: Path, asked: _Asked, minutes: float | None, count: int, demonstrations: Path | None, how: dict[str, Any]
+def _train_armnet(
+    out: Path,
+    data: _DataOptions,
+    minutes: float | None,
+    count: int,
+    demonstrations: Path | None,
+    recipe_options: dict[str, Any],
 ) -> None:
     from wiw.datasets.demonstrations import read_manifest
-    from wiw.networks import one_thread
+    from wiw.networks import single_thread
     from wiw.training import armnet as training
     from wiw.training.checkpoint import Checkpoint
-    from wiw.training.plays import demonstrated, gathered_plays, merged
+    from wiw.training.plays import gather_plays, merge_plays, read_demonstration_plays
     from wiw.world_models.armnet.weights import load, save
 
-    recipe = training.Recipe(seed=asked.seed, **how)
-    plays = gathered_plays(count, asked.seed, **asked.gathering)
-    held_out = gathered_plays(training.HELD_OUT, asked.seed + training.OTHERS, **asked.gathering)
+    recipe = training.Recipe(seed=data.seed, **recipe_options)
+    plays = gather_plays(count, data.seed, **data.gathering)
+    held_out = gather_plays(training.HELD_OUT, data.seed + training.HELD_OUT_SEED_OFFSET, **data.gathering)
     card: dict[str, Any] = {"plays": len(plays), "demonstrations": 0}
     if demonstrations is not None:
-        shown = demonstrated(demonstrations)
-        card |= {"demonstrations": len(shown), "collection": read_manifest(demonstrations)}
-        plays = merged([plays, shown])
-    asked_for = {**card, "recipe": asdict(recipe), "minutes": minutes}
-    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), asked_for)
-    with one_thread(), _Steps() as steps:
+        demonstrated = read_demonstration_plays(demonstrations)
+        card |= {"demonstrations": len(demonstrated), "collection": read_manifest(demonstrations)}
+        plays = merge_plays([plays, demonstrated])
+    identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
+    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
+    with single_thread(), _StepBar() as steps:
         network, recipe = training.train(plays, recipe, minutes, steps, checkpoint)
     card["recipe"] = asdict(recipe)
-    save(out, network, card)  # before measuring, which takes another minute
-    network = load(out)[0]  # as it is kept, in half precision
-    card["held_out"] = training.measured(network, held_out)
+    save(out, network, card)  # before the evaluation, which takes another minute
+    network = load(out)[0]  # as it is stored, in half precision
+    card["held_out"] = training.evaluate(network, held_out)
     save(out, network, card)
     checkpoint.remove()
     _report_armnet(card)
 
 
-def _given(**options: Any) -> dict[str, Any]:
-    """Those that are not None."""
+def _drop_none(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options that are not None."""
     return {name: value for name, value in options.items() if value is not None}
 
 
+def _check_numbers(
+    *,
+    epochs: int | None,
+    minutes: float | None,
+    places: int | None,
+    plays: int | None,
+    seed: int,
+    workers: int | None,
+) -> None:
+    """Refuse numbers that are out of range."""
+    from wiw.errors import ArgumentError
+
+    counts = {"epochs": epochs, "places": places, "plays": plays, "workers": workers}
+    for name, count in _drop_none(counts).items():
+        if count < 1:
+            raise ArgumentError(f"--{name}: expected 1 or more, got {count}")
+    if minutes is not None and not (minutes > 0 and math.isfinite(minutes)):
+        raise ArgumentError(f"--minutes: expected a number above 0, got {minutes}")
+    if not 0 <= seed < 2**63:
+        raise ArgumentError(f"--seed: expected 0 to 2**63 - 1, got {seed}")
+
+
 def _check_use(what: str, given: Mapping[str, Any]) -> None:
-    """That nothing is asked for in vain."""
+    """Refuse options that the network does not use."""
     from wiw.errors import ArgumentError
 
     for name in given:
-        users, why = USES[name]
+        users, reason = USES[name]
         if what not in users:
-            instead = "give --plays in place of it" if (what, name) == ("armnet", "places") else "leave it out"
-            raise ArgumentError(f"--{name}: {what} {why}; {instead}")
-    if given.get("plays", 1) < 1:
-        raise ArgumentError(f"--plays: expected 1 or more, got {given['plays']}")
+            instead = "use --plays instead" if (what, name) == ("armnet", "places") else "leave it out"
+            raise ArgumentError(f"--{name}: {what} {reason}; {instead}")
 
 
 def _check_out(out: Path) -> None:
-    """What would otherwise be found out after minutes."""
+    """Check that the file can be written, before the minutes that training takes."""
     from wiw.errors import FileError
 
     if not out.absolute().parent.is_dir() or out.is_dir():
-        raise FileError(f"{out}: cannot be written there; choose a file in a folder that exists with --out")
+        raise FileError(f"{out}: cannot be written; choose a file in a folder that exists by --out")
 
 
 def _check_scenes(scenes: str, val: str) -> None:
-    """Likewise."""
+    """Check that no scene is both trained and evaluated on."""
     from wiw.errors import ArgumentError
     from wiw.scenes import resolve
 
     shared = sorted(set(resolve(scenes)) & set(resolve(val)))
     if shared:
-        raise ArgumentError(f"--val: expected scenes that are not learnt from, got {shared[0]} in both; choose others")
+        raise ArgumentError(
+            f"--val: expected held-out scenes that are not among --scenes, got {shared[0]} in both; choose others"
+        )
 
 
-def _report(card: dict[str, Any], temperature: float) -> None:
-    print(f"{card['sets']} sets of looks, {card['recipe']['epochs']} epochs; held out: {card['held_out_sets']} sets")
+def _report_recogniser(card: dict[str, Any], temperature: float) -> None:
+    print(f"{card['sets']} glimpse sets, {card['recipe']['epochs']} epochs; held out: {card['held_out_sets']} sets")
     for name, accuracy in card["accuracy"].items():
         print(f"  {name:<20} accuracy {100 * accuracy:5.1f} %")
     error = card["calibration_error"]
@@ -295,7 +350,7 @@ def _report(card: dict[str, Any], temperature: float) -> None:
 
 def _report_warpnet(card: dict[str, Any]) -> None:
     held_out = card["held_out"]
-    print(f"{card['ways']} ways, {card['recipe']['epochs']} epochs; held out: {held_out['ways']} ways")
+    print(f"{card['ways']} walks, {card['recipe']['epochs']} epochs; held out: {held_out['ways']} walks")
     print(f"{'steps of 0.2 m ahead':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
     for name in held_out["psnr"]:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]
@@ -306,16 +361,16 @@ def _report_warpnet(card: dict[str, Any]) -> None:
 def _report_armnet(card: dict[str, Any]) -> None:
     held_out = card["held_out"]
     print(f"{card['plays']} plays, {card['recipe']['epochs']} epochs; held out: {held_out['plays']} plays")
-    print(f"{'poses gone to':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
+    print(f"{'poses ahead':<20}" + "".join(f"{steps:>15}" for steps in held_out["psnr"]["copy"]))
     for name in held_out["psnr"]:
         cells = [
             f"{held_out['changed'][name][n]:8.1f} {held_out['psnr'][name][n]:6.1f}" for n in held_out["psnr"][name]
         ]
         print(f"  {name:<18}" + "".join(cells))
-    print("mean absolute error, of 255, where things have changed, and PSNR in dB of the window around the table")
+    print("mean absolute error (of 255) of changed pixels, and PSNR in dB of the window around the table")
 
 
-def _bar(items: Any, text: str, total: int) -> Any:
+def _show_bar(items: Any, text: str, total: int) -> Any:
     from rich.progress import track
 
     return track(items, text, total, console=_console(), disable=not sys.stderr.isatty() or not total)
@@ -327,10 +382,10 @@ def _console() -> Any:
     return Console(stderr=True)
 
 
-class _Steps:
-    """A bar of training steps."""
+class _StepBar:
+    """A progress bar of training steps."""
 
-    def __enter__(self) -> _Steps:
+    def __enter__(self) -> _StepBar:
         from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
         columns = TextColumn("training"), BarColumn(), TextColumn("loss {task.fields[loss]:.3f}"), TimeRemainingColumn()

@@ -15,7 +15,7 @@ def view(
     *,
     out: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Writes pages to walk through a run: all episodes with filters, and every decision of each on a timeline.
+    """Write pages to walk through a run: all episodes with filters, and every decision of each on a timeline.
 
     $ wiw view runs/first
     $ wiw view runs/first --out pages

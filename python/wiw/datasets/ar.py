@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.visibility import COARSE, alone, seen
+from wiw.datasets.visibility import COARSE, measure_sizes, measure_unhidden_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
 from wiw.types import Episode
@@ -52,7 +52,7 @@ CATEGORIES = (
     "wardrobe",
     "washing machine",
 )
-"""What targets are and answers are chosen from, unless told otherwise: as many as there are letters."""
+"""Categories of targets and answers where no others are given: as many as there are letters."""
 
 ALIASES = {
     "carpet": "rug",
@@ -75,7 +75,7 @@ HIDDEN = (0.4, 0.2)
 
 @dataclass(frozen=True)
 class EpisodeRules:
-    """What makes a target and a start worth an episode. Lengths in metres, sizes in steradians."""
+    """Rules that a target and a start of an episode satisfy. Lengths in metres, sizes in steradians."""
 
     nearest: float = 0.7
     """Least horizontal distance from the start to the target's centre."""
@@ -110,7 +110,7 @@ class EpisodeRules:
 
 @dataclass(frozen=True)
 class Survey:
-    """What is seen from where in one scene."""
+    """How large each instance looks from each place of one scene."""
 
     points: NDArray[np.float64]
     """float64 [N, 3], on the floor."""
@@ -119,12 +119,12 @@ class Survey:
 
 
 def category_of(instance: Mapping[str, Any]) -> str:
-    """An instance's category in the apartments' words."""
+    """Return an instance's category in the apartments' words."""
     return ALIASES.get(instance["category"], instance["category"])
 
 
 def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
-    """The middle of an instance's bounds, world metres.
+    """Return the middle of an instance's bounds, world metres.
 
     Raises:
         ArgumentError: the scene has no such instance; names `where`.
@@ -145,7 +145,7 @@ def generate(
     first: int = 0,
     before: Iterable[str] = (),
 ) -> list[Episode]:
-    """Episodes `first` to `first + count - 1` of one scene.
+    """Return episodes `first` to `first + count - 1` of one scene.
 
     Categories take turns: those that are rarest among `before`, the targets of the episodes made so far, come first.
     Otherwise the episodes are a function of (scene, seed, `first`).
@@ -156,7 +156,7 @@ def generate(
     key = core.fold_key([seed, first, 0xA12])
     things = _targets(world, categories)
     points = world.ground.put_down(world.navmesh.sample(rules.survey, key)).astype(np.float64)
-    survey = Survey(points, seen(world, points, COARSE))
+    survey = Survey(points, measure_sizes(world, points, COARSE))
     made: list[Episode] = []
     tally = Counter(before)
     for round_ in range(count):
@@ -174,7 +174,7 @@ def generate(
 
 
 def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[str, Any]]]:
-    """Instances by category."""
+    """Return the instances by category."""
     things: dict[str, list[Mapping[str, Any]]] = {}
     for instance in world.scene.instances:
         if category_of(instance) in categories:
@@ -188,7 +188,7 @@ def _targets(world: World, categories: Sequence[str]) -> dict[str, list[Mapping[
 
 
 def _order(things: Mapping[str, Any], tally: Counter[str], key: int) -> list[str]:
-    """Categories of a scene, the rarest so far first, otherwise at random."""
+    """Return the categories of a scene, the rarest so far first, otherwise at random."""
     names = sorted(things)
     draws = dict(zip(names, core.uniform(key, len(names)), strict=True))
     return sorted(names, key=lambda name: (tally[name], draws[name]))
@@ -202,7 +202,7 @@ def _episode(
     rules: EpisodeRules,
     made: Sequence[Episode],
 ) -> Episode | None:
-    """An episode with one of the instances as target, if one has a start that is hard and can be mended.
+    """Return an episode with one of the instances as target, if one has a start that is hard and can be mended.
 
     Never from where the same target is looked at in one of those `made`.
     """
@@ -243,15 +243,15 @@ def _episode(
 def _starts(
     world: World, survey: Survey, instance: int, centre: NDArray[np.float64], key: int, rules: EpisodeRules
 ) -> Iterator[tuple[NDArray[np.float64], float, float]]:
-    """Places from which the target is seen, though perhaps not much of it, with its size and visible share there."""
+    """Yield places from which at least a little of the target is seen, with its size and visible share there."""
     away = np.hypot(*(survey.points - centre)[:, [0, 2]].T)
     near = np.flatnonzero((away >= rules.nearest) & (away <= rules.farthest) & (survey.sizes[:, instance] > 0))
     if not len(near):
         return
     points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
-    sizes = seen(world, points)[:, instance]
+    sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
-    shares = np.minimum(1.0, sizes / np.maximum(alone(world, points, instance), 1e-9))
+    shares = np.minimum(1.0, sizes / np.maximum(measure_unhidden_sizes(world, points, instance), 1e-9))
     # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
     for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
         yield points[i], float(sizes[i]), float(shares[i])
@@ -268,17 +268,18 @@ class _View:
 def _best_view(
     world: World, start: NDArray[np.float64], yaw: float, instance: int, rules: EpisodeRules
 ) -> _View | None:
-    """Where within the budget the target is seen largest, among places where it is seen clearly; of those where it is
-    large enough, the one with the greatest visible share.
+    """Return where within the budget the target is seen largest, among places where it is seen clearly.
+
+    Of those where it is large enough, it is the one with the greatest visible share.
     """
     ends, primitives = _reachable(world, start, yaw, rules.budget)
-    rough = seen(world, ends, COARSE)[:, instance]
+    rough = measure_sizes(world, ends, COARSE)[:, instance]
     largest = np.argsort(-np.minimum(rough, rules.enough), kind="stable")[:6]
     largest = largest[rough[largest] >= rules.large / 2]
     if not len(largest):
         return None
-    sizes = seen(world, ends[largest])[:, instance]
-    shares = sizes / np.maximum(alone(world, ends[largest], instance), 1e-9)
+    sizes = measure_sizes(world, ends[largest])[:, instance]
+    shares = sizes / np.maximum(measure_unhidden_sizes(world, ends[largest], instance), 1e-9)
     fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
     if not len(fit):
         return None
@@ -287,8 +288,8 @@ def _best_view(
     return _View(ends[end], int(primitives[end]), float(sizes[best]), min(1.0, float(shares[best])))
 
 
-def best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRules()) -> NDArray[np.float64]:
-    """Where the target is seen best within the budget: as the episode says, else as measured; float64 [3]."""
+def find_best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRules()) -> NDArray[np.float64]:
+    """Return where the target is seen best within the budget: as the episode says, else as measured; float64 [3]."""
     known = episode.info.get("best_position")
     if known is not None:
         return np.asarray(known, np.float64)
@@ -297,21 +298,23 @@ def best_place(world: World, episode: Episode, rules: EpisodeRules = EpisodeRule
     if best is not None:
         return best.position
     ends, _ = _reachable(world, start, episode.start_yaw, rules.budget)
-    return np.asarray(ends[seen(world, ends, COARSE)[:, target].argmax()], np.float64)
+    return np.asarray(ends[measure_sizes(world, ends, COARSE)[:, target].argmax()], np.float64)
 
 
-def clarity(world: World, place: NDArray[np.float64], instance: int, rules: EpisodeRules = EpisodeRules()) -> float:
-    """How well an instance is seen from a place, 0 to 1: its visible share, times its size up to `rules.enough`."""
+def measure_clarity(
+    world: World, place: NDArray[np.float64], instance: int, rules: EpisodeRules = EpisodeRules()
+) -> float:
+    """Return how well an instance is seen, 0 to 1: its visible share, times its size up to `rules.enough`."""
     points = np.asarray(place, np.float64)[None]
-    size = float(seen(world, points)[0, instance])
-    whole = float(alone(world, points, instance)[0]) if size else 0.0
+    size = float(measure_sizes(world, points)[0, instance])
+    whole = float(measure_unhidden_sizes(world, points, instance)[0]) if size else 0.0
     return min(1.0, size / whole) * min(1.0, size / rules.enough) if whole else 0.0
 
 
 def _reachable(
     world: World, start: NDArray[np.float64], yaw: float, budget: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Places that a turn and then some steps lead to, every other step of each way, and the primitives to get there."""
+    """Return every other place that a turn and then steps lead to, and the primitives to get there."""
     step = ActionSpace().forward_m
     found, spent = [start], [0]
     half = round(np.pi / ActionSpace().turn_rad)
@@ -337,8 +340,10 @@ def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
 def load(
     path: str | Path, scenes: str | Path = "", categories: Sequence[str] | None = None
 ) -> tuple[list[Episode], tuple[str, ...]]:
-    """Episodes of a file and what their answers are chosen from: `categories`, else what the file's header names, else
-    the built-in list where it holds all targets, else the targets' own categories.
+    """Return the episodes of a file and the labels that their answers are chosen from.
+
+    These are `categories`, else what the file's header names, else the built-in list where it holds all targets, else
+    the targets' own categories.
 
     Raises:
         FileError: see `wiw.datasets.episodes.load`; a target or category is missing or not among the choices. Names

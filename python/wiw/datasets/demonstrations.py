@@ -13,7 +13,6 @@ import json
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
@@ -22,74 +21,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration
 from wiw.datasets.shards import Shard, require_pyarrow
 from wiw.errors import ArgumentError, FileError
 
 MANIFEST = "manifest.json"
 SHARD = 10
 """Demonstrations a file."""
-DEPTH_UNITS = 5000
-"""A metre."""
 QUALITY = 95
 """Of JPEG, whose colours are as fine as its brightness."""
 
 Format = Literal["jpeg", "png"]
-
-
-@dataclass(frozen=True)
-class Demonstration:
-    """How an expert did what it was told, in T frames evenly spread over time; frame 0 is before anything was done.
-
-    Pictures are decoded when they are first asked for.
-    """
-
-    task: str
-    variation: int
-    seed: int
-    episode: int
-    """Its number within the task."""
-    instruction: str
-    success: bool
-    places: Mapping[str, NDArray[np.float64]]
-    """T_world_object [4, 4] in frame 0, by name."""
-    seconds: NDArray[np.float64]
-    """float64 [T], of the physics."""
-    poses: NDArray[np.float64]
-    """float64 [T, 7]: where the gripper is."""
-    actions: NDArray[np.float64]
-    """float64 [T, 7]: the pose that it is told to go to."""
-    keys: NDArray[np.int32]
-    """int32 [T]: number of the action under way, from 1; 0 in frame 0."""
-    ended: NDArray[np.bool_]
-    """bool [T]: whether the action ends in this frame."""
-    encoded_images: tuple[bytes, ...]
-    """T front views, JPEG or PNG."""
-    encoded_depths: tuple[bytes, ...] | None = None
-    """T depths of the front view, 16-bit PNG."""
-
-    def __len__(self) -> int:
-        return len(self.seconds)
-
-    @cached_property
-    def images(self) -> NDArray[np.uint8]:
-        """uint8 [T, H, W, 3]: the front views.
-
-        Raises:
-            FileError: one of them is damaged.
-        """
-        return _decoded(self.encoded_images, cv2.IMREAD_COLOR)[..., ::-1]
-
-    @cached_property
-    def depths(self) -> NDArray[np.float32] | None:
-        """float32 [T, H, W]: their planar depths in metres, 0 where nothing is hit; None where none were collected.
-
-        Raises:
-            FileError: one of them is damaged.
-        """
-        if self.encoded_depths is None:
-            return None
-        units = _decoded(self.encoded_depths, cv2.IMREAD_UNCHANGED)
-        return units.astype(np.float32) / np.float32(DEPTH_UNITS)
 
 
 @dataclass(frozen=True)
@@ -120,7 +62,7 @@ class Demonstrations(Sequence[Demonstration]):
         require_pyarrow()
         self.folder = Path(folder)
         self.config = read_manifest(self.folder)
-        """What was asked for when it was collected."""
+        """Options of the collection."""
         paths = [path for task in self._asked(tasks) for path in shard_paths(self.folder, self.config, task)]
         self._shards = [Shard(path) for path in paths if not partial or path.exists()]
         self._ends = list(accumulate(len(shard) for shard in self._shards))
@@ -214,17 +156,3 @@ def encoded_depth(depth: NDArray[np.float32]) -> bytes:
     """Metres as a 16-bit PNG; what is further away than 13 m is as far."""
     units = np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     return bytes(cv2.imencode(".png", units)[1])
-
-
-def _decoded(pictures: Sequence[bytes], how: int) -> NDArray[Any]:
-    """[T, H, W, ...]; what is damaged is no picture, or one of another size."""
-    try:
-        images = [cv2.imdecode(np.frombuffer(data, np.uint8), how) if data else None for data in pictures]
-        whole = [image for image in images if image is not None]
-        if len(whole) < len(images):
-            raise ValueError("no picture")
-        return np.stack(whole)
-    except (ValueError, cv2.error) as error:
-        raise FileError(
-            f"a picture of a demonstration is damaged ({error}); delete its file, then `wiw collect` makes it anew"
-        ) from error

@@ -25,7 +25,7 @@ MOST_BYTES = 256 << 20
 
 
 def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any) -> None:
-    """Writes an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header."""
+    """Write an episode file, gzipped if its name ends in .gz; `about` (generator, seed, ...) goes into its header."""
     folder = Path(path).absolute().parent
     items = [_item(episode, folder) for episode in episodes]
     body = {"format": "wiw-episodes", "version": VERSION, "task": task, **about, "episodes": items}
@@ -34,7 +34,7 @@ def save(path: str | Path, episodes: Sequence[Episode], task: str, **about: Any)
 
 
 def _item(episode: Episode, folder: Path) -> dict[str, Any]:
-    """An episode as JSON; the scene's path relative to the file's folder where it lies in there."""
+    """Return an episode as JSON; the scene's path relative to the file's folder where it lies in there."""
     scene = Path(episode.scene)
     name = str(scene.relative_to(folder)) if scene.is_relative_to(folder) else episode.scene
     geodesic = episode.geodesic if math.isfinite(episode.geodesic) else None
@@ -42,7 +42,7 @@ def _item(episode: Episode, folder: Path) -> dict[str, Any]:
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
-    """Reads an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
+    """Read an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
 
     `scenes` is the folder that scene paths are relative to; if not given, the folder of a file that `save` wrote, and
     the present one for the other formats. Lengths that a file does not give are NaN until the task has measured them.
@@ -89,7 +89,7 @@ def _own(body: Mapping[str, Any], path: str | Path) -> list[Episode]:
 
 
 def read_json(path: str | Path) -> Any:
-    """The parsed file, gunzipped when its name ends in .gz.
+    """Return the parsed file, gunzipped when its name ends in .gz.
 
     Raises:
         FileError: it cannot be read or parsed, or is larger than `MOST_BYTES` once unpacked; names file and cause.

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+from collections import Counter
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +16,12 @@ from wiw.errors import ArgumentError
 from wiw.types import Episode
 
 CAMERA_HEIGHT = 1.0
+_log = logging.getLogger("wiw.datasets")
 
 
 @dataclass(frozen=True)
 class EpisodeRules:
-    """What makes a start and a goal worth an episode. Lengths in metres."""
+    """Rules that a start and a goal of an episode satisfy. Lengths in metres."""
 
     shortest: float = 2.0
     """Least geodesic distance."""
@@ -28,7 +31,8 @@ class EpisodeRules:
     goal_depth: float = 1.2
     """Least median depth of the goal view, so that it shows more than a wall."""
     goal_instances: int = 4
-    """Least number of things in the goal view."""
+    """Least number of things in the goal view, the outside counted. In a scene of fewer, such as a scan that is one
+    mesh, nothing is asked of their number."""
     attempts: int = 400
     """Pairs tried per episode before giving up."""
 
@@ -36,28 +40,47 @@ class EpisodeRules:
 def generate(
     world: World, count: int, seed: int, rules: EpisodeRules = EpisodeRules(), *, first: int = 0
 ) -> list[Episode]:
-    """Episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
+    """Return episodes `first` to `first + count - 1` of one scene, each a function of (scene, seed, its number) alone.
 
     Raises:
-        ArgumentError: the scene has too few pairs of places that satisfy `rules`.
+        ArgumentError: the scene has too few pairs of places that satisfy `rules`; says which rules they broke.
     """
+    rules = _fit_rules(world, rules)
     return [_episode(world, index, seed, rules) for index in range(first, first + count)]
+
+
+def _fit_rules(world: World, rules: EpisodeRules) -> EpisodeRules:
+    """Return the rules, less the number of things in view where the whole scene has fewer."""
+    instances = len(world.scene.instances)
+    if rules.goal_instances <= instances + 1:
+        return rules
+    _log.info(
+        "%s has %d instances: goal views are not asked for %d things", world.name, instances, rules.goal_instances
+    )
+    return replace(rules, goal_instances=0)
 
 
 def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episode:
     key = core.fold_key([seed, index, 0x1A6E])
     points = world.ground.put_down(world.navmesh.sample(2 * rules.attempts, key))
     draws = core.uniform(core.fold_key([key, 1]), 5 * rules.attempts).reshape(-1, 5)
+    broken: Counter[str] = Counter()
     for start, goal, draw in zip(points[::2], points[1::2], draws, strict=True):
         geodesic = float(world.navmesh.geodesic_distance(start, goal))
         if not rules.shortest <= geodesic <= rules.longest:
+            broken["shortest, longest"] += 1
             continue
         start_yaw = float(2 * np.pi * draw[0])
         ideal = ideal_primitives(np.asarray(world.navmesh.shortest_path(start, goal)), start_yaw)
-        if ideal > rules.budget or in_sight(world, start, goal):
+        if ideal > rules.budget:
+            broken["budget"] += 1
+            continue
+        if in_sight(world, start, goal):
+            broken["the goal in sight of the start"] += 1
             continue
         goal_yaw = _best_view(world, goal, 2 * np.pi * draw[1:], rules)
         if goal_yaw is None:
+            broken["goal_depth, goal_instances"] += 1
             continue
         return Episode(
             episode_id=f"{index:04d}",
@@ -69,13 +92,15 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
             geodesic=geodesic,
             info={"ideal_primitives": ideal},
         )
+    reasons = ", ".join(f"{count} broke {rule}" for rule, count in broken.most_common())
     raise ArgumentError(
-        f"{world.name}: no start and goal satisfy {rules} in {rules.attempts} attempts; loosen the rules"
+        f"{world.name}: no start and goal among {rules.attempts} satisfy {rules}: {reasons}. Loosen one "
+        "(--task-option goal_depth=0.8, or goal_depth=0.8 in Python), or raise attempts"
     )
 
 
 def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, turn: float = np.pi / 8) -> int:
-    """Primitives of a shortest path [N, 3] from heading `yaw`: its turns in whole steps, its length in strides."""
+    """Return the primitives of a path [N, 3] from heading `yaw`: its turns in whole steps, its length in strides."""
     legs = np.diff(path[:, [0, 2]], axis=0)
     legs = legs[np.linalg.norm(legs, axis=1) > 1e-6]
     headings = np.arctan2(-legs[:, 0], -legs[:, 1])
@@ -85,7 +110,7 @@ def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, t
 
 
 def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
-    """Whether the goal camera's place can be seen from the start camera's, by the depth along the ray between them."""
+    """Return whether the goal camera's place is seen from the start camera's, by the depth along the ray between."""
     eye, place = (np.add(p, [0.0, CAMERA_HEIGHT, 0.0]) for p in (start, goal))
     way = place - eye
     pose = camera_pose(start, float(np.arctan2(-way[0], -way[2])))
@@ -97,7 +122,7 @@ def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64]
 
 
 def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMERA_HEIGHT) -> NDArray[np.float64]:
-    """float64 [4, 4]: T_world_camera of an agent at `position` on the floor, heading `yaw` radians."""
+    """Return T_world_camera [4, 4] of an agent at `position` on the floor, heading `yaw` radians."""
     pose = np.eye(4)
     pose[0, 0] = pose[2, 2] = np.cos(yaw)
     pose[0, 2], pose[2, 0] = np.sin(yaw), -np.sin(yaw)
@@ -106,7 +131,7 @@ def camera_pose(position: NDArray[np.float64], yaw: float, height: float = CAMER
 
 
 def _best_view(world: World, goal: NDArray[np.float64], yaws: NDArray[np.float64], rules: EpisodeRules) -> float | None:
-    """The heading whose view reaches deepest, if any view is worth looking at."""
+    """Return the heading whose view reaches deepest, if any view is worth looking at."""
     poses = np.stack([camera_pose(goal, float(yaw)) for yaw in yaws])
     views = world.renderer.perspective(poses, (60, 60), 90.0, outputs=("depth", "instance"))
     depths = np.median(views["depth"].reshape(len(yaws), -1), axis=1)

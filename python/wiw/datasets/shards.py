@@ -6,15 +6,13 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from wiw.datasets.demonstration import Demonstration
 from wiw.errors import DependencyError, FileError
 from wiw.files import whole_file
-
-if TYPE_CHECKING:
-    from wiw.datasets.demonstrations import Demonstration
 
 FORMAT = 1
 KEY = b"wiw"
@@ -197,8 +195,6 @@ def _table(demonstration: Demonstration, schema: Any) -> Any:
 
 
 def _demonstration(rows: Mapping[str, list[Any]]) -> Demonstration:
-    from wiw.datasets.demonstrations import Demonstration
-
     depths = rows.get("depth")
     return Demonstration(
         task=rows["task"][0],

@@ -22,28 +22,28 @@ LIFT = 100.0
 """Metres above the scene where an instance is looked at alone."""
 
 
-def seen(world: World, points: NDArray[np.float64], size: Size = SIZE) -> NDArray[np.float64]:
-    """Steradians that each instance fills, seen from N places on the floor: float64 [N, instances + 1], column = id."""
+def measure_sizes(world: World, points: NDArray[np.float64], size: Size = SIZE) -> NDArray[np.float64]:
+    """Return the steradians that each instance fills from N places on the floor: float64 [N, 1 + instances] by id."""
     counted = np.zeros((len(points), len(world.scene.instances) + 1))
     for row, ids in enumerate(_panoramas(world, points, size)):
         counted[row] = np.bincount(ids.ravel(), _weights(size).ravel(), counted.shape[1])
     return counted
 
 
-def alone(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
-    """Steradians that an instance would fill if nothing else were there, from N places: float64 [N]."""
+def measure_unhidden_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
+    """Return the steradians that an instance would fill if nothing else were there, from N places: float64 [N]."""
     if not len(points):
         return np.zeros(0)
-    with _lifted(world, instance):
+    with _lift(world, instance):
         ids = _panoramas(world, np.add(points, [0.0, LIFT, 0.0]), SIZE)
     return ((ids == instance) * _weights(SIZE)).sum(axis=(1, 2))
 
 
 def visible_share(world: World, point: NDArray[np.float64], instance: int) -> float:
-    """Which part of what an instance would show if it were alone is seen from a place, 0 to 1."""
+    """Return how much of an instance is seen from a place, 0 to 1 of what it would show if it were alone."""
     places = np.asarray(point, np.float64)[None]
-    whole = float(alone(world, places, instance)[0])
-    return min(1.0, float(seen(world, places)[0, instance]) / whole) if whole else 0.0
+    whole = float(measure_unhidden_sizes(world, places, instance)[0])
+    return min(1.0, float(measure_sizes(world, places)[0, instance]) / whole) if whole else 0.0
 
 
 def _panoramas(world: World, points: NDArray[np.float64], size: Size) -> NDArray[np.uint32]:
@@ -52,14 +52,14 @@ def _panoramas(world: World, points: NDArray[np.float64], size: Size) -> NDArray
 
 
 def _weights(size: Size) -> NDArray[np.float64]:
-    """float64 [H, W]: steradians of each pixel."""
+    """Return the steradians of each pixel, float64 [H, W]."""
     edges = np.sin(np.linspace(np.pi / 2, -np.pi / 2, size[0] + 1))
     return np.repeat(-np.diff(edges)[:, None] * 2 * np.pi / size[1], size[1], axis=1)
 
 
 @contextmanager
-def _lifted(world: World, instance: int) -> Iterator[None]:
-    """The instance high above the scene, where nothing hides it."""
+def _lift(world: World, instance: int) -> Iterator[None]:
+    """Hold the instance high above the scene, where nothing hides it."""
     home = np.asarray(world.scene.instances[instance - 1]["T_world_instance"], np.float64)
     away = home.copy()
     away[1, 3] += LIFT

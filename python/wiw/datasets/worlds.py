@@ -30,20 +30,22 @@ class World:
     navmesh: NavMesh
     ground: Ground
     """Heights of the floor; the mesh lies up to 0.2 m above it."""
+    backend: Literal["auto", "cpu", "gpu"] = "auto"
+    """As the renderer was asked for."""
 
 
 _worlds: OrderedDict[tuple[str, str, Path | None], World] = OrderedDict()
 
 
 def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
-    """The world of a scene spec that names one scene, from memory where possible; the oldest unused is dropped."""
+    """Return the world of a single scene's spec, from memory where possible; the oldest unused is dropped."""
     path = navmesh_file(scene)
     key = (scene, backend, path)
     if key in _worlds:
         _worlds.move_to_end(key)
         return _worlds[key]
     loaded = open_scene(scene)
-    made = World(scene, loaded, Renderer(loaded, backend=backend), _navmesh(path, loaded), Ground(loaded))
+    made = World(scene, loaded, Renderer(loaded, backend=backend), _navmesh(path, loaded), Ground(loaded), backend)
     _worlds[key] = made
     while len(_worlds) > CAPACITY:
         _worlds.popitem(last=False)
@@ -51,7 +53,7 @@ def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
 
 
 def navmesh_file(scene: str) -> Path | None:
-    """Habitat's navigation mesh beside a scene's file, "house.navmesh" for "house.glb"; None where there is none."""
+    """Return Habitat's navigation mesh beside a scene's file, "house.navmesh" for "house.glb", if there is one."""
     if is_generated(scene):
         return None
     path = Path(scene).expanduser().with_suffix(".navmesh")
@@ -59,7 +61,7 @@ def navmesh_file(scene: str) -> Path | None:
 
 
 def _navmesh(path: Path | None, scene: Scene) -> NavMesh:
-    """The mesh that came with the scene, else one built from it.
+    """Return the mesh that came with the scene, else one built from it.
 
     Raises:
         FileError: the file is damaged, or its mesh is not where the scene is.

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from functools import cache
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -13,81 +13,20 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from wiw.action import PoseGrid
+from wiw.envs.base import Env, Segment, read_episode_option
+from wiw.envs.manipulation_spec import ManipulationSpec
 from wiw.envs.sensors import Sensors
 from wiw.envs.table_guide import TableGuide
 from wiw.errors import ArgumentError
-from wiw.tabletop.robot import Robot
+from wiw.tabletop.table import Table
 from wiw.tabletop.workbench import Pose, Workbench
-from wiw.types import ArmObservation, Episode, Goal, Key, Truth
+from wiw.types import Answer, ArmObservation, Episode, Goal, Key, Truth
 
 LEAST, MOST = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7.0] * 3 + [1.0])
 """Poses between these are in the action space; none beyond can be reached."""
 
 
-class Table(Protocol):
-    """One episode's table, as a task has set it."""
-
-    @property
-    def bench(self) -> Workbench:
-        """The arm and the things."""
-
-    @property
-    def goal(self) -> Goal:
-        """What the agent is asked to do."""
-
-    @property
-    def objects(self) -> Sequence[str]:
-        """Names of what agents are told the place of."""
-
-    def succeeded(self) -> bool:
-        """Whether what is asked for is done."""
-
-
-class ManipulationTask(Protocol):
-    """What the environment asks of a task."""
-
-    @property
-    def seed(self) -> int:
-        """Of the run."""
-
-    @property
-    def actions(self) -> int:
-        """K: poses an episode may take."""
-
-    @property
-    def robot(self) -> Robot:
-        """The arm."""
-
-    def episode(self, index: int) -> Episode:
-        """An episode by its number."""
-
-    def table(self, episode: Episode) -> Any:
-        """An episode's `Table`, as it begins."""
-
-    def progress(self, table: Any, bench: Workbench) -> float:
-        """How good it would be if a table stood as a fork of it does, the higher the better."""
-
-    def expert(self, table: Any, bench: Workbench) -> NDArray[np.float64]:
-        """float64 [K, 7]: what is left to do for who knows what is asked; nothing where nothing helps."""
-
-
-@dataclass(frozen=True)
-class Segment:
-    """What carrying out several poses came to."""
-
-    observation: ArmObservation
-    executed: NDArray[np.float64]
-    path: NDArray[np.float64]
-    """float64 [n + 1, 3]: places of the gripper."""
-    terminated: bool
-    truncated: bool
-    key: Key
-    """Of the next decision."""
-    refused: tuple[str, ...] = ()
-    """Why ways were not gone to their ends, one an action that was not."""
-
-
-class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
+class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
     """An arm at a table that is told in words what to do.
 
     Actions are absolute poses float64 [7] of the gripper: x, y, z in metres, roll, pitch, yaw, and how open it is. A
@@ -111,11 +50,11 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         ArgumentError: no such camera, or a size below 1.
     """
 
-    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 - gymnasium's name and type
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012 - gymnasium's name and type
 
     def __init__(
         self,
-        task: ManipulationTask,
+        task: ManipulationSpec,
         depth: bool = False,
         *,
         size: int = 480,
@@ -129,7 +68,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         self.grid = PoseGrid() if grid else None
         self.render_mode = "rgb_array"
         self.action_space = action_space(self.grid)
-        self.observation_space = self.sensors.space()
+        self.observation_space = observation_space(self.sensors)
         self._table: Table | None = None
         self._observation: ArmObservation | None = None
         self._front: dict[str, NDArray[Any]] = {}
@@ -142,9 +81,13 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random."""
+        """Start an episode: `options={"episode": 3}`, or the next one; `seed` draws one at random.
+
+        Raises:
+            ArgumentError: an unknown option, or a negative number of an episode.
+        """
         super().reset(seed=seed)
-        index = (options or {}).get("episode")
+        index = read_episode_option(options)
         if index is None:
             index = int(self.np_random.integers(1000)) if seed is not None else self._next
         self.begin(self.task.episode(int(index)))
@@ -153,7 +96,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return self._sensed(), info
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Goes to one pose, which is a decision of its own.
+        """Go to one pose, which is a decision of its own.
 
         Raises:
             ArgumentError: no finite pose [7] with a gripper from 0 to 1, nor, with `grid`, whole numbers [7]; nothing
@@ -167,31 +110,31 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return self._sensed(), float(segment.terminated), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
-        """The front view."""
+        """Return the front view."""
         return self.observation.front
 
     # -- the loop ------------------------------------------------------------------------------------------------------
 
     def begin(self, episode: Episode) -> ArmObservation:
-        """Starts a given episode and observes."""
-        self._table = self.task.table(episode)
+        """Start a given episode and observe."""
+        self._table = self.task.set_table(episode)
         self._taken = self._decisions = 0
         self._refused = []
         return self._observe()
 
-    def run(self, plan: ArrayLike) -> Segment:
-        """Carries out one decision's poses [K, 7], as far as the episode goes on; observes once, at the end.
+    def run(self, plan: ArrayLike, answer: Answer | None = None) -> Segment:
+        """Carry out one decision's poses [K, 7], as far as the episode goes on; observe once, at the end.
 
         Raises:
-            ArgumentError: as `checked`; nothing has moved then.
+            ArgumentError: as `check_poses`; nothing has moved then.
         """
-        table, poses, executed, refused = self.table, checked(plan), [], []
+        table, poses, executed, refused = self.table, check_poses(plan), [], []
         path = [table.bench.pose[:3]]
         for pose in poses[: self.task.actions - self._taken]:
-            move = table.bench.go(pose)
+            move = table.bench.move_to(pose)
             executed.append(pose)
             path.append(table.bench.pose[:3])
-            refused += [] if move.why == "free" else [move.why]
+            refused += [] if move.reason == "free" else [move.reason]
             if table.succeeded():
                 break
         self._decisions += 1
@@ -205,12 +148,12 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
 
     @property
     def goal(self) -> Goal:
-        """What the agent is asked to do."""
+        """The goal of the running episode."""
         return self.table.goal
 
     @property
     def observation(self) -> ArmObservation:
-        """What the agent perceives now."""
+        """The agent's present view."""
         self._require_episode()
         assert self._observation is not None
         return self._observation
@@ -223,20 +166,20 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         return self._table
 
     def fork(self) -> Workbench:
-        """The physics as they stand, to be run ahead by the oracle; this environment does not move."""
+        """Return a copy of the physics, which the oracle runs ahead; this environment does not move."""
         return self.table.bench.fork()
 
     def guide(self) -> TableGuide:
-        """The truth about plans from here, for stages of the loop that an experiment tells it."""
+        """Return the truth about plans from here, for stages of the loop that an experiment tells it."""
         return TableGuide(self.task, self.table, self.fork())
 
     def truth(self) -> Truth:
-        """Where the gripper is, for records and reports alone; no distance leads to what is asked for."""
+        """Return where the gripper is, for records and reports alone; no distance leads to what is asked for."""
         return Truth(self.table.bench.pose[:3], 0.0, float("nan"), float("nan"))
 
     def result(self) -> dict[str, float]:
-        """Metrics of the running episode: success (0 or 1), `actions` (decisions, as the paper counts), poses gone to,
-        and ways refused.
+        """Return the metrics of the running episode: success (0 or 1), `actions` (decisions, as the paper counts),
+        poses gone to, and ways refused.
         """
         return {
             "success": float(self.table.succeeded()),
@@ -251,7 +194,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
         bench = self.table.bench
         self._front = self.sensors.pictures(bench)
         depth = self._front["depth"] if self.sensors.depth else None
-        places: dict[str, Pose] = bench.places(self.table.objects)
+        places: dict[str, Pose] = bench.get_poses(self.table.objects)
         self._observation = ArmObservation(self._front["color"], bench.pose, depth, places)
         return self._observation
 
@@ -264,15 +207,21 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]]):
             raise ArgumentError("the environment has no episode yet; call reset() first")
 
 
+@cache
+def observation_space(sensors: Sensors) -> spaces.Dict:
+    """Return what an environment with these sensors shows; shared by all of them, as its bounds are large."""
+    return sensors.space()
+
+
 def action_space(grid: PoseGrid | None) -> spaces.Space[Any]:
-    """Poses, or whole numbers that a grid reads."""
+    """Return poses, or whole numbers that a grid reads."""
     if grid is None:
         return spaces.Box(LEAST, MOST, dtype=np.float64)
     return spaces.MultiDiscrete([grid.bins] * 3 + [grid.turns] * 3 + [2])
 
 
-def checked(plan: ArrayLike) -> NDArray[np.float64]:
-    """A plan as poses float64 [K, 7].
+def check_poses(plan: ArrayLike) -> NDArray[np.float64]:
+    """Return a plan as poses float64 [K, 7].
 
     Raises:
         ArgumentError: another shape, a value that is not finite, or a gripper outside [0, 1].

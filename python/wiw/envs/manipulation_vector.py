@@ -14,7 +14,9 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import ArrayLike, NDArray
 
 from wiw._core import core
-from wiw.envs.manipulation import ManipulationEnv, ManipulationTask, checked
+from wiw.envs.base import read_episode_option
+from wiw.envs.manipulation import ManipulationEnv, check_poses
+from wiw.envs.manipulation_spec import ManipulationSpec
 from wiw.errors import ArgumentError
 from wiw.types import Goal
 
@@ -40,7 +42,7 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[A
 
     metadata = {"render_modes": ["rgb_array"], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
-    def __init__(self, task: ManipulationTask, num_envs: int, depth: bool = False, **sensors: Any) -> None:
+    def __init__(self, task: ManipulationSpec, num_envs: int, depth: bool = False, **sensors: Any) -> None:
         if num_envs < 1:
             raise ArgumentError(f"ManipulationVectorEnv: expected num_envs of at least 1, got {num_envs}")
         self.task, self.num_envs, self.render_mode = task, num_envs, "rgb_array"
@@ -58,23 +60,23 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[A
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random."""
+        """Start N episodes: `options={"episode": [3, 5]}`, or the next ones; `seed` draws a first one at random."""
         super().reset(seed=seed)
-        indices = (options or {}).get("episode")
+        indices = read_episode_option(options)
         if indices is None:
             first = int(self.np_random.integers(1000)) if seed is not None else self._next
             indices = range(first, first + self.num_envs)
         if len(indices) != self.num_envs:
             raise ArgumentError(f"reset: expected {self.num_envs} episodes, got {len(indices)}")
-        begun = self._each(lambda place: self._begun(place, int(indices[place])))
+        begun = self._each(lambda place: self._begin(place, int(indices[place])))
         self._over[:] = False
         self._next = max(map(int, indices)) + 1
-        return self._batched([observation for observation, *_ in begun]), self._told([info for *_, info in begun])
+        return self._stack([observation for observation, *_ in begun]), self._merge_infos([info for *_, info in begun])
 
     def step(
         self, actions: ArrayLike
     ) -> tuple[dict[str, Any], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Goes to one pose each, [N, 7].
+        """Go to one pose each, [N, 7].
 
         Raises:
             ArgumentError: another shape, or an action that `ManipulationEnv.step` refuses where an episode is running;
@@ -85,45 +87,45 @@ class ManipulationVectorEnv(gymnasium.vector.VectorEnv[dict[str, Any], NDArray[A
             raise ArgumentError(f"step: expected actions [{self.num_envs}, 7], got {list(given.shape)}")
         running = given[~self._over]
         if len(running):
-            checked(running if self.envs[0].grid is None else self.envs[0].grid.decode(running))
+            check_poses(running if self.envs[0].grid is None else self.envs[0].grid.decode(running))
         fresh = {int(place): self._next + count for count, place in enumerate(np.flatnonzero(self._over))}
         self._next += len(fresh)
         moved = self._each(
-            lambda place: self._begun(place, fresh[place]) if place in fresh else self.envs[place].step(given[place])
+            lambda place: self._begin(place, fresh[place]) if place in fresh else self.envs[place].step(given[place])
         )
         observations, rewards, done, over, infos = zip(*moved, strict=True)
         terminated, truncated = np.array(done, bool), np.array(over, bool)
         self._over = terminated | truncated
-        return self._batched(observations), np.array(rewards), terminated, truncated, self._told(infos)
+        return self._stack(observations), np.array(rewards), terminated, truncated, self._merge_infos(infos)
 
     def render(self) -> tuple[NDArray[np.uint8], ...]:
-        """The front views."""
+        """Return the front views."""
         return tuple(env.render() for env in self.envs)
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Ends the threads."""
+        """End the threads."""
         self._threads.shutdown()
 
     @property
     def goals(self) -> tuple[Goal, ...]:
-        """What each agent is asked to do."""
+        """The goal of each agent."""
         return tuple(env.goal for env in self.envs)
 
     # ------------------------------------------------------------------------------------------------------------------
 
     def _each(self, work: Callable[[int], Moved]) -> list[Moved]:
-        """Does something at every place at once."""
+        """Do something at every place at once."""
         return list(self._threads.map(work, range(self.num_envs)))
 
-    def _begun(self, place: int, index: int) -> Moved:
+    def _begin(self, place: int, index: int) -> Moved:
         observation, info = self.envs[place].reset(options={"episode": index})
         return observation, 0.0, False, False, info
 
-    def _batched(self, observations: Any) -> dict[str, Any]:
+    def _stack(self, observations: Any) -> dict[str, Any]:
         return {name: np.stack([each[name] for each in observations]) for name in observations[0]}
 
-    def _told(self, infos: Any) -> dict[str, Any]:
-        told: dict[str, Any] = {}
+    def _merge_infos(self, infos: Any) -> dict[str, Any]:
+        merged: dict[str, Any] = {}
         for place, info in enumerate(infos):
-            told = self._add_info(told, info, place)
-        return told
+            merged = self._add_info(merged, info, place)
+        return merged

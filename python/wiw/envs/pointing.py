@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.perception.boxes import Mask, box_of, largest_part, scaled
+from wiw.perception.boxes import Mask, find_box, keep_largest_part, scale_box
 from wiw.types import Box, Target
 
 IDS = ["panorama_ids", "front_ids"]
@@ -28,20 +28,22 @@ class Pointing:
     """Whether the episode goes on where neither panorama nor front view shows the target."""
 
     def target(self, panorama_ids: NDArray[np.uint32], front_ids: NDArray[np.uint32], instance: int) -> Target:
-        """The instance as the agent is shown it."""
+        """Return the instance as the agent is shown it."""
         mask = panorama_ids == instance
         return Target(mask, self._box(mask, wraps=True), self._box(front_ids == instance, wraps=False))
 
     def split(self, images: dict[str, Any], instance: int) -> dict[str, Any]:
-        """What the simulator showed, with the ids made into `target`."""
+        """Return the simulator's images, with the ids made into `target`."""
         ids = [images[name] for name in IDS]
         plain = {name: image for name, image in images.items() if name not in IDS}
         return {**plain, "target": self.target(ids[0], ids[1], instance)}
 
     def ends(self, target: Target | None) -> bool:
-        """Whether the episode is over for want of a target."""
+        """Return whether the episode is over for want of a target."""
         return self.lost == "stop" and target is not None and target.panorama_box is None and target.front_box is None
 
     def _box(self, mask: Mask, wraps: bool) -> Box | None:
-        box = box_of(largest_part(mask, wraps) if self.part == "largest" and mask.any() else mask, wraps)
-        return box if box is None or self.scale == 1 else scaled(box, self.scale, (mask.shape[0], mask.shape[1]), wraps)
+        box = find_box(keep_largest_part(mask, wraps) if self.part == "largest" and mask.any() else mask, wraps)
+        return (
+            box if box is None or self.scale == 1 else scale_box(box, self.scale, (mask.shape[0], mask.shape[1]), wraps)
+        )

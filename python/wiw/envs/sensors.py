@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a manipulator can be given to see and feel, as gymnasium knows it."""
+"""Sensors of a manipulator: cameras and joints, as gymnasium knows them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.render import Output
-from wiw.tabletop.cloud import points_of
+from wiw.tabletop.cloud import unproject_depth
 from wiw.tabletop.workbench import CAMERAS, Workbench
 
 ROOM, ARM = 0, 255
@@ -51,12 +51,12 @@ class Sensors:
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """What is drawn for each camera."""
+        """Images that each camera draws."""
         depth: tuple[Output, ...] = ("depth",) if self.depth or self.cloud else ()
         return ("color", *depth, *(("instance",) if self.ids else ()))
 
     def space(self) -> spaces.Dict:
-        """Of observations."""
+        """Return the space of observations."""
         shape = (self.size, self.size)
         count = len(self.names) * self.size**2
         seen: dict[str, spaces.Space[Any]] = {
@@ -76,13 +76,13 @@ class Sensors:
         return spaces.Dict(seen)
 
     def pictures(self, bench: Workbench, camera: str = "front") -> dict[str, NDArray[Any]]:
-        """What one camera gives: those of "color", "depth" and "instance" that are asked for."""
-        return bench.picture(camera, (self.size, self.size), self.outputs)
+        """Return the images of one camera: those of "color", "depth" and "instance" that are asked for."""
+        return bench.render_view(camera, (self.size, self.size), self.outputs)
 
     def read(
         self, bench: Workbench, objects: Sequence[str], front: dict[str, NDArray[Any]] | None = None
     ) -> dict[str, Any]:
-        """An observation in `space`.
+        """Return an observation in `space`.
 
         Args:
             bench: what is looked at.
@@ -92,7 +92,11 @@ class Sensors:
         drawn = {name: self.pictures(bench, name) for name in self.names if front is None or name != "front"}
         if front is not None:
             drawn = {"front": front, **drawn}
-        values: dict[str, Any] = {"pose": bench.pose, "joints": bench.joints, "held": np.int64(bench.held is not None)}
+        values: dict[str, Any] = {
+            "pose": bench.pose,
+            "joints": bench.joints,
+            "held": np.int64(bench.held_object is not None),
+        }
         for name, images in drawn.items():
             values[name] = images["color"]
             if self.depth:
@@ -101,7 +105,7 @@ class Sensors:
                 values[_key(name, "ids")] = _numbers(bench, objects)[images["instance"]]
         if self.cloud:
             clouds = [
-                points_of(images["depth"], CAMERAS[name].hfov_deg, bench.camera_pose(name)).reshape(-1, 3)
+                unproject_depth(images["depth"], CAMERAS[name].hfov_deg, bench.get_camera_pose(name)).reshape(-1, 3)
                 for name, images in drawn.items()
             ]
             values["points"] = np.concatenate(clouds)
@@ -116,4 +120,4 @@ def _key(camera: str, what: str) -> str:
 def _numbers(bench: Workbench, objects: Sequence[str]) -> NDArray[np.uint8]:
     """By instance id, the number that observations have for it."""
     known = {"arm": ARM, **{name: number for number, name in enumerate(objects, start=1)}}
-    return np.array([ROOM, *(known.get(name, ROOM) for name in bench.names)], np.uint8)
+    return np.array([ROOM, *(known.get(name, ROOM) for name in bench.instance_names)], np.uint8)

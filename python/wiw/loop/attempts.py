@@ -20,7 +20,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from contextvars import copy_context
 from functools import partial
@@ -30,19 +30,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
+from wiw.loop.limits import DEADLINE
 from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel, checked_rollout, patience
+from wiw.world_models.base import Accepts, WorldModel, check_rollout, patience
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
 """Seconds before the second and the third try; a server that restarts may be back by then."""
-DEADLINE = 300.0
-"""Seconds a call may take unless the user says otherwise: room for a first call that loads and compiles."""
 
 
-class Attempts:
-    """A world model's answers, held to the contract and to a deadline.
+class Attempted(WorldModel):
+    """A world model whose answers are held to the contract and to a deadline.
 
     Args:
         model: what is asked.
@@ -54,20 +53,43 @@ class Attempts:
         if not deadline > 0:
             raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
         self.model, self.deadline = model, deadline
-        self.tally: Counter[str] = Counter()
-        """What was asked so far: `calls` that the model has answered or not, their `rows` and `frames` (padding and
-        frames that other rows answer left out), and `retries`, calls that repeat one that gave nothing."""
-        self.cache_seconds = 0.0
-        """Nothing is cached here."""
+        self._tally: Counter[str] = Counter()
         self._helper: _Helper | None = None
 
     def __reduce__(self) -> Any:
-        return Attempts, (self.model, self.deadline)
+        return Attempted, (self.model, self.deadline)
 
-    def __call__(
+    @property
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's."""
+        return self.model.accepts
+
+    @property
+    def unwrapped(self) -> WorldModel:
+        """The model behind everything that wraps it."""
+        return self.model.unwrapped
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What was asked so far, on top of what the model says itself.
+
+        `calls` that the model has answered or not, their `rows` and `frames` (padding and frames that other rows answer
+        left out), and `retries`, calls that repeat one that gave nothing.
+        """
+        return {**self.model.spent, **self._tally}
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the model."""
+        return self.model.describe()
+
+    def fingerprint(self) -> str:
+        """Return the model's."""
+        return self.model.fingerprint()
+
+    def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Frames as `WorldModel.rollout` promises them.
+        """Ask the model until it answers as agreed.
 
         Raises:
             RolloutError: every try failed. An answer that breaks the contract in the same way twice is not asked for a
@@ -80,33 +102,33 @@ class Attempts:
                 return self.once(observations, controls, seeds)
             except Exception as error:
                 said.append(_said(error))
-                hopeless = isinstance(error, ContractError) and said.count(said[-1]) > 1
-                if attempt + 1 == TRIES or hopeless:
+                in_vain = isinstance(error, ContractError) and said.count(said[-1]) > 1
+                if attempt + 1 == TRIES or in_vain:
                     raise self._failure(error, said) from error
-                self.tally["retries"] += 1
+                self._tally["retries"] += 1
                 time.sleep(PAUSES[attempt])
         raise AssertionError("unreachable")
 
     def once(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Likewise, in a single try that counts nowhere.
+        """Ask in a single try that counts nowhere.
 
         Raises:
             LateError: no answer within the deadline.
             ContractError: the answer breaks the contract.
             ExitError: the model tried to end the process; and whatever else the model raises.
         """
-        return self._ask(lambda: _contain(lambda: checked_rollout(self.model, observations, controls, seeds)))
+        return self._ask(lambda: _contain(lambda: check_rollout(self.model, observations, controls, seeds)))
 
     def _count(self, controls: Sequence[Control]) -> None:
-        self.tally["calls"] += 1
-        self.tally["rows"] += len(controls)
-        self.tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
+        self._tally["calls"] += 1
+        self._tally["rows"] += len(controls)
+        self._tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
     def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
         kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
-        name = type(self.model).__name__
+        name = type(self.model.unwrapped).__name__
         return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
 
     def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 
 
 class Clock:
@@ -17,18 +18,30 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        begin = time.perf_counter()
+        begin, token = time.perf_counter(), _RUNNING.set((self, stage))
         try:
             yield
         finally:
+            _RUNNING.reset(token)
             self.seconds[stage] += time.perf_counter() - begin
 
-    def move(self, seconds: float, origin: str, target: str) -> None:
-        """Books part of a stage's time under another."""
-        if seconds:
-            self.seconds[origin] -= seconds
-            self.seconds[target] += seconds
-
     def share(self, count: int) -> dict[str, float]:
-        """Seconds by stage, divided over `count` episodes that shared the work."""
+        """Return the seconds by stage, divided over `count` episodes that shared the work."""
         return {stage: seconds / count for stage, seconds in self.seconds.items()}
+
+
+_RUNNING: ContextVar[tuple[Clock, str] | None] = ContextVar("wiw_running_stage", default=None)
+
+
+@contextmanager
+def time_apart(stage: str) -> Iterator[None]:
+    """Add the block's wall time to a stage of its own instead of the one that is being timed, if any is."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        running = _RUNNING.get()
+        if running is not None:
+            clock, around = running
+            clock.seconds[stage] += time.perf_counter() - begin
+            clock.seconds[around] -= time.perf_counter() - begin

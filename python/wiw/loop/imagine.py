@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,86 +13,88 @@ from numpy.typing import NDArray
 from wiw import action, panorama
 from wiw._core import core, planner
 from wiw.errors import ArgumentError, ContractError
-from wiw.loop.clock import Clock
-from wiw.loop.rollout_cache import Asking
+from wiw.loop.history import RowHistories
+from wiw.loop.imagination import Imagination, ModelInput, Request
+from wiw.loop.views import maker_of, view_maker
 from wiw.policies.base import FrameSpec
-from wiw.types import Conditioning, Control, Key, Proposal, Rollout, View
-from wiw.world_models.base import Accepts
+from wiw.types import Conditioning, Control, Key, Observation, Rollout, View
+from wiw.world_models.base import Accepts, WorldModel, ask
+
+NO_SEMANTICS = (
+    "needs semantics: choose a source of them, --semantics simulator or --semantics rednet "
+    "(wiw.experiments.semantics.Labelled); see docs/perception.md"
+)
 
 
 @dataclass(frozen=True)
-class Imagination:
+class ImaginedPrimitives(Imagination):
     """Answer to one batch of plans."""
 
     rollouts: list[list[Rollout]]
     """[episode][candidate]."""
-    calls: list[dict[str, int]]
+    costs: list[dict[str, int]]
     """What the batch cost each episode: a consultation, rows asked and frames imagined."""
-    queries: Sequence[Any]
+    observations: Sequence[Observation]
     batch: Any
     answers: list[NDArray[np.uint8]]
     """What the world model gave, one array a part of the batch."""
     view: View
     """Of the answers."""
 
-    def seen(self, frames: FrameSpec) -> list[list[Rollout]]:
-        """The rollouts in other views than the reviser's."""
-        panoramas = np.stack([query.observation.panorama for query in self.queries])
-        return _shown(self.batch, panoramas, self.answers, self.view, frames)
+    def show(self, frames: FrameSpec) -> list[list[Rollout]]:
+        """Return the rollouts in other views than the reviser's."""
+        panoramas = np.stack([observation.panorama for observation in self.observations])
+        return _show(self.batch, panoramas, self.answers, self.view, frames)
 
-    def ends(self, candidates: Sequence[int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """What the named candidates (counted over all episodes) end with: panoramas and front views, as observed."""
-        panoramas = np.stack([query.observation.panorama for query in self.queries])
-        sizes = panoramas.shape[1:3], self.queries[0].observation.front.shape[:2]
+    def ends(self, chosen: Sequence[tuple[int, int]]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the panoramas and front views that (episode, candidate) plans end with, as they would be observed."""
+        first = np.cumsum([0, *map(len, self.rollouts)])
+        candidates = [first[episode] + candidate for episode, candidate in chosen]
+        panoramas = np.stack([observation.panorama for observation in self.observations])
+        sizes = panoramas.shape[1:3], self.observations[0].front.shape[:2]
         whole, front = (
-            self.batch.ends(candidates, panoramas, self.answers, _maker(view, size))
+            self.batch.ends(candidates, panoramas, self.answers, view_maker(view, size))
             for view, size in zip(("panorama", "front"), sizes, strict=True)
         )
         return whole, front
 
 
-def imagine(
-    ask: Asking,
-    queries: Sequence[Any],
-    proposals: Sequence[Sequence[Proposal]],
-    origins: Sequence[Sequence[int]],
-    frames: FrameSpec,
-    clock: Clock,
-    seen: Sequence[Any] | None = None,
-) -> Imagination:
-    """Imagines every proposal of every episode and shows the futures in the views that the reviser asked for.
-
-    `origins` numbers the seed of each proposal. `seen` are queries whose observations the model is shown instead of the
-    episodes' own; real views, those of leading turns, stay the episodes' own.
-    """
-    accepts = ask.model.accepts
+def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitives:
+    """Imagine every plan of every episode and show the futures in the views that the reviser asked for."""
+    accepts, clock = model.accepts, request.clock
     with clock("platform"):
-        batch = planner.Batch.build([[p.actions for p in plans] for plans in proposals], model_spec(accepts))
-        panoramas = np.stack([query.observation.panorama for query in queries])
-        conditioning = _conditioning(accepts, batch, queries if seen is None else seen)
-        seeds = _seeds(batch, queries, origins)
+        plans = [[plan.actions for plan in own] for own in request.plans]
+        batch = planner.Batch.build(plans, make_model_spec(accepts))
+        panoramas = np.stack([observation.panorama for observation in request.observations])
+        parts, conditioning = batch.parts, _conditioning(accepts, batch, request.inputs)
+        histories = None
+        if accepts.history:
+            flat = [actions for own in plans for actions in own]
+            histories = RowHistories(accepts, batch, parts, flat, request.inputs, conditioning.image)
+        seeds = _seeds(batch, request.keys, request.origins)
     answers: list[NDArray[np.uint8]] = []
-    for part in batch.parts:
+    for part in parts:
         with clock("platform"):
             observations = _at_start(conditioning, part, answers, accepts)
+            if histories is not None:
+                observations = replace(observations, history=histories.before(part, answers))
             controls = _controls(accepts, part)
         with clock("world_model"):
-            before = ask.cache_seconds
-            found = ask(observations, controls, seeds[part.rows])
-            answers.append(_unshared(found, answers, ask.model))
-        clock.move(ask.cache_seconds - before, "world_model", "cache")
+            found = ask(model, observations, controls, seeds[part.rows])
+            answers.append(_require_own_memory(found, answers, model))
     with clock("platform"):
-        rollouts = _shown(batch, panoramas, answers, accepts.view, frames)
-        return Imagination(rollouts, _cost(batch, len(queries)), queries, batch, answers, accepts.view)
+        rollouts = _show(batch, panoramas, answers, accepts.view, request.frames)
+        costs = _cost(batch, len(request.keys))
+        return ImaginedPrimitives(rollouts, costs, request.observations, batch, answers, accepts.view)
 
 
-def _shown(
+def _show(
     batch: Any, panoramas: NDArray[np.uint8], answers: list[NDArray[np.uint8]], kind: View, frames: FrameSpec
 ) -> list[list[Rollout]]:
     """Rollouts in the views that are asked for, or in the front view where the model gives no other."""
     view = "front" if kind == "perspective" else frames.view
     size = frames.size if view == frames.view else (384, 384)
-    shown = batch.views(panoramas, answers, _maker(view, size), kind)
+    shown = batch.views(panoramas, answers, view_maker(view, size), kind)
     real, lengths = batch.real, batch.lengths
     rollouts: list[list[Rollout]] = [[] for _ in panoramas]
     for i, episode in enumerate(batch.candidate_episode):
@@ -101,50 +102,48 @@ def _shown(
     return rollouts
 
 
-def model_spec(accepts: Accepts) -> Any:
-    """What the planner must know of a model."""
+def make_model_spec(accepts: Accepts) -> Any:
+    """Return what the planner must know of a model."""
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
 
 
-@cache
-def _maker(view: str, size: tuple[int, int]) -> Any:
-    return planner.ViewMaker(view, size)
-
-
-def _conditioning(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> Conditioning:
+def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:
     """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
-    maker = _maker("front" if accepts.view == "perspective" else "panorama", accepts.size)
+    maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = batch.depths(depths_of(queries), maker)
-    semantic = _labels(accepts, batch, queries) if "semantic" in accepts.needs else None
+        depth = batch.depths(stack_depths(inputs), maker)
+    semantic = _labels(accepts, batch, inputs) if "semantic" in accepts.needs else None
     if "simulator" in accepts.needs:
         simulators = [
-            _turned(queries[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
+            _turn(inputs[e].simulator, turns) for e, turns in zip(batch.row_episode, batch.row_turns, strict=True)
         ]
-    panoramas = np.stack([query.observation.panorama for query in queries])
+    panoramas = np.stack([own.observation.panorama for own in inputs])
     return Conditioning(batch.observations(panoramas, maker), depth=depth, semantic=semantic, simulators=simulators)
 
 
-def _labels(accepts: Accepts, batch: Any, queries: Sequence[Any]) -> NDArray[np.uint32]:
-    """The same of the panoramas' labels, of which none are blended."""
-    if any(query.semantic is None for query in queries):
-        raise ArgumentError(
-            "the world model needs semantics: pass decide_batch([Query(..., semantic=env.semantic())]), or give the "
-            "agent another source than the simulator"
-        )
-    labels = np.stack([query.semantic for query in queries])
+def _labels(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> NDArray[np.uint32]:
+    """Return the labels of what each row begins with, none of them blended.
+
+    Raises:
+        ArgumentError: an episode has none.
+    """
+    labels = np.stack([_require_labels(own) for own in inputs])
     if accepts.view == "panorama":  # small numbers survive as floats, and distances are turned by the nearest pixel
-        turned = batch.depths(labels.astype(np.float32), _maker("panorama", accepts.size))
+        turned = batch.depths(labels.astype(np.float32), view_maker("panorama", accepts.size))
         return np.asarray(turned, np.uint32)
     rows = zip(batch.row_episode, np.degrees(action.ActionSpace().turn_rad) * batch.row_turns, strict=True)
     return np.stack([panorama.to_perspective(labels[e], 90.0, accepts.size, yaw, 0.0, "nearest") for e, yaw in rows])
 
 
-def _turned(simulator: Any, turns: int) -> Any:
-    """A fork of the simulator after `turns` left turns."""
-    if simulator is None:
-        raise ArgumentError("the world model needs the simulator: pass decide(..., simulator=env.fork())")
+def _require_labels(shown: ModelInput) -> NDArray[np.uint32]:
+    if shown.semantic is None:
+        raise ArgumentError(f"the world model {NO_SEMANTICS}")
+    return shown.semantic
+
+
+def _turn(simulator: Any, turns: int) -> Any:
+    """Return a fork of the simulator after `turns` left turns."""
     fork = simulator.fork()
     for _ in range(abs(int(turns))):
         fork.step(int(action.TURN_LEFT if turns > 0 else action.TURN_RIGHT))
@@ -159,16 +158,16 @@ def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8
         semantic = None if whole.semantic is None else whole.semantic[rows]
         simulators = None if whole.simulators is None else [whole.simulators[r] for r in part.rows]
         return Conditioning(whole.image[rows], depth=depth, semantic=semantic, simulators=simulators)
-    assert not accepts.needs  # check_model: an imagined frame has neither depth nor labels nor a simulator
+    assert not set(accepts.needs) - {"history"}  # check_model: imagined frames have no depth, labels or simulator
     return Conditioning(np.stack([answers[p][i, f] for p, i, f in part.start]))
 
 
-def _unshared(found: NDArray[np.uint8], before: Sequence[NDArray[np.uint8]], model: Any) -> NDArray[np.uint8]:
-    """The answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
+def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.uint8]], model: Any) -> NDArray[np.uint8]:
+    """Return the answer, if it lies elsewhere than those of earlier calls, which are still to be read."""
     if any(np.may_share_memory(found, answer) for answer in before):
         raise ContractError(
-            f"{type(model).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by that; "
-            "return a new array from every call",
+            f"{type(model.unwrapped).__name__}.rollout: gave the memory of an earlier answer, whose frames are lost by "
+            "that; return a new array from every call",
             "memory",
         )
     return found
@@ -205,28 +204,26 @@ def _ids(accepts: Accepts, actions: NDArray[np.int8]) -> NDArray[Any] | None:
 
 
 def seed_of(key: Key, candidate: int) -> int:
-    """The seed of a candidate's future, whatever else is imagined beside it."""
+    """Return the seed of a candidate's future, whatever else is imagined beside it."""
     return int(core.fold_key([key.seed, key.episode, key.decision, candidate]))
 
 
-def depths_of(queries: Sequence[Any]) -> NDArray[np.float32]:
-    """Depth of all observations, stacked.
+def stack_depths(inputs: Sequence[ModelInput]) -> NDArray[np.float32]:
+    """Return the depth of all observations.
 
     Raises:
         ArgumentError: one has none.
     """
-    depths = [query.observation.depth for query in queries]
+    depths = [own.observation.depth for own in inputs]
     if any(value is None for value in depths):
         raise ArgumentError("the world model needs depth: make the environment with depth=True")
     return np.stack(depths)
 
 
-def _seeds(batch: Any, queries: Sequence[Any], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
-    """uint64 [rows]: keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
-    keys = [
-        seed_of(query.key, candidate) for query, numbers in zip(queries, origins, strict=True) for candidate in numbers
-    ]
-    return np.array(keys, np.uint64)[batch.row_owner]
+def _seeds(batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) -> NDArray[np.uint64]:
+    """Return uint64 [rows], keyed by (run seed, episode, decision, candidate), whatever else is in the batch."""
+    seeds = [seed_of(key, candidate) for key, numbers in zip(keys, origins, strict=True) for candidate in numbers]
+    return np.array(seeds, np.uint64)[batch.row_owner]
 
 
 def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:

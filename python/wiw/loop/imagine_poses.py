@@ -8,39 +8,38 @@ from the gripper's present pose on. The frame at each pose of the plan is shown 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw import action
-from wiw.errors import ArgumentError
-from wiw.loop.clock import Clock
-from wiw.loop.imagine import Imagination, depths_of, imagine, seed_of
-from wiw.loop.rollout_cache import Asking
+from wiw.loop.history import frames_of, stack_histories
+from wiw.loop.imagination import Imagination, ModelInput, Request
+from wiw.loop.imagine import seed_of, stack_depths
+from wiw.loop.views import resize
 from wiw.policies.base import FrameSpec
-from wiw.types import Conditioning, Control, Proposal, Rollout, Space, View
-from wiw.world_models.base import Accepts
+from wiw.types import Conditioning, Control, Proposal, Rollout, View
+from wiw.world_models.base import Accepts, WorldModel, ask
 
 
 @dataclass(frozen=True)
-class PoseImagination:
+class ImaginedPoses(Imagination):
     """Answer to one batch of plans."""
 
     rollouts: list[list[Rollout]]
     """[episode][candidate]."""
-    calls: list[dict[str, int]]
+    costs: list[dict[str, int]]
     """What the batch cost each episode: a consultation, rows asked and frames imagined."""
     frames: list[list[NDArray[np.uint8]]]
     """uint8 [K, H, W, 3] by [episode][candidate], in the model's size."""
     view: View = "perspective"
 
-    def seen(self, frames: FrameSpec) -> list[list[Rollout]]:
-        """The rollouts in another size."""
+    def show(self, frames: FrameSpec) -> list[list[Rollout]]:
+        """Return the rollouts in another size."""
         return [[_rollout(own, frames.size) for own in plans] for plans in self.frames]
 
 
@@ -54,64 +53,44 @@ class _Row:
     seed: int
 
 
-def imagine_poses(
-    ask: Asking,
-    queries: Sequence[Any],
-    proposals: Sequence[Sequence[Proposal]],
-    origins: Sequence[Sequence[int]],
-    frames: FrameSpec,
-    clock: Clock,
-    seen: Sequence[Any] | None = None,
-) -> PoseImagination:
-    """Imagines every proposal of every episode, equal ones of an episode once; see `wiw.loop.imagine.imagine`."""
-    accepts = ask.model.accepts
+def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
+    """Imagine every plan of every episode, equal ones of an episode once; see `wiw.loop.imagine`."""
+    accepts, clock = model.accepts, request.clock
     with clock("platform"):
-        rows, places = _rows(accepts, queries, proposals, origins)
-        shown = queries if seen is None else seen
+        rows, places = _rows(accepts, request)
     answers: list[NDArray[np.uint8]] = [np.empty(0, np.uint8)] * len(rows)
     for part in _parts(rows, accepts.best_batch):
         with clock("platform"):
-            observations = _conditioning(accepts, [shown[rows[i].episode] for i in part])
+            observations = _conditioning(accepts, [request.inputs[rows[i].episode] for i in part])
             seeds = np.array([rows[i].seed for i in part], np.uint64)
         with clock("world_model"):
-            before = ask.cache_seconds
-            found = ask(observations, [rows[i].control for i in part], seeds)
-        clock.move(ask.cache_seconds - before, "world_model", "cache")
+            found = ask(model, observations, [rows[i].control for i in part], seeds)
         for i, own in zip(part, found, strict=True):
             answers[i] = own[_frames_of(rows[i])]
     with clock("platform"):
         made = [[answers[place] for place in plans] for plans in places]
-        rollouts = [[_rollout(own, frames.size) for own in plans] for plans in made]
-        return PoseImagination(rollouts, _cost(rows, len(queries)), made)
+        rollouts = [[_rollout(own, request.frames.size) for own in plans] for plans in made]
+        return ImaginedPoses(rollouts, _cost(rows, len(request.keys)), made)
 
 
-IMAGINE: Mapping[Space, Callable[..., Imagination | PoseImagination]] = {"discrete": imagine, "pose7": imagine_poses}
-"""By what plans are made of."""
-
-
-def _rows(
-    accepts: Accepts,
-    queries: Sequence[Any],
-    proposals: Sequence[Sequence[Proposal]],
-    origins: Sequence[Sequence[int]],
-) -> tuple[list[_Row], list[list[int]]]:
-    """The futures to be asked for, and the place among them of each episode's plans."""
+def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int]]]:
+    """Return the futures to be asked for, and the place among them of each episode's plans."""
     rows: list[_Row] = []
     places: list[list[int]] = []
-    for episode, (query, plans, numbers) in enumerate(zip(queries, proposals, origins, strict=True)):
+    for episode, (plans, numbers) in enumerate(zip(request.plans, request.origins, strict=True)):
         known: dict[tuple[bytes, str], int] = {}
         for plan, number in zip(plans, numbers, strict=True):
             name = plan.actions.tobytes(), plan.text
             if name not in known:
                 known[name] = len(rows)
-                control = _control(accepts, plan, query.observation.pose)
-                rows.append(_Row(episode, plan.actions, control, seed_of(query.key, number)))
+                control = _control(accepts, plan, request.observations[episode].pose)
+                rows.append(_Row(episode, plan.actions, control, seed_of(request.keys[episode], number)))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 
 
 def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64]) -> Control:
-    """The plan at the length that the model imagines, or at its own."""
+    """Return the plan at the length that the model imagines, or at its own."""
     poses = plan.actions
     if accepts.frames:
         poses = action.resample(poses, accepts.frames - 1, start=here)
@@ -135,20 +114,17 @@ def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
             yield places[first : first + most]
 
 
-def _conditioning(accepts: Accepts, queries: Sequence[Any]) -> Conditioning:
+def _conditioning(accepts: Accepts, inputs: Sequence[ModelInput]) -> Conditioning:
     depth = simulators = None
     if "depth" in accepts.needs:
-        depth = np.stack([_resized(value, accepts.size, cv2.INTER_NEAREST) for value in depths_of(queries)])
+        depth = np.stack([resize(value, accepts.size, cv2.INTER_NEAREST) for value in stack_depths(inputs)])
     if "simulator" in accepts.needs:
-        simulators = [query.simulator for query in queries]
-        if any(value is None for value in simulators):
-            raise ArgumentError("the world model needs the simulator: pass decide(..., simulator=env.fork())")
-    image = np.stack([_resized(query.observation.front, accepts.size) for query in queries])
-    return Conditioning(image, depth=depth, simulators=simulators)
-
-
-def _resized(image: NDArray[Any], size: tuple[int, int], how: int = cv2.INTER_AREA) -> NDArray[Any]:
-    return image if image.shape[:2] == size else np.asarray(cv2.resize(image, size[::-1], interpolation=how))
+        simulators = [own.simulator for own in inputs]
+    image = np.stack([resize(own.observation.front, accepts.size) for own in inputs])
+    history = None
+    if accepts.history:
+        history = stack_histories([frames_of(accepts, own) for own in inputs], accepts.history)
+    return Conditioning(image, depth=depth, history=history, simulators=simulators)
 
 
 def _frames_of(row: _Row) -> NDArray[np.int64]:
@@ -157,7 +133,7 @@ def _frames_of(row: _Row) -> NDArray[np.int64]:
 
 
 def _rollout(frames: NDArray[np.uint8], size: tuple[int, int]) -> Rollout:
-    shown = np.stack([_resized(frame, size) for frame in frames])
+    shown = np.stack([resize(frame, size) for frame in frames])
     return Rollout(shown, np.zeros(len(frames), np.bool_), "front")
 
 

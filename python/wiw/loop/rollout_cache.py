@@ -2,10 +2,10 @@
 """Rollouts on disk, so that the same question is put to a world model once.
 
 An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: class, declared version,
-options, weights), the observation's bytes, the control and the seed. A model without a version is never cached. An
-entry holds the frames of one row, raw: a panorama is read in 0.1 ms and checked in 0.3 ms, where unpacking it from PNG
-would take 10 ms. Files appear under their names whole, so any number of processes may share a folder. When it outgrows
-its budget, what was not used for longest goes first.
+options, weights), the bytes of the observation and its history, the control and the seed. A model without a version is
+never cached. An entry holds the frames of one row, raw: a panorama is read in 0.1 ms and checked in 0.3 ms, where
+unpacking it from PNG would take 10 ms. Files appear under their names whole, so any number of processes may share a
+folder. When it outgrows its budget, what was not used for longest goes first.
 """
 
 from __future__ import annotations
@@ -17,8 +17,7 @@ import struct
 import time
 import uuid
 import zlib
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
@@ -30,16 +29,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.loop.attempts import Attempts
+from wiw.loop.clock import time_apart
+from wiw.loop.limits import BUDGET_GB
 from wiw.types import Conditioning, Control
+from wiw.world_models.base import Accepts, WorldModel
 
 _log = logging.getLogger("wiw.rollouts")
 _HEADER = struct.Struct("<8s6I")
 """Magic, first frame, frames, height, width, CRC-32 of the frames, CRC-32 of the header so far."""
 _MAGIC = b"wiwroll1"
 _CHANNELS = 3
-BUDGET_GB = 20.0
-"""Most gigabytes of a folder unless the user says otherwise; a panorama takes 1.8 MB, a front view 0.7 MB."""
 
 
 def default_folder() -> Path:
@@ -160,66 +159,75 @@ class RolloutCache:
         return found
 
 
-class Remembered:
-    """Asks a world model only for rows that the cache does not hold. Stands in for the `Attempts` it wraps."""
+class Cached(WorldModel):
+    """A world model that is asked only for rows that the cache does not hold."""
 
-    def __init__(self, ask: Attempts, cache: RolloutCache) -> None:
-        self.model, self.cache = ask.model, cache
-        self.cache_seconds = 0.0
-        """Spent on the cache so far."""
-        self._ask = ask
-        self._identity = f"{ask.model.fingerprint()} {replace(ask.model.accepts, best_batch=1)}".encode()
+    def __init__(self, model: WorldModel, cache: RolloutCache) -> None:
+        self.model, self.cache = model, cache
+        self._cached_rows = 0
+        self._identity = f"{model.fingerprint()} {replace(model.accepts, best_batch=1)}".encode()
 
     @property
-    def tally(self) -> Counter[str]:
-        """What the model was asked, and `cached_rows` that it was not."""
-        return self._ask.tally
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's."""
+        return self.model.accepts
 
-    def __call__(
+    @property
+    def unwrapped(self) -> WorldModel:
+        """The model behind everything that wraps it."""
+        return self.model.unwrapped
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What the model was asked, and `cached_rows` that it was not."""
+        return {**self.model.spent, "cached_rows": self._cached_rows}
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the model."""
+        return self.model.describe()
+
+    def fingerprint(self) -> str:
+        """Return the model's."""
+        return self.model.fingerprint()
+
+    def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Frames as `WorldModel.rollout` promises them; those that nobody reads may be left unwritten."""
-        begin = time.perf_counter()
+        """Return frames as `WorldModel.rollout` promises them; those that nobody reads may be left unwritten."""
         keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
-        shape = (len(controls), 1 + len(controls[0].actions), *self.model.accepts.size, _CHANNELS)
-        frames = np.empty(shape, np.uint8)
-        frames[:, 0] = observations.image
         own = [(1 + control.shared, 1 + control.length) for control in controls]
-        missing = [
-            row
-            for row, (key, (first, end)) in enumerate(zip(keys, own, strict=True))
-            if first < end and not self.cache.get(key, first, frames[row, first:end])
-        ]
-        self.tally["cached_rows"] += len(controls) - len(missing)
-        self.cache_seconds += time.perf_counter() - begin
+        frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, _CHANNELS), np.uint8)
+        with time_apart("cache"):
+            frames[:, 0] = observations.image
+            missing = [
+                row
+                for row, (key, (first, end)) in enumerate(zip(keys, own, strict=True))
+                if first < end and not self.cache.get(key, first, frames[row, first:end])
+            ]
+        self._cached_rows += len(controls) - len(missing)
         if missing:
-            fresh = self._ask(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
-            begin = time.perf_counter()
-            for answer, row in zip(fresh, missing, strict=True):
-                first, end = own[row]
-                self.cache.put(keys[row], first, answer[first:end])
-                frames[row, first:end] = answer[first:end]
-            self.cache_seconds += time.perf_counter() - begin
+            fresh = self.model.rollout(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
+            with time_apart("cache"):
+                for answer, row in zip(fresh, missing, strict=True):
+                    first, end = own[row]
+                    self.cache.put(keys[row], first, answer[first:end])
+                    frames[row, first:end] = answer[first:end]
         return frames
 
 
-Asking = Attempts | Remembered
-"""What the loop asks for frames."""
-
-
-def remember(ask: Attempts, cache: str | Path, budget_gb: float = BUDGET_GB) -> Asking:
-    """The model behind a cache: with "auto" where it declares itself `cacheable`, never with "off", else in a folder.
+def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: float = BUDGET_GB) -> WorldModel:
+    """Return the model behind a cache: with "auto" if it is `cacheable`, never with "off", else in a folder.
 
     A model that is handed the simulator is never cached: its answer depends on a whole scene, which no key can hold.
     Nor is one without a `version`, for nobody could tell when its answers change: a warning names it.
     """
-    accepts = ask.model.accepts
+    accepts = model.accepts
     if cache == "off" or "simulator" in accepts.needs or (cache == "auto" and not accepts.cacheable):
-        return ask
-    if not ask.model.fingerprint():
-        _warn_unversioned(type(ask.model).__name__)
-        return ask
-    return Remembered(ask, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
+        return model
+    if not model.fingerprint():
+        _warn_unversioned(type(model.unwrapped).__name__)
+        return model
+    return Cached(model, RolloutCache(default_folder() if cache == "auto" else cache, budget_gb))
 
 
 @lru_cache(None)
@@ -235,8 +243,10 @@ def _warn_unversioned(name: str) -> None:
 def _key(identity: bytes, observations: Conditioning, row: int, control: Control, seeds: NDArray[np.uint64]) -> str:
     digest = blake2b(identity, digest_size=20)
     parts: list[Any] = [observations.image[row], control.actions, control.trajectory, control.viewpoints, seeds[row]]
-    optional = (observations.depth, observations.semantic, observations.history)
-    parts += [values[row] for values in optional if values is not None]
+    parts += [values[row] for values in (observations.depth, observations.semantic) if values is not None]
+    if observations.history is not None:
+        past = observations.history.rows([row])  # without the padding that the rest of the batch brings about
+        parts += [past.images, past.poses, past.actions, past.lengths, past.count]
     if control.ids is not None:
         parts.append(control.ids)
     for part in parts:
@@ -254,5 +264,5 @@ def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
     index = list(rows)
     depth = None if whole.depth is None else whole.depth[index]
     semantic = None if whole.semantic is None else whole.semantic[index]
-    history = None if whole.history is None else [whole.history[row] for row in index]
+    history = None if whole.history is None else whole.history.rows(index)
     return Conditioning(whole.image[index], depth=depth, semantic=semantic, history=history)

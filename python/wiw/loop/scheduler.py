@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from wiw.errors import ArgumentError, ContractError, RolloutError, VlmError, asks_to_stop
-from wiw.loop.agent import Agent, Query
+from wiw.loop.agent import Agent
+from wiw.loop.memory import Query
+from wiw.loop.privileged import LiveEnvironments
 from wiw.types import Decision, DecisionRecord, Episode, EpisodeResult, Key
-
-NO_STRANGERS: Mapping[int, Episode] = {}
 
 
 class Sink(Protocol):
@@ -43,22 +43,15 @@ class Trial:
     key: Key
     observation: Any
     begin: float
-    stranger: Query | None = None
     decisions: int = 0
     done: bool = field(default=False)
 
-    def query(self, agent: Agent) -> Query:
-        """What the agent is asked; a fork of the simulator goes along only where the world model declares its need, and
-        a guide only where stages are told the truth.
-        """
-        simulator = self.env.fork() if "simulator" in agent.needs else None
-        guide = self.env.guide() if "guide" in agent.needs else None
-        semantic = self.env.semantic() if "semantic" in agent.needs else None
-        key = self.key.at(self.decisions)
-        return Query(self.observation, self.env.goal, key, simulator, self.stranger, guide, semantic)
+    def query(self) -> Query:
+        """Return what the agent is asked."""
+        return Query(self.observation, self.env.goal, self.key.at(self.decisions))
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
-        """Executes the decision's first segment and observes."""
+        """Execute the decision's first segment and observe."""
         before = self.env.truth()
         plan = decision.actions[: decision.execute]
         begin = time.perf_counter()
@@ -66,7 +59,7 @@ class Trial:
         seconds = {**decision.seconds, "environment": time.perf_counter() - begin}
         decision = replace(decision, seconds=seconds)
         self.observation, self.done = outcome.observation, outcome.terminated or outcome.truncated
-        facts = outcome.executed, before, self.env.truth(), outcome.path, getattr(outcome, "refused", ())
+        facts = outcome.executed, before, self.env.truth(), outcome.path, outcome.refused
         end = self.observation if self.done else None
         record = DecisionRecord(self.index, self.decisions, decision, *facts, end)
         self.decisions += 1
@@ -81,80 +74,67 @@ def run_episodes(
     seed: int,
     live: int = 4,
     sink: Sink,
-    strangers: Mapping[int, Episode] = NO_STRANGERS,
 ) -> None:
-    """Runs (index, episode) pairs to their ends, at most `live` at a time.
+    """Run (index, episode) pairs to their ends, at most `live` at a time.
 
-    `strangers` names for each index another episode, whose first moment goes along with every query; for placebos.
-
-    An exception in an episode is infrastructure: the episode is reported as failed and the rest go on. One in a batch
-    may be due to any of its episodes, so each of them is run again by itself, after the others: what fails does not
+    An exception in an episode is infrastructure: the episode is recorded as an error and the rest go on. One in a batch
+    may be due to any of its episodes, so each of them is run again by itself, after the others: what breaks does not
     depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so it is
     raised; so is what the sink raises.
     """
     waiting, trials, suspects = deque(episodes), list[Trial](), deque[tuple[int, Episode]]()
     envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
+    environments = LiveEnvironments()
+    agent.grant(environments)
     try:
         while waiting or trials or suspects:
             while waiting and envs:
-                _start(agent, waiting.popleft(), envs, trials, seed, sink, strangers)
+                trials += _start(waiting.popleft(), envs, seed, sink)
             if not trials and not waiting and suspects:
-                _start(agent, suspects.popleft(), envs, trials, seed, sink, strangers)
+                trials += _start(suspects.popleft(), envs, seed, sink)
+            for trial in trials:
+                environments.add(trial.key, trial.env)
             suspects += _advance(agent, trials, sink)
             for trial in [trial for trial in trials if trial.done]:
                 trials.remove(trial)
                 envs.append(trial.env)
+                environments.remove(trial.key)
                 agent.forget(trial.key)
     finally:
         for env in [*envs, *(trial.env for trial in trials)]:
             env.close()
 
 
-def _start(
-    agent: Agent,
-    item: tuple[int, Episode],
-    envs: list[Any],
-    trials: list[Trial],
-    seed: int,
-    sink: Sink,
-    strangers: Mapping[int, Episode],
-) -> None:
+def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) -> list[Trial]:
+    """Begin an episode in one of the free environments; return it, unless it could not begin."""
     index, episode = item
     begin = time.perf_counter()
     env = envs.pop()
     try:
-        stranger = _first_moment(agent, env, strangers[index], Key(seed, index)) if strangers else None
         observation = env.begin(episode)
     except BaseException as error:  # whatever went wrong, the run goes on and the record says so
         if asks_to_stop(error):
             raise
         envs.append(env)
         sink.episode(_failed(index, episode, begin, "environment", error))
-        return
-    trials.append(Trial(index, episode, env, Key(seed, index), observation, begin, stranger))
-
-
-def _first_moment(agent: Agent, env: Any, episode: Episode, key: Key) -> Query:
-    observation = env.begin(episode)
-    simulator = env.fork() if "simulator" in agent.needs else None
-    semantic = env.semantic() if "semantic" in agent.needs else None
-    return Query(observation, env.goal, key, simulator, semantic=semantic)
+        return []
+    return [Trial(index, episode, env, Key(seed, index), observation, begin)]
 
 
 def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, Episode]]:
-    """One decision for every live episode; returns those that have to be run again, one at a time."""
+    """Decide once for every live episode; return those that have to be run again, one at a time."""
     if not trials:
         return []
-    before, begin = agent.meter(), time.perf_counter()
+    before, begin = agent.count_spent(), time.perf_counter()
     try:
-        decisions = agent.decide_batch([trial.query(agent) for trial in trials])
+        decisions = agent.decide_batch([trial.query() for trial in trials])
     except (ArgumentError, ContractError):
         raise
     except BaseException as error:
         if asks_to_stop(error):
             raise
         kind = _kind(error)
-        sink.lost({**(agent.meter() - before), "seconds": time.perf_counter() - begin})
+        sink.lost({**(agent.count_spent() - before), "seconds": time.perf_counter() - begin})
         for trial in trials:
             trial.done = True
         if len(trials) > 1:
@@ -194,4 +174,4 @@ def _finished(trial: Trial) -> EpisodeResult:
 def _failed(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     seconds = time.perf_counter() - begin
-    return EpisodeResult(index, episode.episode_id, episode.scene, "failed", {}, seconds, text, kind)
+    return EpisodeResult(index, episode.episode_id, episode.scene, "error", {}, seconds, text, kind)

@@ -11,7 +11,7 @@ from wiw.errors import ArgumentError
 
 
 def aeqa_score(scores: ArrayLike) -> float:
-    """Mean answer score in percent, 100 (clip(s, 1, 5) - 1) / 4.
+    """Return the mean answer score in percent, 100 (clip(s, 1, 5) - 1) / 4.
 
     Raises:
         ArgumentError: no episode, or NaN.
@@ -20,7 +20,7 @@ def aeqa_score(scores: ArrayLike) -> float:
 
 
 def aeqa_spl(scores: ArrayLike, shortest: ArrayLike, travelled: ArrayLike, answered: ArrayLike | None = None) -> float:
-    """Answer score weighted by path length in percent: mean of (s - 1) / 4 * L* / max(L, L*).
+    """Return the answer score weighted by path length in percent: mean of (s - 1) / 4 * L* / max(L, L*).
 
     Args:
         scores: [N] raw marks; values outside 1 to 5 are clipped.

@@ -18,7 +18,7 @@ Weights = Literal["uniform", "latitude"]
 def psnr(
     a: ArrayLike, b: ArrayLike, *, weights: Weights = "uniform", data_range: float | None = None
 ) -> float | NDArray[np.float64]:
-    """Peak signal-to-noise ratio in dB, higher is closer; equal images give 100, so that means stay finite.
+    """Return the peak signal-to-noise ratio in dB, higher is closer; equal images give 100, so that means stay finite.
 
     Args:
         a: uint8 or float [..., H, W, C].
@@ -38,7 +38,7 @@ def psnr(
 def ssim(
     a: ArrayLike, b: ArrayLike, *, weights: Weights = "uniform", data_range: float | None = None
 ) -> float | NDArray[np.float64]:
-    """Structural similarity in [-1, 1], 1 for equal images: Gaussian window 11x11, sigma 1.5, mean over channels.
+    """Return SSIM in [-1, 1], 1 for equal images: Gaussian window 11x11, sigma 1.5, mean over channels.
 
     Windows lie inside the image; with weights="latitude" they wrap around a panorama's seam and count with the cosine
     of their latitude. Arguments, result and errors as for `psnr`; images are at least 11x11 pixels.

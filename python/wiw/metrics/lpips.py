@@ -55,7 +55,7 @@ HEADS = Weights(
 
 
 def default_folder() -> Path:
-    """Where weights are looked for: `$WIW_CACHE/weights`, or `~/.cache/wiw/weights`."""
+    """Return the folder of the weights: `$WIW_CACHE/weights`, or `~/.cache/wiw/weights`."""
     root = os.environ.get("WIW_CACHE")
     return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "weights"
 
@@ -79,7 +79,7 @@ class Lpips:
         self._where, self._weights = _read(self.folder, device)
 
     def __call__(self, a: ArrayLike, b: ArrayLike) -> float | NDArray[np.float64]:
-        """Distances of uint8 images [..., H, W, 3] from as many others: a float for two, float64 [...] for batches.
+        """Return distances of uint8 images [..., H, W, 3] from as many others: a float, or float64 [...] for batches.
 
         Raises:
             ArgumentError: another type or shape, or images that are too small.
@@ -117,7 +117,7 @@ class Lpips:
 
 
 def _features(x: Any, weights: Mapping[str, Any]) -> Iterator[Any]:
-    """What AlexNet's five convolutions give, each after its ReLU."""
+    """Return the outputs of AlexNet's five convolutions, each after its ReLU."""
     from torch.nn import functional
 
     for number, stride, padding, pooled in STAGES:
@@ -130,7 +130,7 @@ def _features(x: Any, weights: Mapping[str, Any]) -> Iterator[Any]:
 
 @cache
 def _read(folder: Path, device: str) -> tuple[str, dict[str, Any]]:
-    """The device and both files' tensors there; AlexNet's classifier is left out."""
+    """Return the device and both files' tensors on it, without AlexNet's classifier."""
     absent = [file.name for file in (BACKBONE, HEADS) if not (folder / file.name).is_file()]
     if absent:
         raise WeightsError(

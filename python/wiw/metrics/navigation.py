@@ -10,7 +10,7 @@ from wiw._core import metrics as _core
 
 
 def success_rate(success: ArrayLike) -> float:
-    """Percent of episodes that succeeded.
+    """Return the percent of episodes that succeeded.
 
     Args:
         success: [N] booleans or numbers in [0, 1].
@@ -22,12 +22,12 @@ def success_rate(success: ArrayLike) -> float:
 
 
 def path_efficiency(success: ArrayLike, shortest: ArrayLike, travelled: ArrayLike) -> NDArray[np.float64]:
-    """Each episode's term of SPL, float64 [N] in [0, 1]; see `spl`."""
+    """Return each episode's term of SPL, float64 [N] in [0, 1]; see `spl`."""
     return np.asarray(_core.path_efficiency(_numbers(success), _numbers(shortest), _numbers(travelled)))
 
 
 def spl(success: ArrayLike, shortest: ArrayLike, travelled: ArrayLike) -> float:
-    """Success weighted by path length in percent: mean of S L* / max(L, L*).
+    """Return the success weighted by path length in percent: mean of S L* / max(L, L*).
 
     An episode that starts at its goal (L* = 0) counts fully if the agent stayed there and nothing otherwise.
 
@@ -43,7 +43,7 @@ def spl(success: ArrayLike, shortest: ArrayLike, travelled: ArrayLike) -> float:
 
 
 def mean_trajectory(lengths: ArrayLike) -> float:
-    """Mean trajectory length over all episodes, in the unit of `lengths` (ImageNav: executed actions).
+    """Return the mean trajectory length over all episodes, in the unit of `lengths` (ImageNav: executed actions).
 
     Raises:
         ArgumentError: no episode, or a value that is not finite.

@@ -10,7 +10,7 @@ from wiw._core import metrics as _core
 
 
 def pose_error(a: ArrayLike, b: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance in metres and rotation angle in radians (0 to pi) between poses.
+    """Return the distance in metres and rotation angle in radians (0 to pi) between poses.
 
     Args:
         a: rigid transforms float [4, 4] or [B, 4, 4].

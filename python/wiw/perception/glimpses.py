@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the recogniser is shown of a target: a close and a wide view centred on its box, and the box's angles."""
+"""The recogniser's input for a target: a close and a wide view centred on its box, and the box's angles."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 from wiw import panorama
 from wiw.errors import ArgumentError
 from wiw.panorama import PerspectivePlan
-from wiw.perception.boxes import Mask, box_of, width_of
+from wiw.perception.boxes import Mask, box_width, find_box
 
 SIDE = 64
 """Pixels of a view."""
-FILL = 0.6
-"""Which part of the close view the box fills, in the axis where it is longer."""
-CONTEXT = 2.5
+CLOSE_FILL = 0.6
+"""Part of the close view that the box fills, along its longer side."""
+WIDE_FACTOR = 2.5
 """How many times as wide the wide view is."""
 NARROWEST, WIDEST = np.tan(np.radians([4.0, 65.0]))
 """Half fields of view, as tangents."""
@@ -33,7 +33,7 @@ SCALARS = 5
 
 @dataclass(frozen=True)
 class Glimpses:
-    """N looks at targets."""
+    """N glimpses of targets."""
 
     images: NDArray[np.uint8]
     """uint8 [N, 2, 64, 64, 3]: close and wide."""
@@ -61,66 +61,69 @@ class Glimpses:
         return Glimpses(self.images[rows], self.boxes[rows], self.scalars[rows])
 
 
-def joined(parts: Sequence[Glimpses]) -> Glimpses:
-    """All of several in one; none of none."""
+def join_glimpses(parts: Sequence[Glimpses]) -> Glimpses:
+    """Concatenate glimpses; an empty list gives none."""
     empty = np.zeros((0, 2, SIDE, SIDE, 3), np.uint8), np.zeros((0, 2, 4)), np.zeros((0, SCALARS))
     columns = zip(*((part.images, part.boxes, part.scalars) for part in parts), strict=True)
     images, boxes, scalars = (np.concatenate(column) for column in columns) if parts else empty
     return Glimpses(images, boxes.astype(np.float32), scalars.astype(np.float32))
 
 
-def glimpses(
+def extract_glimpses(
     panoramas: NDArray[np.uint8], masks: NDArray[np.bool_], real: NDArray[np.bool_]
 ) -> tuple[Glimpses, NDArray[np.int64]]:
-    """Looks at the target in those of K panoramas that show it, and which of them these are.
+    """Extract glimpses of the target from those of K panoramas that show it; return them with the panoramas' indices.
 
     Args:
         panoramas: uint8 [K, H, W, 3].
         masks: bool [K, H, W]: the target's pixels; only the box around them is used.
-        real: bool [K]: True where the panorama is an observation, not imagination.
+        real: bool [K]: True where the panorama is an observation, False where it is imagined.
 
     Raises:
         ArgumentError: arrays of other shapes.
     """
     if panoramas.ndim != 4 or panoramas.shape[3] != 3 or masks.shape != panoramas.shape[:3]:
         raise ArgumentError(
-            f"glimpses: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape}, {masks.shape}"
+            f"extract_glimpses: expected panoramas [K, H, W, 3] and masks [K, H, W], got {panoramas.shape} and "
+            f"{masks.shape}"
         )
     if np.shape(real) != (len(panoramas),):
-        raise ArgumentError(f"glimpses: expected one flag a panorama [{len(panoramas)}], got {np.shape(real)}")
+        raise ArgumentError(f"extract_glimpses: expected one flag a panorama [{len(panoramas)}], got {np.shape(real)}")
     frames = np.flatnonzero(masks.any(axis=(1, 2)))
-    return joined([_glimpse(panoramas[k], masks[k], bool(real[k])) for k in frames]), frames
+    return join_glimpses([_extract_glimpse(panoramas[k], masks[k], bool(real[k])) for k in frames]), frames
 
 
-def _glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimpses:
-    yaw, pitch = _direction(mask)
-    x, y, elevation = _angles(mask, yaw, pitch)
-    close = _quantised(float(max(np.abs(x).max(), np.abs(y).max())) / FILL)
-    fields = [close, _quantised(close * CONTEXT)]
+def _extract_glimpse(image: NDArray[np.uint8], mask: Mask, real: bool) -> Glimpses:
+    yaw, pitch = _find_direction(mask)
+    x, y, elevation = _compute_angles(mask, yaw, pitch)
+    close = _quantise_field(float(max(np.abs(x).max(), np.abs(y).max())) / CLOSE_FILL)
+    fields = [close, _quantise_field(close * WIDE_FACTOR)]
     half = np.pi / image.shape[1]  # of a pixel, whose rays pass through its middle
     extent = np.array([x.min() - half, -y.max() - half, x.max() + half, half - y.min()])
     width, height = np.arctan([extent[2] - extent[0], extent[3] - extent[1]])
     scalars = [width, height, elevation.max() + half, elevation.min() - half, float(real)]
     return Glimpses(
-        np.stack([_view(image, yaw, pitch, field) for field in fields])[None],
+        np.stack([_cut_view(image, yaw, pitch, field) for field in fields])[None],
         np.stack([np.clip((extent / field + 1) / 2, 0, 1) for field in fields])[None].astype(np.float32),
         np.array([scalars], np.float32),
     )
 
 
-def _direction(mask: Mask) -> tuple[float, float]:
-    """Yaw (a whole column) and pitch (a whole step) of the middle of the mask's box; left and up positive."""
+def _find_direction(mask: Mask) -> tuple[float, float]:
+    """Return yaw (a whole column) and pitch (a whole step) of the middle of the mask's box; left and up positive."""
     rows, columns = mask.shape
-    box = box_of(mask, wraps=True)
+    box = find_box(mask, wraps=True)
     assert box is not None
-    middle = round(box[0] + width_of(box, columns) / 2) % columns
+    middle = round(box[0] + box_width(box, columns) / 2) % columns
     pitch = 90 - 90 * (box[1] + box[3]) / rows
     return (columns / 2 - middle) * 360 / columns, round(pitch / PITCH_STEP) * PITCH_STEP
 
 
-def _angles(mask: Mask, yaw_deg: float, pitch_deg: float) -> tuple[NDArray[np.float64], ...]:
-    """Of the mask's pixels: tangents to the right and up in a view of this direction, and elevation in radians."""
-    rays = _rays(mask.shape[0], mask.shape[1])[np.flatnonzero(mask)]
+def _compute_angles(mask: Mask, yaw_deg: float, pitch_deg: float) -> tuple[NDArray[np.float64], ...]:
+    """Return the mask's pixels as tangents to the right and up in a view of this direction, and as elevations in
+    radians.
+    """
+    rays = _get_rays(mask.shape[0], mask.shape[1])[np.flatnonzero(mask)]
     yaw, pitch = np.radians([yaw_deg, pitch_deg])
     sin, cos = np.sin(yaw), np.cos(yaw)
     ahead = np.array([-sin * np.cos(pitch), np.sin(pitch), -cos * np.cos(pitch)])
@@ -130,27 +133,27 @@ def _angles(mask: Mask, yaw_deg: float, pitch_deg: float) -> tuple[NDArray[np.fl
     return x / z, y / z, np.arcsin(np.clip(rays[:, 1], -1, 1))
 
 
-def _quantised(field: float) -> float:
+def _quantise_field(field: float) -> float:
     field = float(np.clip(field, NARROWEST, WIDEST))
     return float(STEP ** np.ceil(np.log(field) / np.log(STEP) - 1e-9))
 
 
-def _view(image: NDArray[np.uint8], yaw: float, pitch: float, field: float) -> NDArray[np.uint8]:
-    """A square view; where its pixels are coarser than the panorama's, a mean of finer ones."""
+def _cut_view(image: NDArray[np.uint8], yaw: float, pitch: float, field: float) -> NDArray[np.uint8]:
+    """Cut a square view; where its pixels are coarser than the panorama's, average finer ones."""
     coarser = (2 * field / SIDE) / (2 * np.pi / image.shape[1])
     finer = 1 if coarser < 1.4 else 2 if coarser < 2.8 else 4
-    plan = _plan((image.shape[0], image.shape[1]), finer * SIDE, field, pitch)
+    plan = _get_plan((image.shape[0], image.shape[1]), finer * SIDE, field, pitch)
     view = plan(image, yaw)
     return view if finer == 1 else panorama.resize(view, (SIDE, SIDE))
 
 
 @lru_cache(maxsize=256)
-def _plan(size: tuple[int, int], side: int, field: float, pitch: float) -> PerspectivePlan:
+def _get_plan(size: tuple[int, int], side: int, field: float, pitch: float) -> PerspectivePlan:
     return PerspectivePlan(size, (side, side), float(np.degrees(2 * np.arctan(field))), pitch)
 
 
 @lru_cache(maxsize=4)
-def _rays(rows: int, columns: int) -> NDArray[np.float32]:
+def _get_rays(rows: int, columns: int) -> NDArray[np.float32]:
     rays = panorama.directions((rows, columns)).reshape(-1, 3)
     rays.setflags(write=False)
     return rays

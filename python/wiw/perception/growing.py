@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reprojection that goes on into what the real observation did not show, by the imagined frame's colours."""
+"""Reprojection extended into regions that the real observation did not show, by the imagined frame's colours."""
 
 from __future__ import annotations
 
@@ -9,76 +9,76 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.perception.boxes import Mask, box_of, width_of
+from wiw.perception.boxes import Mask, box_width, find_box
 from wiw.perception.tracking import Reprojection
 from wiw.types import Box, Observation
 
 MARGIN = 8.0
-"""Pixels around the box that are looked at, besides as much again as the box is wide or high."""
+"""Pixels searched around the box, besides the box's own width or height."""
 SIDE = 96
-"""Pixels of the longer side at which colours are compared."""
-NEAR = 5
-"""Pixels (at that size) around the seed that are taken for the target until colours tell otherwise."""
+"""Longer side in pixels at which colours are compared."""
+SEED_MARGIN = 5
+"""Pixels (at that size) around the seed that count as the target until colours decide."""
 ROUNDS = 3
-FEWEST = 3
-"""Pixels that either part must have for their colours to be told apart."""
+MIN_PIXELS = 3
+"""Pixels that foreground and background must each have for their colours to be compared."""
 
 
 class Growing(Reprojection):
-    """A reprojected mask is the seed; GrabCut (Rother et al., SIGGRAPH 2004) lets it grow into the warp's holes.
+    """Grows a reprojected mask into the warp's holes by GrabCut (Rother et al., SIGGRAPH 2004).
 
-    What the observation did show is either in the seed or not the target. What it did not show, because something hid
-    it, may be more of the target, and the frame tells if it goes on in the same colours.
+    Pixels that the observation showed are either in the seed or not the target. Those it did not show, because
+    something was in front, may belong to the target if they continue its colours.
     """
 
-    def masks(
+    def predict_masks(
         self,
         observations: Sequence[Observation],
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
     ) -> list[NDArray[np.bool_]]:
-        """The grown masks."""
-        seeds = self.reprojected(observations, viewpoints, frames, panoramic)
+        """Return the grown masks."""
+        seeds = self.reproject_with_holes(observations, viewpoints, frames, panoramic)
         return [
-            np.array([grown(*parts, panoramic) for parts in zip(images, masks, holes, strict=True)], bool)
+            np.array([grow_mask(*parts, panoramic) for parts in zip(images, masks, holes, strict=True)], bool)
             for images, (masks, holes) in zip(frames, seeds, strict=True)
         ]
 
 
-def grown(frame: NDArray[np.uint8], seed: Mask, unseen: Mask, wraps: bool) -> Mask:
-    """The seed, bool [H, W], and those of the unseen pixels around that hang together with it and have its colours."""
-    box = box_of(seed, wraps)
+def grow_mask(frame: NDArray[np.uint8], seed: Mask, unseen: Mask, wraps: bool) -> Mask:
+    """Return the seed, bool [H, W], with the connected unseen pixels that have its colours."""
+    box = find_box(seed, wraps)
     if box is None or not unseen.any():
         return seed
-    shift = round(seed.shape[1] / 2 - box[0] - width_of(box, seed.shape[1]) / 2) if wraps else 0
+    shift = round(seed.shape[1] / 2 - box[0] - box_width(box, seed.shape[1]) / 2) if wraps else 0
     image, own, open_ = np.roll(frame, shift, axis=1), np.roll(seed, shift, axis=1), np.roll(unseen, shift, axis=1)
-    middle = box_of(own)
+    middle = find_box(own)
     assert middle is not None
-    crop = _around(middle, seed.shape)
+    crop = _crop_around(middle, seed.shape)
     found = own.copy()
-    found[crop] |= _cut(image[crop], own[crop], open_[crop]) & open_[crop]
+    found[crop] |= _run_grabcut(image[crop], own[crop], open_[crop]) & open_[crop]
     return np.roll(found, -shift, axis=1)
 
 
-def _around(box: Box, size: Sequence[int]) -> tuple[slice, slice]:
+def _crop_around(box: Box, size: Sequence[int]) -> tuple[slice, slice]:
     left, top, right, bottom = box
     more = max(right - left, bottom - top) + MARGIN
     rows = slice(int(max(0, top - more)), int(min(size[0], bottom + more)))
     return rows, slice(int(max(0, left - more)), int(min(size[1], right + more)))
 
 
-def _cut(image: NDArray[np.uint8], seed: Mask, unseen: Mask) -> Mask:
-    """GrabCut at a small size: seed and seen pixels are settled, unseen ones are not."""
+def _run_grabcut(image: NDArray[np.uint8], seed: Mask, unseen: Mask) -> Mask:
+    """Run GrabCut at a small size: seed and seen pixels are fixed, unseen ones are not."""
     scale = min(1.0, SIDE / max(image.shape[:2]))
     size = tuple(max(2, round(edge * scale)) for edge in image.shape[1::-1])
     labels = np.where(unseen, cv2.GC_PR_BGD, cv2.GC_BGD).astype(np.uint8)
     labels[seed] = cv2.GC_FGD
     labels = np.asarray(cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST), np.uint8)
     settled = labels == cv2.GC_FGD
-    if min(settled.sum(), (labels != cv2.GC_FGD).sum()) < FEWEST:
+    if min(settled.sum(), (labels != cv2.GC_FGD).sum()) < MIN_PIXELS:
         return seed
-    near = cv2.dilate(settled.astype(np.uint8), np.ones((NEAR, NEAR), np.uint8)) > 0
+    near = cv2.dilate(settled.astype(np.uint8), np.ones((SEED_MARGIN, SEED_MARGIN), np.uint8)) > 0
     labels[near & (labels == cv2.GC_PR_BGD)] = cv2.GC_PR_FGD
     small = np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     cv2.setRNGSeed(0)  # its mixtures of colours begin at random

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks of `transformers` with their weights, and images as they want them; torchvision is never needed."""
+"""Loading of networks and image processors of `transformers`; torchvision is never needed."""
 
 from __future__ import annotations
 
@@ -13,34 +13,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, DependencyError, WeightsError
-from wiw.networks import explained, is_path
+from wiw.networks import explain_hub_error, is_path
 
 MEAN = (0.485, 0.456, 0.406)
+"""ImageNet's mean and standard deviation, channel by channel."""
 STD = (0.229, 0.224, 0.225)
 """Of ImageNet, channel by channel."""
 
 
-def network(loader: str, kinds: Sequence[str], weights: str | Path, revision: str | None, device: str) -> Any:
-    """A network with all its weights, ready to be asked.
+def load_network(loader: str, kinds: Sequence[str], weights: str | Path, revision: str | None, device: str) -> Any:
+    """Load a network with all its weights, in evaluation mode.
 
     Args:
         loader: a class of `transformers`.
-        kinds: `model_type` of the configurations it may have.
-        weights: a folder as `save_pretrained` writes it, or a name on the Hugging Face hub.
+        kinds: accepted values of the configuration's `model_type`.
+        weights: a folder written by `save_pretrained`, or a name on the Hugging Face hub.
         revision: of the hub's repository: pins a commit.
         device: of torch.
 
     Raises:
         DependencyError: torch or transformers is not installed.
-        WeightsError: there are no such weights, or they are another network's.
-        ArgumentError: a revision of a folder.
+        WeightsError: there are no such weights, or they belong to another network.
+        ArgumentError: a revision was given for a folder.
     """
-    transformers = library()
-    config = part("AutoConfig", weights, revision)
+    transformers = import_transformers()
+    config = load_component("AutoConfig", weights, revision)
     if config.model_type not in kinds:
         raise WeightsError(f"{weights} holds a '{config.model_type}': expected {' or '.join(kinds)}", "unfit")
     load = getattr(transformers, loader).from_pretrained
-    model, report = _read(load, weights, revision, output_loading_info=True)
+    model, report = _load(load, weights, revision, output_loading_info=True)
     if missing := sorted(report["missing_keys"]):
         raise WeightsError(
             f"{weights} has no weights for {len(missing)} parts of {type(model).__name__}: {', '.join(missing[:5])}",
@@ -49,19 +50,21 @@ def network(loader: str, kinds: Sequence[str], weights: str | Path, revision: st
     return model.to(device).float().eval().requires_grad_(False)
 
 
-def part(loader: str, weights: str | Path, revision: str | None) -> Any:
-    """What lies beside the weights: `transformers.LOADER.from_pretrained`; raises what `network` does."""
-    return _read(getattr(library(), loader).from_pretrained, weights, revision)
+def load_component(loader: str, weights: str | Path, revision: str | None) -> Any:
+    """Load a file beside the weights by `transformers.LOADER.from_pretrained`; raises what `load_network` does."""
+    return _load(getattr(import_transformers(), loader).from_pretrained, weights, revision)
 
 
-def image_processor(kind: str, weights: str | Path, revision: str | None) -> Any:
-    """What scales and normalises images for a network of a kind, in NumPy and Pillow; raises what `network` does."""
+def load_image_processor(kind: str, weights: str | Path, revision: str | None) -> Any:
+    """Load the image processor of a network, in NumPy and Pillow; raises what `load_network` does."""
     in_numpy = f"{kind}ImageProcessorPil"  # before transformers 5 it was the one without a suffix
-    return part(in_numpy if hasattr(library(), in_numpy) else f"{kind}ImageProcessor", weights, revision)
+    return load_component(
+        in_numpy if hasattr(import_transformers(), in_numpy) else f"{kind}ImageProcessor", weights, revision
+    )
 
 
-def library() -> Any:
-    """The module `transformers`, with torch.
+def import_transformers() -> Any:
+    """Import the module `transformers`, with torch.
 
     Raises:
         DependencyError: one of them is not installed.
@@ -73,8 +76,8 @@ def library() -> Any:
         raise DependencyError(f"{error.name or error} not installed; pip install 'wiw[torch]'") from error
 
 
-def square(images: Sequence[NDArray[np.uint8]], side: int, device: str) -> Any:
-    """Float tensor [B, 3, side, side] around 0: each image resized, whatever its aspect ratio, as SAM 2 has it."""
+def to_square_batch(images: Sequence[NDArray[np.uint8]], side: int, device: str) -> Any:
+    """Resize images to a normalised float tensor [B, 3, side, side], ignoring aspect ratios, as SAM 2 expects."""
     import torch
 
     resized = []
@@ -85,7 +88,7 @@ def square(images: Sequence[NDArray[np.uint8]], side: int, device: str) -> Any:
     return (torch.cat(resized) - mean) / std
 
 
-def _read(load: Callable[..., Any], weights: str | Path, revision: str | None, **options: Any) -> Any:
+def _load(load: Callable[..., Any], weights: str | Path, revision: str | None, **options: Any) -> Any:
     folder = Path(weights).expanduser()
     local = folder.is_dir()
     if local and revision is not None:
@@ -95,18 +98,18 @@ def _read(load: Callable[..., Any], weights: str | Path, revision: str | None, *
             f"no folder {folder.resolve()}; give one that save_pretrained wrote, or a name on the Hugging Face hub"
         )
     try:
-        with _quiet():
+        with _silence_transformers():
             return load(folder, **options) if local else load(str(weights), revision=revision, **options)
     except Exception as error:
         if not local:
-            raise explained(error, str(weights), revision) from error
+            raise explain_hub_error(error, str(weights), revision) from error
         first = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise WeightsError(f"{folder}: {first}; give a folder that save_pretrained wrote", "unfit") from error
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Holds back the library's progress bars and remarks: a run has its own, and what matters is checked."""
+def _silence_transformers() -> Iterator[None]:
+    """Suppress the library's progress bars and warnings: a run has its own, and everything relevant is checked."""
     from transformers.utils import logging
 
     shown, level = logging.is_progress_bar_enabled(), logging.get_verbosity()

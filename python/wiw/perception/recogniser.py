@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The built-in recogniser: what a boxed thing is, from any number of real and imagined looks at it, with no VLM."""
+"""The built-in recogniser: names a boxed object from any number of real and imagined glimpses, without a VLM."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, BackendError, FileError
 from wiw.files import whole_file
-from wiw.networks import one_thread
+from wiw.networks import single_thread
 from wiw.perception.calibration import softmax
-from wiw.perception.glimpses import Glimpses, joined
+from wiw.perception.glimpses import Glimpses, join_glimpses
 
 if TYPE_CHECKING:
     from wiw.perception.recognition_network import Network
@@ -29,9 +29,9 @@ class Recogniser:
     Args:
         network: `wiw.perception.recognition_network.Network`; its weights are rounded to half precision, in which they
             are stored, so that a loaded recogniser answers exactly as the saved one.
-        categories: what its logits stand for.
-        temperature: the logits are divided by it.
-        card: how it was made and measured, JSON-able: recipe, accuracy, calibration.
+        categories: the names of its logits.
+        temperature: divides the logits.
+        card: how it was trained and evaluated, JSON-able: recipe, accuracy, calibration.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class Recogniser:
 
     @classmethod
     def load(cls, path: str | Path) -> Recogniser:
-        """A recogniser from its file.
+        """Load a recogniser from its file.
 
         Raises:
             BackendError: torch or safetensors is not installed.
-            FileError: there is no such file, or it is damaged or not one of these.
+            FileError: there is no such file, or it is damaged or of another format.
         """
         require_torch()
         from safetensors import SafetensorError, safe_open
@@ -68,7 +68,7 @@ class Recogniser:
 
         try:
             with safe_open(path, framework="pt") as file:
-                header = _header(file.metadata(), path)
+                header = _parse_header(file.metadata(), path)
                 weights = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 - it is no mapping
         except (OSError, SafetensorError) as error:
             raise FileError(
@@ -89,14 +89,14 @@ class Recogniser:
             ) from error
 
     def save(self, path: str | Path) -> None:
-        """Writes half-precision weights with a JSON header, whole or not at all.
+        """Write half-precision weights with a JSON header, atomically.
 
         Raises:
             FileError: the file cannot be written.
         """
         from safetensors.torch import save
 
-        from wiw.perception.recognition_network import state
+        from wiw.perception.recognition_network import select_float_state
 
         header = {
             "categories": list(self.categories),
@@ -104,39 +104,41 @@ class Recogniser:
             "temperature": self.temperature,
             "card": self.card,
         }
-        weights = {name: value.half().contiguous() for name, value in state(self.network).items()}
+        weights = {name: value.half().contiguous() for name, value in select_float_state(self.network).items()}
         metadata = {"format": FORMAT, "header": json.dumps(header, sort_keys=True)}
         with whole_file(Path(path)) as draft:
             draft.write_bytes(save(weights, metadata))
 
     def __call__(self, sets: Sequence[Glimpses], choices: Sequence[str] | None = None) -> NDArray[np.float64]:
-        """What each target is, from all looks at it: float64 [sets, choices], rows sum to 1.
+        """Classify each target by all its glimpses: float64 [sets, choices], rows sum to 1.
 
-        A target without any look gets equal probabilities. Rows do not depend on what else is asked.
+        A target without glimpses gets equal probabilities. Rows do not depend on the other sets.
 
         Args:
-            sets: looks at one target each, real and imagined.
-            choices: what is to be chosen from; None means `categories`. Probabilities of other categories are left out,
-                and the rest scaled to sum to 1.
+            sets: glimpses of one target each, real and imagined.
+            choices: the possible answers; None means `categories`. Probabilities of other categories are dropped, and
+                the rest scaled to sum to 1.
 
         Raises:
             ArgumentError: a choice that the recogniser was not trained on.
         """
-        columns = self._columns(self.categories if choices is None else choices)
-        return softmax(self.logits(sets)[:, columns], self.temperature)
+        columns = self._find_columns(self.categories if choices is None else choices)
+        return softmax(self.compute_logits(sets)[:, columns], self.temperature)
 
-    def logits(self, sets: Sequence[Glimpses]) -> NDArray[np.float64]:
-        """Float64 [sets, categories], before the temperature."""
+    def compute_logits(self, sets: Sequence[Glimpses]) -> NDArray[np.float64]:
+        """Return float64 [sets, categories], before the temperature."""
         import torch
 
-        from wiw.perception.recognition_network import pictures
+        from wiw.perception.recognition_network import to_network_input
 
-        looks = joined(sets)
+        looks = join_glimpses(sets)
         owners = torch.from_numpy(np.repeat(np.arange(len(sets)), [len(each) for each in sets]))
-        with torch.inference_mode(), one_thread():
+        with torch.inference_mode(), single_thread():
             rows = [
-                self.network.looks(  # one at a time: how rows round may hang on how many there are
-                    pictures(torch.from_numpy(looks.images[i : i + 1]), torch.from_numpy(looks.boxes[i : i + 1])),
+                self.network.encode_glimpses(  # one at a time: how rows round may hang on how many there are
+                    to_network_input(
+                        torch.from_numpy(looks.images[i : i + 1]), torch.from_numpy(looks.boxes[i : i + 1])
+                    ),
                     torch.from_numpy(looks.scalars[i : i + 1]),
                 )
                 for i in range(len(looks))
@@ -144,9 +146,9 @@ class Recogniser:
             if not rows:
                 return np.zeros((len(sets), len(self.categories)))
             logits, weights = (torch.cat(column) for column in zip(*rows, strict=True))
-            return self.network.fused(logits, weights, owners, len(sets)).double().numpy()
+            return self.network.fuse(logits, weights, owners, len(sets)).double().numpy()
 
-    def _columns(self, choices: Sequence[str]) -> list[int]:
+    def _find_columns(self, choices: Sequence[str]) -> list[int]:
         unknown = sorted(set(choices) - set(self.categories))
         if unknown or not choices:
             raise ArgumentError(
@@ -158,7 +160,7 @@ class Recogniser:
 
 
 def require_torch() -> None:
-    """Raises a BackendError that says how to install torch and safetensors, unless they are."""
+    """Raise a BackendError that says how to install torch and safetensors, unless they are installed."""
     try:
         import safetensors  # noqa: F401
         import torch  # noqa: F401
@@ -169,7 +171,7 @@ def require_torch() -> None:
         ) from error
 
 
-def _header(metadata: Mapping[str, str] | None, path: str | Path) -> dict[str, Any]:
+def _parse_header(metadata: Mapping[str, str] | None, path: str | Path) -> dict[str, Any]:
     if not metadata or metadata.get("format") != FORMAT:
         raise FileError(
             f"{path}: expected the format '{FORMAT}' in its header, got {(metadata or {}).get('format')!r}; these are "

@@ -12,27 +12,26 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.errors import ArgumentError, DependencyError, WeightsError
-from wiw.networks import device as usable
-from wiw.networks import memory_guard
+from wiw.networks import memory_guard, resolve_device
 from wiw.perception.semantics import CATEGORIES, Semantics
 
 FILE = "rednet_semmap_mp3d_tuned.pth"
 CLASSES = len(CATEGORIES) - 1
-"""The network's channel c is category c + 1; none is void."""
-COLOUR = ((0.493, 0.468, 0.438), (0.544, 0.521, 0.499))
-DEPTH = (0.213, 0.285)
-"""Mean and standard deviation with which the published weights are fed, of colours and depth from 0 to 1."""
+"""The network's channel c is category c + 1; void has none."""
+COLOUR_STATISTICS = ((0.493, 0.468, 0.438), (0.544, 0.521, 0.499))
+DEPTH_STATISTICS = (0.213, 0.285)
+"""Mean and standard deviation of the published weights' input, of colours and depth from 0 to 1."""
 STRIDE = 32
 
 
 class RedNet(Semantics):
-    """Looks at the six faces of a panorama's cube one by one.
+    """Labels the six faces of a panorama's cube one by one.
 
     Args:
-        weights: the checkpoint rednet_semmap_mp3d_tuned.pth or the folder it is in: Matterport3D, 40 categories.
+        weights: the checkpoint rednet_semmap_mp3d_tuned.pth or its folder: Matterport3D, 40 categories.
         device: of torch; the GPU if there is one.
         face: pixels of a face's side; 640 is the scale of the training images, 480 x 640 with HFOV 90.
-        metres: what depths 0 and 1 of the network's input are, as of Habitat's depth sensor.
+        metres: depths that 0 and 1 of the network's input stand for, as of Habitat's depth sensor.
         batch: faces in one call of the network.
 
     Raises:
@@ -58,19 +57,19 @@ class RedNet(Semantics):
         self.face, self.metres, self.batch = face, metres, batch
         path = Path(weights).expanduser()
         self.weights = path / FILE if path.is_dir() else path
-        self._model, self.device = _loaded(self.weights, device)
+        self._model, self.device = _load_network(self.weights, device)
 
     def describe(self) -> dict[str, Any]:
-        """What the labels depend on."""
+        """Return what the labels depend on."""
         return {**super().describe(), "weights": self.weights.name, "face": self.face, "metres": list(self.metres)}
 
-    def panoramas(
+    def label_panoramas(
         self,
         images: NDArray[np.uint8],
         depth: NDArray[np.float32] | None = None,
         ids: NDArray[np.uint32] | None = None,
     ) -> NDArray[np.uint32]:
-        """The likeliest category of each pixel, 1 to 40."""
+        """Return the likeliest category of each pixel, 1 to 40."""
         if depth is None or images.ndim != 4 or depth.shape != images.shape[:3]:
             raise ArgumentError(
                 f"RedNet: expected panoramas [B, H, W, 3] and depth [B, H, W], got {images.shape} and "
@@ -81,11 +80,11 @@ class RedNet(Semantics):
         for row, (image, distance) in enumerate(zip(images, depth, strict=True)):
             colours = panorama.to_cubemap(image, self.face)
             planar = panorama.distance_to_planar(panorama.to_cubemap(distance, self.face, "nearest"), 90.0)
-            found[row] = panorama.from_cubemap(self.views(colours, planar), size, "nearest")
+            found[row] = panorama.from_cubemap(self.label_views(colours, planar), size, "nearest")
         return found
 
-    def views(self, images: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint32]:
-        """The same of perspective views: uint8 [B, H, W, 3] and planar depth float32 [B, H, W] to uint32 [B, H, W].
+    def label_views(self, images: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint32]:
+        """Label perspective views: uint8 [B, H, W, 3] and planar depth float32 [B, H, W] to uint32 [B, H, W].
 
         Raises:
             ArgumentError: arrays of other shapes, or sides that are no multiples of 32.
@@ -98,25 +97,25 @@ class RedNet(Semantics):
             )
         parts = [slice(first, first + self.batch) for first in range(0, len(images), self.batch)]
         with memory_guard("RedNet", "give a smaller batch or face"):
-            return np.concatenate([self._categories(images[part], depth[part]) for part in parts])
+            return np.concatenate([self._predict_categories(images[part], depth[part]) for part in parts])
 
-    def _categories(self, images: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint32]:
+    def _predict_categories(self, images: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint32]:
         import torch
 
         nearest, farthest = self.metres
         with torch.inference_mode():
             colour = torch.from_numpy(np.ascontiguousarray(images)).to(self.device).permute(0, 3, 1, 2).float() / 255
-            mean, std = (torch.tensor(values, device=self.device)[:, None, None] for values in COLOUR)
+            mean, std = (torch.tensor(values, device=self.device)[:, None, None] for values in COLOUR_STATISTICS)
             planar = torch.from_numpy(np.ascontiguousarray(depth)).to(self.device)[:, None].float()
             part = ((planar - nearest) / (farthest - nearest)).clamp(0, 1)
-            scores = self._model((colour - mean) / std, (part - DEPTH[0]) / DEPTH[1])
+            scores = self._model((colour - mean) / std, (part - DEPTH_STATISTICS[0]) / DEPTH_STATISTICS[1])
             return np.asarray((scores.argmax(dim=1) + 1).cpu().numpy(), np.uint32)
 
 
-def _loaded(path: Path, device: str | None) -> tuple[Any, str]:
-    """The network with the weights in a file, and where it is."""
+def _load_network(path: Path, device: str | None) -> tuple[Any, str]:
+    """Load the network with the weights of a file; return it with its device."""
     try:
-        from wiw.perception.rednet_network import empty, width_of
+        from wiw.perception.rednet_network import create_empty, infer_width
     except ImportError as error:
         raise DependencyError(f"{error.name or error} not installed; pip install 'wiw[torch]'") from error
     if not path.is_file():
@@ -124,12 +123,12 @@ def _loaded(path: Path, device: str | None) -> tuple[Any, str]:
             f"no file {path}; the pages of Semantic-MapNet and Habitat-Web link to {FILE} (CC BY-NC 4.0, for "
             "research). The simulator's semantics need no weights: wiw.perception.semantics.TrueSemantics"
         )
-    state = _state(path)
+    state = _read_state(path)
     if "conv1.weight" not in state:
         raise WeightsError(
             f"{path}: no weights of RedNet: there is no 'conv1.weight', but {sorted(state)[:5]}", "unfit"
         )
-    network = empty(CLASSES, width_of(state))
+    network = create_empty(CLASSES, infer_width(state))
     expected = {name: tuple(value.shape) for name, value in network.state_dict().items()}
     differing = sorted(
         name
@@ -143,12 +142,12 @@ def _loaded(path: Path, device: str | None) -> tuple[Any, str]:
             "unfit",
         )
     network.load_state_dict(state, assign=True)
-    where = usable(device)
+    where = resolve_device(device)
     return network.to(where).float().eval().requires_grad_(False), where
 
 
-def _state(path: Path) -> dict[str, Any]:
-    """The tensors of a checkpoint, by names without the prefix of parallel training."""
+def _read_state(path: Path) -> dict[str, Any]:
+    """Read the tensors of a checkpoint, by names without the prefix of parallel training."""
     import torch
 
     if path.suffix == ".safetensors":

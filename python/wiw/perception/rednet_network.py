@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 BLOCKS = (3, 4, 6, 3)
-"""Of each stage of ResNet-50."""
+"""Blocks of each stage of ResNet-50."""
 DECODER = (6, 4, 3, 3)
 """Blocks of the decoder's stages, the coarsest first."""
 EXPANSION = 4
@@ -60,8 +60,8 @@ class RedNet(nn.Module):
 
     def __init__(self, classes: int = 40, width: int = 64) -> None:
         super().__init__()
-        self._encoder(3, width, "")
-        self._encoder(1, width, "_d")
+        self._add_encoder(3, width, "")
+        self._add_encoder(1, width, "_d")
         widths = (width, width, 2 * width, 4 * width, 8 * width)
         joined = (width, *(EXPANSION * stage for stage in widths[1:]))
         for level, (inputs, outputs) in enumerate(zip(joined, widths, strict=True)):
@@ -76,7 +76,7 @@ class RedNet(nn.Module):
         for level in (5, 4, 3, 2):  # heads on coarser stages that only training asks
             self.add_module(f"out{level}_conv_custom", nn.Conv2d(widths[level - 2], classes, 1))
 
-    def _encoder(self, channels: int, width: int, suffix: str) -> None:
+    def _add_encoder(self, channels: int, width: int, suffix: str) -> None:
         self.add_module(f"conv1{suffix}", nn.Conv2d(channels, width, 7, 2, 3, bias=False))
         self.add_module(f"bn1{suffix}", nn.BatchNorm2d(width))
         inputs = width
@@ -104,12 +104,12 @@ class RedNet(nn.Module):
         return scores
 
 
-def width_of(state: dict[str, Tensor]) -> int:
-    """The width of the network that a state belongs to."""
+def infer_width(state: dict[str, Tensor]) -> int:
+    """Return the width of the network that a state belongs to."""
     return int(state["conv1.weight"].shape[0])
 
 
-def empty(classes: int, width: int) -> RedNet:
-    """The network without memory for its weights, to be given a state."""
+def create_empty(classes: int, width: int) -> RedNet:
+    """Create the network without memory for its weights, to be given a state."""
     with torch.device("meta"):
         return RedNet(classes, width)

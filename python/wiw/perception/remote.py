@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A detector in a process of its own, asked over HTTP; `docs/perception.md` has the protocol and a server's script."""
+"""A detector in its own process, queried over HTTP; `docs/perception.md` has the protocol and a server script."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, RemoteError
-from wiw.perception.detection import Detections, Detector, nothing
+from wiw.perception.detection import Detections, Detector, no_detections
 
 VERSION = 1
-MOST_BYTES = 64 * 2**20
-"""Of an answer."""
+MAX_BYTES = 64 * 2**20
+"""Greatest size of a response."""
 
 
 class Remote(Detector):
-    """Sends images and names, and reads boxes.
+    """Sends images and names, and receives boxes.
 
     Args:
         address: http://HOST:PORT. There is no token and no encryption: keep it on this machine, or in a tunnel.
-        seconds: for which an answer is waited for.
+        seconds: timeout of a request.
 
     Raises:
-        ArgumentError: no such address, or no time.
+        ArgumentError: an invalid address, or a timeout that is not above 0.
     """
 
     def __init__(self, address: str, seconds: float = 60.0) -> None:
@@ -45,21 +45,21 @@ class Remote(Detector):
     def find(
         self, images: Sequence[NDArray[np.uint8]], names: Sequence[str], ids: Sequence[NDArray[np.uint32]]
     ) -> list[Detections]:
-        """One request for all images.
+        """Send one request for all images.
 
         Raises:
-            RemoteError: nobody is there ("connection"), no answer in time ("deadline"), an error of the server
-                ("raised"), or an answer that is not as agreed ("message").
+            RemoteError: no connection ("connection"), no response in time ("deadline"), an error of the server
+                ("raised"), or a response that breaks the protocol ("message").
         """
-        question = {"version": VERSION, "names": list(names), "images": [_png(image) for image in images]}
-        said = self._post(json.dumps(question).encode())
+        question = {"version": VERSION, "names": list(names), "images": [_encode_png(image) for image in images]}
+        response = self._post(json.dumps(question).encode())
         try:
-            answers = json.loads(said)["detections"]
-            return [_detections(answer) for answer in answers]
+            answers = json.loads(response)["detections"]
+            return [_parse_detections(answer) for answer in answers]
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
             raise RemoteError(
                 f"{self.address}: expected {{'detections': [[{{'box': 4 numbers, 'score': number, 'label': name}}]]}} "
-                f"with a list for each image, got {said[:80]!r} ({type(error).__name__}: {error})",
+                f"with a list for each image, got {response[:80]!r} ({type(error).__name__}: {error})",
                 "message",
             ) from error
 
@@ -67,7 +67,7 @@ class Remote(Detector):
         request = Request(f"{self.address}/detect", body, {"Content-Type": "application/json"})
         try:
             with build_opener(ProxyHandler({})).open(request, timeout=self.seconds) as answer:
-                said = self._body(answer)
+                response = self._read_body(answer)
         except HTTPError as error:
             text = error.read(2000).decode(errors="replace").strip()
             raise RemoteError(f"{self.address} answered {error.code}: {text}", "raised") from error
@@ -79,27 +79,27 @@ class Remote(Detector):
                 raise RemoteError(text, "deadline") from error
             text = f"{self.address} cannot be reached ({error}); start the detector's server, see docs/perception.md"
             raise RemoteError(text, "connection") from error
-        if len(said) > MOST_BYTES:
-            raise RemoteError(f"{self.address}: an answer of more than {MOST_BYTES} bytes", "message")
-        return said
+        if len(response) > MAX_BYTES:
+            raise RemoteError(f"{self.address}: an answer of more than {MAX_BYTES} bytes", "message")
+        return response
 
-    def _body(self, answer: Any) -> bytes:
-        """Piece by piece, so that the pace at which they come does not say how long it takes."""
-        until, said = time.monotonic() + self.seconds, bytearray()
-        while (piece := answer.read1(1 << 16)) and len(said) <= MOST_BYTES:
-            said += piece
+    def _read_body(self, answer: Any) -> bytes:
+        """Read piece by piece, so that a slow stream cannot exceed the timeout."""
+        until, response = time.monotonic() + self.seconds, bytearray()
+        while (piece := answer.read1(1 << 16)) and len(response) <= MAX_BYTES:
+            response += piece
             if time.monotonic() > until:
                 raise TimeoutError
-        return bytes(said)
+        return bytes(response)
 
 
-def _png(image: NDArray[np.uint8]) -> str:
+def _encode_png(image: NDArray[np.uint8]) -> str:
     return base64.b64encode(cv2.imencode(".png", image[..., ::-1])[1].tobytes()).decode()
 
 
-def _detections(answer: list[dict[str, Any]]) -> Detections:
+def _parse_detections(answer: list[dict[str, Any]]) -> Detections:
     if not answer:
-        return nothing()
+        return no_detections()
     boxes = np.array([found["box"] for found in answer], np.float32)
     scores = np.array([found["score"] for found in answer], np.float32)
     if boxes.shape != (len(answer), 4) or scores.shape != (len(answer),):

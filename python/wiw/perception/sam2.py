@@ -12,28 +12,28 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.errors import ArgumentError
-from wiw.networks import device as usable
+from wiw.networks import resolve_device
 from wiw.perception import pretrained
-from wiw.perception.boxes import Mask, box_of, width_of
-from wiw.perception.tracking import Tracker, target_of
+from wiw.perception.boxes import Mask, box_width, find_box
+from wiw.perception.tracking import Tracker, get_target
 from wiw.types import Box, Observation
 
 
 class Sam2(Tracker):
     """Segments the target in the imagined frames as a video that begins with the real observation.
 
-    A panorama is turned first, so that the target is at its centre and not across the seam.
+    A panorama is rotated first, so that the target is at its centre and not across the seam.
 
     Args:
         weights: a folder or hub name that `transformers.Sam2VideoModel.from_pretrained` takes, or such a model.
-        prompt: what the first frame is marked with: the target's "box", as in the paper, or its "mask".
+        prompt: how the target is marked in the first frame: by its "box", as in the paper, or its "mask".
         device: of torch; the GPU if there is one.
         revision: of the hub's repository.
 
     Raises:
         ArgumentError: an unknown prompt, or there is no such device.
         DependencyError: torch or transformers is not installed.
-        WeightsError: the weights cannot be had or are another network's; its `kind` says why.
+        WeightsError: the weights cannot be loaded or belong to another network; its `kind` says why.
     """
 
     def __init__(
@@ -45,67 +45,69 @@ class Sam2(Tracker):
     ) -> None:
         if prompt not in ("box", "mask"):
             raise ArgumentError(f"Sam2: prompt: expected 'box' or 'mask', got {prompt!r}")
-        pretrained.library()
-        self.prompt, self.device = prompt, usable(device)
+        pretrained.import_transformers()
+        self.prompt, self.device = prompt, resolve_device(device)
         if isinstance(weights, str | Path):
-            weights = pretrained.network("Sam2VideoModel", ("sam2_video",), weights, revision, self.device)
+            weights = pretrained.load_network("Sam2VideoModel", ("sam2_video",), weights, revision, self.device)
         self._model = weights.to(self.device).eval()
 
-    def masks(
+    def predict_masks(
         self,
         observations: Sequence[Observation],
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
     ) -> list[NDArray[np.bool_]]:
-        """One video a plan; where the target is not in sight at the start there is nothing to follow."""
+        """Track one video per plan; a target that is out of sight at the start gets empty masks."""
         return [
-            self._panoramas(observation, images) if panoramic else self._front_views(observation, images)
+            self._track_panoramas(observation, images) if panoramic else self._track_front_views(observation, images)
             for observation, images in zip(observations, frames, strict=True)
         ]
 
-    def _panoramas(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        mask, columns = target_of(observation).mask, frames.shape[2]
-        box = box_of(mask, wraps=True)
+    def _track_panoramas(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        mask, columns = get_target(observation).mask, frames.shape[2]
+        box = find_box(mask, wraps=True)
         if box is None:
             return np.zeros(frames.shape[:3], bool)
-        middle = (box[0] + width_of(box, mask.shape[1]) / 2) / mask.shape[1]
+        middle = (box[0] + box_width(box, mask.shape[1]) / 2) / mask.shape[1]
         shift = columns // 2 - round(middle * columns)
-        start = np.roll(_fitted(observation.panorama, frames), shift, axis=1)
+        start = np.roll(_resize_to_frames(observation.panorama, frames), shift, axis=1)
         seed = np.roll(mask, round(shift * mask.shape[1] / columns), axis=1)
-        found = self._follow(start, np.roll(frames, shift, axis=2), seed, box_of(seed))
+        found = self._track_video(start, np.roll(frames, shift, axis=2), seed, find_box(seed))
         return np.roll(found, -shift, axis=2)
 
-    def _front_views(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    def _track_front_views(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
         seed = panorama.to_perspective(
-            target_of(observation).mask.astype(np.uint8), 90.0, observation.front.shape[:2], interpolation="nearest"
+            get_target(observation).mask.astype(np.uint8), 90.0, observation.front.shape[:2], interpolation="nearest"
         ).astype(bool)
-        return self._follow(_fitted(observation.front, frames), frames, seed, target_of(observation).front_box)
+        return self._track_video(
+            _resize_to_frames(observation.front, frames), frames, seed, get_target(observation).front_box
+        )
 
-    def _follow(
+    def _track_video(
         self, start: NDArray[np.uint8], frames: NDArray[np.uint8], seed: Mask, box: Box | None
     ) -> NDArray[np.bool_]:
-        """Masks of the frames after `start`, in which the target has the mask `seed`, or the box around it."""
+        """Return masks of the frames after `start`, in which the target has the mask `seed`, or the box around it."""
         import torch
 
         if box is None or not seed.any() or not len(frames):
             return np.zeros(frames.shape[:3], bool)
         with torch.inference_mode():
-            session = self._session(np.concatenate([start[None], frames]))
-            self._mark(session, seed, box)
+            session = self._create_session(np.concatenate([start[None], frames]))
+            self._prompt_target(session, seed, box)
             found = np.zeros(frames.shape[:3], bool)
             for output in self._model.propagate_in_video_iterator(session, start_frame_idx=0):
                 if output.frame_idx > 0 and bool((output.object_score_logits > 0).all()):
-                    found[output.frame_idx - 1] = _upsampled(output.pred_masks, frames.shape[1:3])
+                    found[output.frame_idx - 1] = _upsample_mask(output.pred_masks, frames.shape[1:3])
         return found
 
-    def _session(self, video: NDArray[np.uint8]) -> Any:
-        """The network's memory of one video: its frames, as it wants them."""
+    def _create_session(self, video: NDArray[np.uint8]) -> Any:
+        """Create the network's memory of one video, with its preprocessed frames."""
         import torch
         from transformers.models.sam2_video.modeling_sam2_video import Sam2VideoInferenceSession
 
         return Sam2VideoInferenceSession(
-            video=pretrained.square(list(video), self._side, self.device),
+            video=pretrained.to_square_batch(list(video), self._side, self.device),
             video_height=video.shape[1],
             video_width=video.shape[2],
             inference_device=self.device,
@@ -114,8 +116,8 @@ class Sam2(Tracker):
             dtype=torch.float32,
         )
 
-    def _mark(self, session: Any, seed: Mask, box: Box) -> None:
-        """Points the target out in frame 0."""
+    def _prompt_target(self, session: Any, seed: Mask, box: Box) -> None:
+        """Mark the target in frame 0."""
         import torch
 
         number = session.obj_id_to_idx(1)
@@ -134,8 +136,8 @@ class Sam2(Tracker):
         return int(self._model.image_size)
 
 
-def _fitted(image: NDArray[np.uint8], frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A real image in the frames' size."""
+def _resize_to_frames(image: NDArray[np.uint8], frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Resize a real image to the frames' size."""
     import cv2
 
     height, width = frames.shape[1:3]
@@ -144,8 +146,8 @@ def _fitted(image: NDArray[np.uint8], frames: NDArray[np.uint8]) -> NDArray[np.u
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _upsampled(logits: Any, size: Sequence[int]) -> NDArray[np.bool_]:
-    """Bool [H, W] of the frame's size from the network's small masks."""
+def _upsample_mask(logits: Any, size: Sequence[int]) -> NDArray[np.bool_]:
+    """Upsample the network's small mask to bool [H, W] of the frame's size."""
     import torch
 
     whole = torch.nn.functional.interpolate(logits.float(), tuple(size), mode="bilinear", align_corners=False)

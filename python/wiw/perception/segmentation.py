@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which pixels belong to the things in boxes: segmenters behind one interface."""
+"""Segmentation of objects in boxes: the interface of segmenters."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wiw.errors import ArgumentError, ContractError
-from wiw.perception.detection import Ids, Images, checked_images
+from wiw.perception.detection import Ids, Images, check_images
 
 
 class Segmenter(ABC):
-    """Fills boxes with masks. Subclasses write `masks`; everybody else calls `segment`."""
+    """Fills boxes with masks. Subclasses implement `predict_masks`; callers use `segment`."""
 
     needs: tuple[str, ...] = ()
     """"ids" where images must come with the simulator's instance ids."""
 
     @abstractmethod
-    def masks(
+    def predict_masks(
         self,
         images: Sequence[NDArray[np.uint8]],
         boxes: Sequence[NDArray[np.float32]],
         ids: Sequence[NDArray[np.uint32]],
     ) -> list[NDArray[np.bool_]]:
-        """Bool [N, H, W] an image for its boxes [N, 4]; `ids` is empty unless the segmenter needs it."""
+        """Return masks bool [N, H, W] for each image's boxes [N, 4]; `ids` is empty unless the segmenter needs it."""
 
     def segment(self, images: Images, boxes: Sequence[ArrayLike], ids: Ids = None) -> list[NDArray[np.bool_]]:
-        """The pixels of the thing in each box, bool [N, H, W] an image.
+        """Return the pixels of the object in each box, bool [N, H, W] per image.
 
         Args:
             images: as for `Detector.detect`.
@@ -37,17 +37,16 @@ class Segmenter(ABC):
             ids: the simulator's instance ids of the images, for segmenters that need them; others never see them.
 
         Raises:
-            ArgumentError: arrays of other shapes, boxes without area or across the seam of a panorama, or no ids where
-                needed.
-            ContractError: the segmenter's answer has another shape or type.
+            ArgumentError: arrays of other shapes, boxes without area or across the seam of a panorama, or missing ids.
+            ContractError: the segmenter's result has another shape or type.
         """
-        seen, pointed = checked_images("segment", images, ids, "ids" in self.needs)
+        seen, pointed = check_images("segment", images, ids, "ids" in self.needs)
         if len(boxes) != len(seen):
             raise ArgumentError(f"segment: expected one array of boxes an image, got {len(boxes)} for {len(seen)}")
-        asked = [_boxes(given) for given in boxes]
+        asked = [_check_boxes(given) for given in boxes]
         if not seen:
             return []
-        found = self.masks(seen, asked, pointed)
+        found = self.predict_masks(seen, asked, pointed)
         expected = [(len(given), *image.shape[:2]) for given, image in zip(asked, seen, strict=True)]
         if [mask.shape for mask in found] != expected or any(mask.dtype != bool for mask in found):
             came = [(str(mask.dtype), mask.shape) for mask in found]
@@ -55,7 +54,7 @@ class Segmenter(ABC):
         return found
 
 
-def _boxes(given: ArrayLike) -> NDArray[np.float32]:
+def _check_boxes(given: ArrayLike) -> NDArray[np.float32]:
     boxes = np.asarray(given, np.float32)
     boxes = boxes.reshape(0, 4) if boxes.size == 0 else boxes
     if boxes.ndim != 2 or boxes.shape[1] != 4:

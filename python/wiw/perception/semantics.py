@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each pixel is, in Matterport3D's categories (mpcat40): for world models that read semantics, as PathDreamer."""
+"""Semantic labels in Matterport3D's categories (mpcat40), for world models that read them, such as PathDreamer."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ CATEGORIES = (
     "tv monitor", "shower", "column", "bathtub", "counter", "fireplace", "lighting", "beam", "railing", "shelving",
     "blinds", "gym equipment", "seating", "board panel", "furniture", "appliances", "clothes", "objects", "misc",
 )  # fmt: skip
-"""By id, from 0 for nothing to 40."""
-WORDS = {
+"""Category names by id, from 0 for nothing to 40."""
+SYNONYMS = {
     "armchair": "chair",
     "blind": "blinds",
     "bookshelf": "shelving",
@@ -48,25 +48,25 @@ WORDS = {
     "wardrobe": "cabinet",
     "washing machine": "appliances",
 }
-"""Other words, those of the apartments among them, in these categories."""
-OTHER = CATEGORIES.index("objects")
-"""What words are that neither list has."""
+"""Other words for these categories, including those of the apartments."""
+OTHER_CATEGORY = CATEGORIES.index("objects")
+"""Category of words that neither list has."""
 
 
 class Semantics(ABC):
-    """Tells what each pixel of a panorama is."""
+    """Labels each pixel of a panorama with a category."""
 
     needs: tuple[str, ...] = ()
     """"depth", or the simulator's instance "ids"."""
 
     @abstractmethod
-    def panoramas(
+    def label_panoramas(
         self,
         images: NDArray[np.uint8],
         depth: NDArray[np.float32] | None = None,
         ids: NDArray[np.uint32] | None = None,
     ) -> NDArray[np.uint32]:
-        """Ids of `CATEGORIES`, uint32 [B, H, W], as `Conditioning.semantic` holds them.
+        """Return ids of `CATEGORIES`, uint32 [B, H, W], as in `Conditioning.semantic`.
 
         Args:
             images: uint8 [B, H, W, 3] panoramas.
@@ -78,40 +78,42 @@ class Semantics(ABC):
         """
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity for the run's manifest."""
+        """Return a JSON-able identity for the run's manifest."""
         return {"name": type(self).__name__}
 
 
 class TrueSemantics(Semantics):
-    """The simulator's own: each instance's category; 0 where nothing is hit.
+    """The simulator's own labels: each instance's category; 0 where nothing is hit.
 
     Args:
-        categories: id to category; `wiw.perception.simulator.categories_of(scene)`.
+        categories: id to category; `wiw.perception.simulator.read_categories(scene)`.
     """
 
     needs = ("ids",)
 
     def __init__(self, categories: Mapping[int, str]) -> None:
-        self.categories = {number: category_id(name) for number, name in categories.items()}
+        self.categories = {number: find_category_id(name) for number, name in categories.items()}
 
-    def panoramas(
+    def label_panoramas(
         self,
         images: NDArray[np.uint8],
         depth: NDArray[np.float32] | None = None,
         ids: NDArray[np.uint32] | None = None,
     ) -> NDArray[np.uint32]:
-        """Looks every id up; one that no instance has is an object."""
+        """Look up each instance's category; unknown instances are objects."""
         if ids is None or ids.shape != images.shape[:3]:
             raise ArgumentError(
                 f"TrueSemantics: expected ids {images.shape[:3]}, got {None if ids is None else ids.shape}"
             )
         numbers, places = np.unique(ids, return_inverse=True)
-        table = np.array([self.categories.get(int(number), OTHER) if number else 0 for number in numbers], np.uint32)
+        table = np.array(
+            [self.categories.get(int(number), OTHER_CATEGORY) if number else 0 for number in numbers], np.uint32
+        )
         return np.asarray(table[places.reshape(ids.shape)])
 
 
-def category_id(name: str) -> int:
-    """The id of a category or of another word for it; of "objects" for words unknown."""
+def find_category_id(name: str) -> int:
+    """Return the id of a category or of a synonym; of "objects" for unknown words."""
     word = name.strip().casefold().replace("_", " ")
-    word = WORDS.get(word, word)
-    return CATEGORIES.index(word) if word in CATEGORIES else OTHER
+    word = SYNONYMS.get(word, word)
+    return CATEGORIES.index(word) if word in CATEGORIES else OTHER_CATEGORY

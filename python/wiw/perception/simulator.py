@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.perception.boxes import box_of
-from wiw.perception.detection import Detections, Detector, nothing, overlaps
+from wiw.perception.boxes import find_box
+from wiw.perception.detection import Detections, Detector, compute_iou, no_detections
 from wiw.perception.segmentation import Segmenter
 
 
-def categories_of(scene: Any) -> dict[int, str]:
-    """What each of a scene's instances is, by id."""
+def read_categories(scene: Any) -> dict[int, str]:
+    """Return the category of each of a scene's instances, by id."""
     return {instance["id"]: instance["category"] for instance in scene.instances}
 
 
@@ -23,8 +23,8 @@ class TrueBoxes(Detector):
     """Boxes around the visible pixels of each instance, with score 1.
 
     Args:
-        categories: id to category; `categories_of(scene)`. Names match whatever their case, with spaces or underscores.
-        least_pixels: fewer visible pixels than this are no sight of a thing.
+        categories: id to category; `read_categories(scene)`. Names match regardless of case, with spaces or
+        underscores. least_pixels: an instance with fewer visible pixels is not reported.
     """
 
     needs = ("ids",)
@@ -35,50 +35,50 @@ class TrueBoxes(Detector):
     def find(
         self, images: Sequence[NDArray[np.uint8]], names: Sequence[str], ids: Sequence[NDArray[np.uint32]]
     ) -> list[Detections]:
-        """One detection an instance."""
-        asked = {_plain(name): name for name in names}
-        labels = {number: asked.get(_plain(category)) for number, category in self.categories.items()}
-        return [self._found(array, labels) for array in ids]
+        """Return one detection per instance."""
+        asked = {_normalise_name(name): name for name in names}
+        labels = {number: asked.get(_normalise_name(category)) for number, category in self.categories.items()}
+        return [self._find_boxes(array, labels) for array in ids]
 
-    def _found(self, ids: NDArray[np.uint32], labels: Mapping[int, str | None]) -> Detections:
+    def _find_boxes(self, ids: NDArray[np.uint32], labels: Mapping[int, str | None]) -> Detections:
         boxes, found = [], []
         for number, pixels in zip(*np.unique(ids, return_counts=True), strict=True):
             label = labels.get(int(number))
             if label is not None and pixels >= self.least_pixels:
-                boxes.append(box_of(ids == number))
+                boxes.append(find_box(ids == number))
                 found.append(label)
         return (
             Detections(np.array(boxes, np.float32), np.ones(len(boxes), np.float32), tuple(found))
             if boxes
-            else nothing()
+            else no_detections()
         )
 
 
 class TrueMasks(Segmenter):
-    """The visible pixels of the instance whose own box fits a box best; none where nothing touches it."""
+    """The visible pixels of the instance whose own box fits a box best; none where no box overlaps it."""
 
     needs = ("ids",)
 
-    def masks(
+    def predict_masks(
         self,
         images: Sequence[NDArray[np.uint8]],
         boxes: Sequence[NDArray[np.float32]],
         ids: Sequence[NDArray[np.uint32]],
     ) -> list[NDArray[np.bool_]]:
-        """One mask a box."""
-        return [_fitting(array, given) for array, given in zip(ids, boxes, strict=True)]
+        """Return one mask per box."""
+        return [_match_masks(array, given) for array, given in zip(ids, boxes, strict=True)]
 
 
-def _fitting(ids: NDArray[np.uint32], boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _match_masks(ids: NDArray[np.uint32], boxes: NDArray[np.float32]) -> NDArray[np.bool_]:
     masks = np.zeros((len(boxes), *ids.shape), bool)
     numbers = [number for number in np.unique(ids) if number]
-    around = np.array([box_of(ids == number) for number in numbers], np.float32).reshape(-1, 4)
+    around = np.array([find_box(ids == number) for number in numbers], np.float32).reshape(-1, 4)
     for mask, box in zip(masks, boxes, strict=True):
-        fits = overlaps(box, around)
+        fits = compute_iou(box, around)
         if fits.size and fits.max() > 0:
             mask[:] = ids == numbers[int(fits.argmax())]
     return masks
 
 
-def _plain(name: str) -> str:
+def _normalise_name(name: str) -> str:
     return name.strip().casefold().replace("_", " ")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the target is in imagined frames: trackers behind one interface, and the one that geometry alone gives."""
+"""Trackers, which locate the target in imagined frames: their interface, and the one that needs geometry alone."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from wiw.action import to_viewpoints
 from wiw.errors import ArgumentError
-from wiw.perception.boxes import box_of
+from wiw.perception.boxes import find_box
 from wiw.reproject import warp
 from wiw.types import Box, Observation, Proposal, Rollout, Target
 
 FRONT_HFOV = 90.0
-"""Degrees; of every front view."""
+"""Horizontal field of view of every front view, in degrees."""
 
 
 @dataclass(frozen=True)
 class Track:
-    """A target through the K frames of one imagined plan."""
+    """A target in the K frames of one imagined plan."""
 
     masks: NDArray[np.bool_]
     """bool [K, H, W], in the frames' size; empty where the target is lost."""
@@ -31,26 +31,28 @@ class Track:
     """K boxes in the frames' pixels, None where the target is lost; across a panorama's seam left > right."""
 
     @property
-    def found(self) -> NDArray[np.bool_]:
+    def visible(self) -> NDArray[np.bool_]:
         """Bool [K]: where the target is in sight."""
         return np.array([box is not None for box in self.boxes], bool)
 
 
 class Tracker(ABC):
-    """Follows the target of real observations into frames that were imagined from them."""
+    """Follows the target of real observations into frames imagined from them."""
 
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it; a policy that tracks passes this on."""
 
     @abstractmethod
-    def masks(
+    def predict_masks(
         self,
         observations: Sequence[Observation],
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
     ) -> list[NDArray[np.bool_]]:
-        """The target's visible pixels in each frame, bool [K, H, W] a plan; `track` documents the arguments."""
+        """Return the target's visible pixels in each frame, bool [K, H, W] per plan; `track` documents the
+        arguments.
+        """
 
     def track(
         self,
@@ -59,10 +61,10 @@ class Tracker(ABC):
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool = True,
     ) -> list[Track]:
-        """Follows the targets of B observations into as many imagined plans.
+        """Follow the targets of B observations into as many imagined plans.
 
         Args:
-            observations: what each plan begins with; the same one may come several times.
+            observations: what each plan begins with; the same one may occur several times.
             viewpoints: float64 [K, 4, 4] each: T_start_camera of every frame (`wiw.action.to_viewpoints`).
             frames: uint8 [K, H, W, 3] each, panoramas or, with `panoramic=False`, front views (HFOV 90).
             panoramic: which of the two.
@@ -70,9 +72,9 @@ class Tracker(ABC):
         Raises:
             ArgumentError: an observation without a target, or without what the tracker needs; arrays of other shapes.
         """
-        _check(self, observations, viewpoints, frames)
-        found = [without_specks(masks) for masks in self.masks(observations, viewpoints, frames, panoramic)]
-        return [Track(masks, tuple(box_of(mask, wraps=panoramic) for mask in masks)) for masks in found]
+        _check_arguments(self, observations, viewpoints, frames)
+        found = [remove_specks(masks) for masks in self.predict_masks(observations, viewpoints, frames, panoramic)]
+        return [Track(masks, tuple(find_box(mask, wraps=panoramic) for mask in masks)) for masks in found]
 
 
 def track_rollouts(
@@ -81,7 +83,7 @@ def track_rollouts(
     proposals: Sequence[Sequence[Proposal]],
     rollouts: Sequence[Sequence[Rollout]],
 ) -> list[list[Track]]:
-    """Tracks [episode][candidate] for what a reviser is given; one call of the tracker for all of them.
+    """Return tracks [episode][candidate] of the reviser's rollouts, by one call of the tracker.
 
     Raises:
         ArgumentError: rollouts in several views; ask for "panorama" or "front" (`Policy.frames`).
@@ -108,62 +110,62 @@ def track_rollouts(
 class Reprojection(Tracker):
     """Moves the target's mask with the depth mesh of the real panorama; needs no frames and no learning.
 
-    What is behind other surfaces in the new view is not marked, as the mesh is drawn with a depth test. Parts of the
-    target that the real observation did not show are not known to be its own: boxes hold what was seen of it.
+    Parts hidden behind other surfaces in the new view are not marked, as the mesh is drawn with a depth test. Parts
+    that the real observation did not show are unknown: boxes enclose only what was visible.
     """
 
     needs = ("depth",)
 
-    def masks(
+    def predict_masks(
         self,
         observations: Sequence[Observation],
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
     ) -> list[NDArray[np.bool_]]:
-        """The warped mask, without what no observation showed."""
-        return [mask for mask, _ in self.reprojected(observations, viewpoints, frames, panoramic)]
+        """Return the warped masks, without regions that no observation showed."""
+        return [mask for mask, _ in self.reproject_with_holes(observations, viewpoints, frames, panoramic)]
 
-    def reprojected(
+    def reproject_with_holes(
         self,
         observations: Sequence[Observation],
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
     ) -> list[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-        """For each plan the warped mask and what the observation did not show, both bool [K, H, W]."""
+        """Return for each plan the warped mask and what the observation did not show, both bool [K, H, W]."""
         found: list[Any] = [None] * len(frames)
-        for rows in _grouped(observations, frames):
+        for rows in _group_rows(observations, frames):
             poses = np.concatenate([viewpoints[row] for row in rows])
-            moved = _moved(observations[rows[0]], poses, _size(frames[rows[0]]), panoramic)
+            moved = _reproject_target(observations[rows[0]], poses, _get_size(frames[rows[0]]), panoramic)
             cuts = np.cumsum([len(viewpoints[row]) for row in rows])[:-1]
             for row, *parts in zip(rows, *(np.split(images, cuts) for images in moved), strict=True):
                 found[row] = tuple(parts)
         return found
 
 
-def _moved(
+def _reproject_target(
     observation: Observation, poses: NDArray[np.float64], size: tuple[int, int], panoramic: bool
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """The target's mask as seen from K poses, and what was not seen from the observation's, both bool [K, H, W]."""
-    depth, mask = observation.depth, target_of(observation).mask
+    """Return the target's mask as seen from K poses, and what the observation did not show, both bool [K, H, W]."""
+    depth, mask = observation.depth, get_target(observation).mask
     assert depth is not None
     if not len(poses) or not mask.any():
         return np.zeros((len(poses), *size), bool), np.ones((len(poses), *size), bool)
-    seen, hole = moved_masks(mask[None], depth, poses, size, None if panoramic else FRONT_HFOV)
+    seen, hole = reproject_masks(mask[None], depth, poses, size, None if panoramic else FRONT_HFOV)
     return seen[0], hole
 
 
-def moved_masks(
+def reproject_masks(
     masks: NDArray[np.bool_],
     depth: NDArray[np.float32],
     poses: NDArray[np.float64],
     size: tuple[int, int],
     hfov_deg: float | None = None,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Masks of a panorama as seen from other poses, bool [T, K, h, w], three for the price of one.
+    """Return masks of a panorama as seen from other poses, bool [T, K, h, w]; three cost as much as one.
 
-    Also what the panorama did not show of the new views, bool [K, h, w].
+    Also returns what the panorama did not show of the new views, bool [K, h, w].
 
     Args:
         masks: bool [T, H, W], T >= 1.
@@ -184,37 +186,37 @@ def moved_masks(
     return seen, hole
 
 
-def target_of(observation: Observation) -> Target:
-    """The observation's target.
+def get_target(observation: Observation) -> Target:
+    """Return the observation's target.
 
     Raises:
-        ArgumentError: nothing is pointed out in it.
+        ArgumentError: it has none.
     """
     if observation.target is None:
         raise ArgumentError("expected an observation with a target; only tasks that point something out give one")
     return observation.target
 
 
-def _grouped(observations: Sequence[Observation], frames: Sequence[NDArray[np.uint8]]) -> list[list[int]]:
-    """Rows that share an observation and a size, so that its mesh is built once."""
+def _group_rows(observations: Sequence[Observation], frames: Sequence[NDArray[np.uint8]]) -> list[list[int]]:
+    """Group rows that share an observation and a size, so that its mesh is built once."""
     groups: dict[tuple[int, tuple[int, int]], list[int]] = {}
     for row, (observation, images) in enumerate(zip(observations, frames, strict=True)):
-        groups.setdefault((id(observation), _size(images)), []).append(row)
+        groups.setdefault((id(observation), _get_size(images)), []).append(row)
     return list(groups.values())
 
 
-def _size(frames: NDArray[np.uint8]) -> tuple[int, int]:
+def _get_size(frames: NDArray[np.uint8]) -> tuple[int, int]:
     return int(frames.shape[1]), int(frames.shape[2])
 
 
-def without_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The masks, emptied where nothing is two pixels wide and high: specks at the rims of things are no sight of it."""
+def remove_specks(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Empty masks without any 2 x 2 block: specks at the rims of objects do not show the target."""
     wide = masks[:, :, :-1] & masks[:, :, 1:]
     seen = np.asarray((wide[:, :-1] & wide[:, 1:]).any(axis=(1, 2)))
     return masks & seen[:, None, None]
 
 
-def _check(
+def _check_arguments(
     tracker: Tracker,
     observations: Sequence[Observation],
     viewpoints: Sequence[NDArray[np.float64]],
@@ -226,7 +228,7 @@ def _check(
             f"{len(observations)}, {len(viewpoints)} and {len(frames)}"
         )
     for observation, poses, images in zip(observations, viewpoints, frames, strict=True):
-        target_of(observation)
+        get_target(observation)
         if "depth" in tracker.needs and observation.depth is None:
             raise ArgumentError(f"{type(tracker).__name__} needs depth: make the environment with depth=True")
         if images.ndim != 4 or images.shape[3] != 3 or np.shape(poses) != (len(images), 4, 4):

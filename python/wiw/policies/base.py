@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a policy is: it proposes plans, scores imagined futures, and turns scores into a decision."""
+"""The interface of policies: propose plans, score imagined futures, and turn scores into a decision."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
+from wiw.errors import ContractError
+from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout
 
 
 @dataclass(frozen=True)
 class FrameSpec:
-    """How a policy wants imagined frames shown: the paper's 384x384 views, or the whole panorama at a size of its own.
+    """The view and size of imagined frames that a policy asks for: the paper's 384x384 views, or panoramas of any size.
 
     A perspective world model can only give its front view, whatever is asked for.
     """
@@ -29,7 +30,7 @@ class FrameSpec:
 
 @dataclass(frozen=True)
 class Situation:
-    """One live episode at the moment of a decision, as a policy may know it."""
+    """One live episode at the moment of a decision, as far as a policy may know it."""
 
     observation: Any
     """`Observation`, or `ArmObservation` for a policy that plans in poses."""
@@ -38,10 +39,11 @@ class Situation:
     memory: Any
     """What `Policy.begin` returned for this episode; the policy may change it."""
     executed: tuple[Any, ...] = ()
-    """Primitives, or poses, of all decisions since the episode began."""
+    """Primitives, or poses, executed since the episode began."""
     imagines: bool = True
-    """Whether a world model is asked about the plans proposed now. Where none is, no more than one plan is of use to a
-    policy that takes its first."""
+    """Whether a world model will imagine the plans proposed now. Without one, a policy that takes its first plan needs
+    to propose only one.
+    """
 
 
 class Policy(ABC):
@@ -50,40 +52,52 @@ class Policy(ABC):
     All calls are batched over the live episodes. Randomness must be drawn from `situation.key` alone.
     """
 
-    space: Space = "discrete"
-    """What its plans are made of: "discrete" primitives, or "pose7" poses of a gripper."""
+    space: str = PRIMITIVES
+    """What its plans are made of: a name of `wiw.loop.plan_space`."""
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it."""
     frames: FrameSpec = FrameSpec()
     default_revision: str | None = None
-    """Name of the reviser that stands in where this policy only proposes."""
+    """Name of the reviser to use where this policy only proposes."""
     tokens: int = 0
     """Tokens that the policy's language model has read and written so far; 0 without one."""
 
-    def for_space(self, space: Space) -> Policy:
-        """The policy for plans of primitives or of poses, where it can make both. Default: itself."""
+    @property
+    def unwrapped(self) -> Policy:
+        """The policy itself, behind everything that wraps it."""
         return self
 
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Check, before a run begins, that the policy is made for a task that describes itself so. Default: any task.
+
+        Raises:
+            ArgumentError: it is not.
+        """
+        return
+
     def begin(self, goal: Goal, key: Key) -> Any:
-        """Memory for a new episode; None for a policy that keeps none."""
+        """Return the memory of a new episode; None for a policy without memory."""
         return None
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Called once a decision, before `propose`, also on a policy that only revises. Default: nothing to keep."""
+        """Update the memory; called once per decision, before `propose`, also on a policy that only revises. Default:
+        nothing.
+        """
         return
 
     @abstractmethod
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """At most `candidates` plans of at most `horizon` actions for each episode, best first."""
+        """Return at most `candidates` plans of at most `horizon` actions for each episode, best first."""
         raise NotImplementedError
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Continuations of imagined plans, one list a situation; asked for where the beam search goes deeper.
+        """Return continuations of imagined plans, one list per situation; called where the beam search goes deeper.
 
-        Each situation stands at the end of a kept plan: its images are imagined, its odometry is what the plan leads to
-        when no step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default:
-        proposes as if the agent had come there, with a copy of its memory that has observed the place. A policy that
-        observes depth has to write its own.
+        Each situation stands at the end of a plan: its images are imagined, its odometry is where the plan leads if no
+        step is refused, it has no depth. `memory` is the real episode's and must not be changed. Default: propose as
+        if the agent were there, with a copy of its memory that has observed the place. A policy that observes depth
+        must override this.
         """
         there = [replace(situation, memory=deepcopy(situation.memory)) for situation in situations]
         self.observe(there)
@@ -95,13 +109,39 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """One score a candidate for each episode, higher is better. One call for all live episodes."""
+        """Return one score per candidate for each episode, higher is better; one call for all live episodes."""
         raise NotImplementedError(f"{type(self).__name__} only proposes; give the agent a revision policy")
+
+    def score_or_prefer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[NDArray[np.float64]]:
+        """Score the plans of all episodes; where nothing was imagined, the proposer's own preference counts."""
+        scores = [np.array([plan.prior for plan in plans], np.float64) for plans in proposals]
+        shown = [(place, own) for place, own in enumerate(rollouts) if own is not None]
+        if not shown:
+            return scores
+        places = [place for place, _ in shown]
+        found = self.score(
+            [situations[place] for place in places], [proposals[place] for place in places], [own for _, own in shown]
+        )
+        if not isinstance(found, Sequence) or len(found) != len(places):
+            raise ContractError(
+                f"{type(self.unwrapped).__name__}.score: expected scores for each of {len(places)} episodes, got "
+                f"{found!r}"
+            )
+        for place, score in zip(places, found, strict=True):
+            scores[place] = score
+        return scores
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """The plan to follow and its index among the proposals, or None for a plan written anew. Default: the best."""
+        """Return the plan to execute and its index among the proposals, or None for a new plan. Default: the best
+        one.
+        """
         best = int(np.argmax(scores))
         return proposals[best].actions, best
 
@@ -111,19 +151,20 @@ class Policy(ABC):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[Answer | None]:
-        """What each episode's agent believes, where its goal has choices; `rollouts` are None without a world model.
+        """Return what each episode's agent believes, where its goal has choices; `rollouts` are None without a world
+        model.
 
-        Asked of the revising policy once a decision, with what is seen and what was imagined. Default: no answer.
+        Called on the revising policy once per decision, with what is seen and what was imagined. Default: no answer.
         """
         return [None] * len(situations)
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
-        """What a language model was asked for this decision and said, handed over once; nothing without one."""
+        """Return the language model's exchanges of this decision, once; empty without a language model."""
         return ()
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What the policy has used up so far, for the cost ledger (`Decision.spent`)."""
+        """Resources used so far, for the cost ledger (`Decision.spent`)."""
         return {"vlm_tokens": self.tokens}
 
     @property
@@ -137,5 +178,5 @@ class Policy(ABC):
         return type(self).extend is not Policy.extend or "depth" not in self.needs
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity for the run's manifest."""
+        """Return a JSON-able identity for the run's manifest."""
         return {"policy": type(self).__name__}

@@ -1,17 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page shows of the episodes that keep pictures."""
+"""Episodes with pictures, read from the run store for a page."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from PIL import Image
-
-from wiw.analysis.blame import blame
+from wiw.analysis.blame import read_blame
+from wiw.report import cuts
 from wiw.report.maps import (
     MapFrame,
     Trail,
@@ -21,26 +19,27 @@ from wiw.report.maps import (
     start_and_goal,
     trail,
 )
-from wiw.report.plans import of_poses, ways_of_telling
+from wiw.report.plans import of_poses, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
-from wiw.report.story import Album, Attempt, Step, Story
+from wiw.report.story import Album, Attempt, Picture, Step, Story
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.types import Episode, Wording
 
 
-def stories(store: RunStore, arms: Sequence[str]) -> tuple[list[Story], dict[str, str]]:
-    """The episodes that keep pictures and have ended, and the scene maps by id as data URIs."""
+def read_stories(store: RunStore, arms: Sequence[str], album: Album) -> tuple[list[Story], dict[str, Picture]]:
+    """Return the ended episodes among those chosen for pictures, and the scene maps by id."""
     outcomes = outcomes_by_episode(store, arms)
-    episodes, pictures = store.episodes(), dict[str, str]()
-    kept = [index for index in store.info["pictures"] if outcomes.get(index)]
-    return [tell(store, index, episodes[index], outcomes[index], pictures, Album()) for index in kept], pictures
+    episodes, maps = store.episodes(), dict[str, Picture]()
+    kept = [index for index in pictured_episodes(store) if outcomes.get(index)]
+    return [read_story(store, index, episodes[index], outcomes[index], maps, album) for index in kept], maps
 
 
 def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
-    """How each episode ended, by arm in the order of `arms`; episodes that no arm has ended are left out."""
-    blamed = blame(store)
-    verdicts = blamed.verdicts() if blamed is not None else {}
+    """Return outcomes by episode, then by arm in the order of `arms`, without episodes that no arm has ended."""
+    found_blame = read_blame(store)
+    verdicts = found_blame.verdicts() if found_blame is not None else {}
     by_arm = {(row["arm"], row["episode"]): row for row in store.outcomes()}
     by_arm |= {key: {**by_arm[key], "blame": verdict} for key, verdict in verdicts.items()}
     found: dict[int, dict[str, Mapping[str, Any]]] = {}
@@ -49,45 +48,46 @@ def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[
     return found
 
 
-def tell(
+def read_story(
     store: RunStore,
     index: int,
     episode: Episode,
     outcomes: Mapping[str, Mapping[str, Any]],
-    pictures: dict[str, str],
+    maps: dict[str, Picture],
     album: Album,
 ) -> Story:
-    """One episode; its scene's map joins `pictures`."""
+    """Return one episode; add its scene's map to `maps`."""
     decisions = {arm: store.decisions(arm, index) for arm in outcomes}
     rows = [row for own in decisions.values() for row in own]
     poses = any(of_poses(row) for row in rows)
-    frame, picture = (None, None) if poses else _map(store, episode, rows, pictures, album)
-    shots = dict[str, str]()
+    frame, picture = (None, None) if poses else _map(store, episode, rows, maps, album)
+    shots = dict[str, Picture]()
     attempts = tuple(
         _attempt(store, frame, outcome, decisions[arm], shots, album, f"{index}-{number}")
         for number, (arm, outcome) in enumerate(outcomes.items())
     )
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
     ends = start_and_goal(frame, episode) if frame is not None else None
-    shown = album.put(f"{index}-goal", "jpeg", goal) if goal else None
+    shown = album.draw(f"{index}-goal", partial(cuts.front, goal, album.goal_side, album.quality)) if goal else None
     return Story(index, episode, shown, picture, frame, ends, attempts, wording(store), poses, shots)
 
 
 def _map(
-    store: RunStore, episode: Episode, rows: Sequence[Mapping[str, Any]], pictures: dict[str, str], album: Album
+    store: RunStore, episode: Episode, rows: Sequence[Mapping[str, Any]], maps: dict[str, Picture], album: Album
 ) -> tuple[MapFrame, str | None]:
-    """Where an episode is drawn, and the id of what is below."""
+    """Return the frame of an episode's map and the id of its picture."""
     kept = store.scene_map(episode.scene)
     if kept is None:
         return frame_of_points(all_points(episode, rows)), None
     webp, matrix = kept
     picture = f"scene-{hashlib.sha256(episode.scene.encode()).hexdigest()[:12]}"
-    pictures[picture] = album.put(picture, "webp", webp)
-    return frame_of_picture(Image.open(io.BytesIO(webp)).size, matrix), picture
+    drawing = album.put_map(picture, webp)
+    maps[picture] = drawing
+    return frame_of_picture((drawing.width, drawing.height), matrix), picture
 
 
 def wording(store: RunStore) -> Wording:
-    """How the run's task speaks of its episodes."""
+    """Return the run's words for its task's outcomes."""
     return Wording(**store.info.get("wording", {}))
 
 
@@ -96,21 +96,21 @@ def _attempt(
     frame: MapFrame | None,
     outcome: Mapping[str, Any],
     decisions: list[dict[str, Any]],
-    shots: dict[str, str],
+    shots: dict[str, Picture],
     album: Album,
     name: str,
 ) -> Attempt:
-    """One arm's run of an episode; what a gripper's camera saw joins `shots`."""
+    """Return one arm's run of an episode; add the images of a gripper's camera to `shots`."""
     arm, index = outcome["arm"], outcome["episode"]
     stage, steps, end = stage_of(store.info), list[Step](), ""
-    for row, way in zip(decisions, ways_of_telling(decisions, stage), strict=True):
+    for row, way in zip(decisions, plan_views(decisions, stage), strict=True):
         number, images = row["decision"], store.images(arm, index, row["decision"])
         made = step(row, images, way, album, f"{name}-{number}")
         if made.shot and made.seen:
             shots[made.shot] = made.seen
         if "end" in images:
             end = f"shot-{name}-end"
-            shots[end] = album.draw(end, partial(way.seen, images["end"], album))
+            shots[end] = album.draw(end, partial(way.observation, images["end"], album))
         steps.append(made)
     film = store.film(arm, index)
     return Attempt(

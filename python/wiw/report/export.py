@@ -26,7 +26,7 @@ NESTED = ("actions", "executed", "answer", "real_frames", "path", "refused")
 
 
 def export(run: Run, csv: Path | None = None, parquet: Path | None = None, rerun: Path | None = None) -> list[Path]:
-    """Writes what is asked for and returns the files.
+    """Write tables or a recording and return the files.
 
     Args:
         run: to be exported.
@@ -46,7 +46,7 @@ def export(run: Run, csv: Path | None = None, parquet: Path | None = None, rerun
 
 
 def tables(run: Run) -> dict[str, Table]:
-    """The run as tables of plain values, by name: arms, episodes, outcomes, decisions, candidates.
+    """Return the run as tables of plain values, by name: arms, episodes, outcomes, decisions, candidates.
 
     Ended episodes only; a metric is a column of outcomes, seconds and counts are columns of decisions.
     """
@@ -61,7 +61,7 @@ def tables(run: Run) -> dict[str, Table]:
 
 
 def export_csv(run: Run, folder: Path) -> list[Path]:
-    """One CSV file a table, in a new folder; lists are JSON.
+    """Write one CSV file per table into a new folder; lists are JSON.
 
     Raises:
         FileError: the folder holds something already, or cannot be written.
@@ -70,7 +70,7 @@ def export_csv(run: Run, folder: Path) -> list[Path]:
 
 
 def export_parquet(run: Run, folder: Path) -> list[Path]:
-    """One Parquet file a table, in a new folder; lists stay lists.
+    """Write one Parquet file per table into a new folder; lists stay lists.
 
     Raises:
         ArgumentError: pyarrow is not installed.
@@ -81,7 +81,7 @@ def export_parquet(run: Run, folder: Path) -> list[Path]:
 
 
 def export_rerun(run: Run, file: Path) -> Path:
-    """A recording that `rerun FILE` shows: ways, distances and scores over decisions, and the pictures that were kept.
+    """Write a recording for `rerun FILE`: paths, distances and scores over decisions, and the stored pictures.
 
     Raises:
         ArgumentError: rerun-sdk is not installed.

@@ -58,12 +58,12 @@ class Trail:
 
 
 def frame_of_picture(size: tuple[int, int], world_to_pixel: Sequence[Sequence[float]]) -> MapFrame:
-    """The frame of a kept scene map, `size` being (width, height)."""
+    """Return the frame of a kept scene map, `size` being (width, height)."""
     return MapFrame(size[0], size[1], np.asarray(world_to_pixel, np.float64))
 
 
 def frame_of_points(points: NDArray[np.float64]) -> MapFrame:
-    """A frame around world points [N, 3], for scenes without a picture."""
+    """Return a frame around world points [N, 3], for scenes without a picture."""
     low, high = points.min(0) - 0.8, points.max(0) + 0.8
     width, height = PIXELS_PER_METRE * (high[0] - low[0]), PIXELS_PER_METRE * (high[2] - low[2])
     shift = -PIXELS_PER_METRE * low[[0, 2]]
@@ -71,7 +71,7 @@ def frame_of_points(points: NDArray[np.float64]) -> MapFrame:
 
 
 def start_and_goal(frame: MapFrame, episode: Episode) -> tuple[Mark, Mark]:
-    """Where the episode begins, and where the goal picture was taken."""
+    """Return the start, and the place where the goal image was taken."""
     return (
         _mark(frame, episode.start_position, episode.start_yaw),
         _mark(frame, episode.goal_position, episode.goal_yaw),
@@ -79,7 +79,7 @@ def start_and_goal(frame: MapFrame, episode: Episode) -> tuple[Mark, Mark]:
 
 
 def trail(frame: MapFrame, arm: str, decisions: Sequence[Mapping[str, Any]]) -> Trail:
-    """The way that the decisions of one episode took."""
+    """Return the path that the decisions of one episode took."""
     path = np.concatenate([np.asarray(decision["path"], np.float64) for decision in decisions])
     pixels = to_pixels(frame.world_to_pixel, path)
     moved = np.concatenate([[True], np.linalg.norm(np.diff(pixels, axis=0), axis=1) > 0.01])
@@ -89,7 +89,7 @@ def trail(frame: MapFrame, arm: str, decisions: Sequence[Mapping[str, Any]]) -> 
 
 
 def all_points(episode: Episode, decisions: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
-    """Every world point that an episode touches, float64 [N, 3]."""
+    """Return every world point that an episode touches, float64 [N, 3]."""
     ends = np.array([episode.start_position, episode.goal_position], np.float64)
     return np.concatenate([ends, *(np.asarray(decision["path"], np.float64) for decision in decisions)])
 

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How plans and what came of them are told: of primitives, seen all around, or of poses, seen by a fixed camera."""
+"""How pages show plans and their outcomes: primitives on panoramas, poses on a fixed camera's images, or plans of a
+space of the user's own.
+"""
 
 from __future__ import annotations
 
@@ -23,20 +25,28 @@ class Primitives:
     """Name of the picture of what the agent saw."""
 
     def text(self, plan: Sequence[int]) -> str:
-        """A plan in a few signs."""
+        """Return a plan as a few symbols."""
         return glyphs(plan)
 
     def drawing(self, plan: Sequence[int]) -> Drawing | None:
-        """A plan on what the agent saw; none of primitives."""
+        """Return a plan's drawing; None for primitives."""
         return None
 
-    def seen(self, jpeg: bytes, album: Album) -> bytes:
-        """What the agent saw, as a JPEG for the album."""
+    def observation(self, jpeg: bytes, album: Album) -> bytes:
+        """Return the observation as WebP bytes for the album."""
         return cuts.panorama(jpeg, album.panorama_width, album.quality)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
-        """What was imagined, or would have been seen, likewise."""
+        """Return an imagined or true future as WebP bytes for the album."""
         return cuts.strip(jpeg, frames, album.frame_height, album.quality)
+
+
+class Numbers(Primitives):
+    """Plans of a space of the user's own, shown as the numbers that they are."""
+
+    def text(self, plan: Sequence[Any]) -> str:
+        """A plan as numbers."""
+        return numbers(plan)
 
 
 @dataclass(frozen=True)
@@ -52,29 +62,29 @@ class Poses:
     view = "front"
 
     def text(self, plan: Sequence[Sequence[float]]) -> str:
-        """A plan in a few signs."""
+        """Return a plan as a few symbols."""
         return signs(plan, self.start, self.shut)
 
     def drawing(self, plan: Sequence[Sequence[float]]) -> Drawing | None:
-        """A plan on what the camera saw."""
+        """Return a plan's drawing on the camera image."""
         return None if self.stage is None else self.stage.draw(self.start, plan)
 
-    def seen(self, jpeg: bytes, album: Album) -> bytes:
-        """What the camera saw, as a JPEG for the album."""
+    def observation(self, jpeg: bytes, album: Album) -> bytes:
+        """Return the camera image as WebP bytes for the album."""
         return cuts.front(jpeg, album.front_side, album.quality)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
-        """What was imagined, or would have been seen, likewise: every frame without a gap, or the last one."""
+        """Return an imagined or true future as WebP bytes: every frame without a gap, or the last one."""
         return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole)
 
 
-def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
-    """For each decision of an episode how it is told."""
+def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
+    """Return for each decision of an episode how it is shown."""
     found: list[Primitives | Poses] = []
     shut = False
     for row in decisions:
         if not of_poses(row):
-            found.append(Primitives())
+            found.append(Primitives() if of_primitives(row["actions"]) else Numbers())
             continue
         found.append(Poses(stage, (row["before_x"], row["before_y"], row["before_z"]), shut))
         shut = row["executed"][-1][6] < SHUT if row["executed"] else shut
@@ -82,10 +92,21 @@ def ways_of_telling(decisions: Iterable[Mapping[str, Any]], stage: Stage | None)
 
 
 def of_poses(row: Mapping[str, Any]) -> bool:
-    """Whether a decision plans poses of a gripper."""
-    return isinstance(row["actions"][0], list)
+    """Return whether a decision plans poses of a gripper, vectors of 7 numbers."""
+    first = row["actions"][0]
+    return isinstance(first, list) and len(first) == 7
+
+
+def of_primitives(plan: Sequence[Any]) -> bool:
+    """Return whether a plan is made of primitives, whole numbers."""
+    return isinstance(plan[0], int)
+
+
+def numbers(plan: Sequence[Any]) -> str:
+    """Return the actions of a plan as numbers, those of a vector in brackets: "0.5, -0.25" or "(1, 0), (0, 1)"."""
+    return ", ".join(f"({numbers(action)})" if isinstance(action, list) else f"{action:.3g}" for action in plan)
 
 
 def glyphs(actions: Sequence[int]) -> str:
-    """Primitives as arrows; ids without one as numbers."""
+    """Return primitives as arrows; ids without one as numbers."""
     return "".join(GLYPHS.get(action, f"({action})") for action in actions)

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plots as inline SVG that takes its text colour from the page, so that it reads on light and dark alike."""
+"""Plots as inline SVG with the text colour of the page, for light and dark themes alike."""
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,8 @@ from wiw.analysis.intervals import wilson
 from wiw.analysis.summary import Summary
 from wiw.types import Wording
 
+LONGEST_LINE = 16
+"""Characters of an arm's name beside an axis."""
 INK = "#010203"
 """Stands for the page's text colour."""
 PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
@@ -31,6 +34,8 @@ BLAME_COLORS = {
     "joint": "#8e6bbf",
     "beyond": "#8b9099",
 }
+TICKS = 5
+"""Most intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
 FEW = 24
 """Below this many episodes single outcomes are shown instead of binned rates."""
 
@@ -38,13 +43,13 @@ Outcomes = Mapping[str, Sequence[Mapping[str, Any]]]
 
 
 def arm_colors(arms: Sequence[str]) -> dict[str, str]:
-    """One colour an arm; the references always have the same."""
+    """Return a colour per arm; the references always have the same."""
     others = [arm for arm in arms if arm not in ROLE_COLORS]
     return {**ROLE_COLORS, **{arm: PALETTE[i % len(PALETTE)] for i, arm in enumerate(others)}}
 
 
 def success_by_arm(summary: Summary) -> Markup:
-    """Success rates with their intervals; floor and ceiling as lines through the others."""
+    """Plot success rates with their intervals; floor and ceiling as lines through the others."""
     lines = [line for line in summary.arms if "success" in line.estimates]
     colors = arm_colors([line.name for line in summary.arms])
     figure, axes = _figure()
@@ -54,16 +59,17 @@ def success_by_arm(summary: Summary) -> Markup:
             axes.axvline(found.value, color=colors[line.name], lw=1, ls=(0, (4, 3)), alpha=0.7, zorder=0)
         axes.plot([found.low, found.high], [y, y], color=colors[line.name], lw=5, alpha=0.35, solid_capstyle="round")
         axes.plot(found.value, y, "o", color=colors[line.name], ms=9)
-    axes.set_yticks(range(len(lines)), [line.name for line in reversed(lines)])
+    axes.set_yticks(range(len(lines)), [_fold(line.name) for line in reversed(lines)])
     axes.set_ylim(-0.6, len(lines) - 0.4)
     axes.set_xlim(-2, 102)
+    axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel("success rate, %")
     axes.grid(axis="x", color=INK, alpha=0.08)
     return _svg(figure, "success-by-arm")
 
 
 def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) -> Markup:
-    """Success rates with their intervals against imagined futures; for each series (rollouts, estimate, label)."""
+    """Plot success rates with their intervals against imagined futures; each series has (rollouts, estimate, label)."""
     colors = arm_colors(list(series))
     figure, axes = _figure()
     for name, points in series.items():
@@ -75,7 +81,7 @@ def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) 
             axes.annotate(label, (x, found.value), textcoords="offset points", xytext=(6, 6), fontsize=8, color=INK)
     axes.set_ylim(-2, 102)
     axes.set_xlim(left=0)
-    axes.set_xlabel("imagined futures an episode")
+    axes.set_xlabel("imagined futures per episode")
     axes.set_ylabel("success rate, %")
     axes.grid(axis="y", color=INK, alpha=0.08)
     _legend(axes)
@@ -83,7 +89,7 @@ def success_by_rollouts(series: Mapping[str, Sequence[tuple[float, Any, str]]]) 
 
 
 def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
-    """Success rate with its interval against how rightly imagined futures order the plans, a point an arm."""
+    """Plot success rates with their intervals against rank agreement, a point per arm."""
     colors = arm_colors([line.name for line in summary.arms])
     figure, axes = _figure()
     for line in truths:
@@ -99,7 +105,7 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
 
 
 def blame_by_arm(found: Blame) -> Markup:
-    """Failures of each arm by what they are due to, as stacked bars."""
+    """Plot each arm's failures by the stage to blame, as stacked bars."""
     lines = list(reversed(found.arms))
     figure, axes = _figure()
     left = np.zeros(len(lines))
@@ -110,24 +116,26 @@ def blame_by_arm(found: Blame) -> Markup:
             if count:
                 axes.text(start + count / 2, y, f"{count:.0f}", ha="center", va="center", color="white", fontsize=9)
         left += counts
-    axes.set_yticks(range(len(lines)), [line.arm for line in lines])
+    axes.set_yticks(range(len(lines)), [_fold(line.arm) for line in lines])
     axes.set_ylim(-0.6, len(lines) - 0.4)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("failed episodes")
+    axes.xaxis.set_major_locator(MaxNLocator(TICKS, integer=True))
+    axes.set_xlabel("failures, episodes")
     axes.grid(visible=False, axis="y")
     _legend(axes)
     return _svg(figure, "blame-by-arm")
 
 
 def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
-    """How success depends on the way to go: single episodes where there are few, else rates in bins of equal counts."""
+    """Plot success by path length: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))
     figure, axes = _figure()
     if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
         _outcome_dots(axes, outcomes, colors, words)
     else:
         _binned_rates(axes, outcomes, colors)
-    axes.set_xlabel(f"shortest way {words.way}, m")
+    axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(TICKS))
+    axes.set_xlabel(f"shortest path {words.way}, m")
     return _svg(figure, "success-by-distance")
 
 
@@ -136,9 +144,9 @@ def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str], wor
         for row in rows:
             filled = colors[arm] if row["metrics"].get("success") else "none"
             axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9)
-    axes.set_yticks(range(len(outcomes)), list(reversed(list(outcomes))))
+    axes.set_yticks(range(len(outcomes)), [_fold(arm) for arm in reversed(list(outcomes))])
     axes.set_ylim(-0.6, len(outcomes) - 0.4)
-    axes.set_title(f"filled: {words.won}, hollow: {words.lost}", loc="right", fontsize=9, color=INK)
+    axes.figure.suptitle(f"filled: {words.won}, hollow: {words.lost}", x=1, ha="right", fontsize=8, color=INK)
 
 
 def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
@@ -166,7 +174,7 @@ def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> 
 
 
 def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Markup:
-    """Share of episodes that have succeeded after so many decisions."""
+    """Plot the share of episodes that have succeeded after a number of decisions."""
     colors = arm_colors(list(outcomes))
     figure, axes = _figure()
     for arm, rows in outcomes.items():
@@ -175,12 +183,22 @@ def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Mar
         x, y = np.concatenate([[0], taken, [budget]]), np.concatenate([[0], share, [share[-1] if len(share) else 0]])
         axes.step(x, y, where="post", color=colors[arm], lw=2.2, label=arm)
     axes.set_xlim(0, budget + 0.3)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.xaxis.set_major_locator(MaxNLocator(TICKS, integer=True))
     axes.set_ylim(-3, 103)
     axes.set_xlabel("decisions")
     axes.set_ylabel(f"{words.succeeded}, %")
     _legend(axes)
     return _svg(figure, "decisions-to-success")
+
+
+def _fold(arm: str) -> str:
+    """Return an arm's name on lines of at most `LONGEST_LINE` characters, broken after -, + and : where it can be."""
+    lines = [""]
+    for piece in re.findall(r"[^-+:_]*[-+:_]?", arm):
+        if lines[-1] and len(lines[-1]) + len(piece) > LONGEST_LINE:
+            lines.append("")
+        lines[-1] += piece
+    return "\n".join(lines)
 
 
 def _figure() -> tuple[Figure, Axes]:
@@ -199,7 +217,7 @@ def _figure() -> tuple[Figure, Axes]:
 
 def _legend(axes: Axes) -> None:
     longest = max((len(text) for text in axes.get_legend_handles_labels()[1]), default=0)
-    columns = 4 if longest < 11 else 2  # as many as fit the drawing's width
+    columns = 4 if longest < 11 else 2 if longest < 20 else 1  # as many as fit the drawing's width
     axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from wiw.report.plans import Poses, Primitives, ways_of_telling
+from wiw.report.plans import Poses, Primitives, plan_views
 from wiw.report.plots import arm_colors
 from wiw.report.stage import stage_of
 from wiw.runs.run import Run
@@ -16,7 +16,7 @@ from wiw.types import Episode
 
 
 def record(run: Run, file: Path) -> None:
-    """Writes the ended episodes of all arms."""
+    """Write the ended episodes of all arms."""
     import rerun as rr
 
     stream = rr.RecordingStream("wiw", recording_id=f"{run.path.name} {run.store.created}")
@@ -35,7 +35,7 @@ def record(run: Run, file: Path) -> None:
         ended = f"{outcome['status']} {outcome['metrics']} {outcome['error']}".strip()
         stream.log(f"{place}/outcome", rr.TextDocument(ended), static=True)
         rows = run.store.decisions(arm, index)
-        for row, way in zip(rows, ways_of_telling(rows, stage), strict=True):
+        for row, way in zip(rows, plan_views(rows, stage), strict=True):
             stream.set_time("decision", sequence=row["decision"])
             _decision(rr, stream, place, row, way, colors[arm])
             for name, jpeg in run.store.images(arm, index, row["decision"]).items():
@@ -80,5 +80,5 @@ def _decision(rr: Any, stream: Any, place: str, row: dict[str, Any], way: Primit
 
 
 def color_of(web: str) -> int:
-    """0xRRGGBBAA of "#rrggbb"."""
+    """Return 0xRRGGBBAA of "#rrggbb"."""
     return (int(web.removeprefix("#"), 16) << 8) | 0xFF

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writes the list and the episodes' pages; pictures lie beside them, so that a page opens at once in a run of any size.
+"""Pages to browse a run: a list of its episodes and a page per episode, with the pictures in a folder beside them.
 
-The report is one file about the results, with a few episodes for example; this is for finding and opening any decision.
-Both draw an episode from the same values and template parts.
+The report is one file about the results with a few example episodes; these pages are for finding and opening any
+decision, in a run of any size. Both render an episode from the same values and template parts.
 """
 
 from __future__ import annotations
@@ -15,21 +15,22 @@ from typing import Any
 
 from wiw._core import core
 from wiw.files import whole_folder
-from wiw.report.episodes import outcomes_by_episode, tell, wording
+from wiw.report.episodes import outcomes_by_episode, read_story, wording
 from wiw.report.plots import arm_colors
-from wiw.report.story import Album, Story, place, taken_for, where
+from wiw.report.story import Album, Picture, Story, final_answer, place, where
 from wiw.report.templating import environment
 from wiw.runs.run import Run
 from wiw.types import Episode, Wording
 
 
 class Beside(Album):
-    """Pictures as files of a folder, each written once; those that are to be made are made by a pool's threads."""
+    """Pictures as files in a folder, each written once, made by the threads of a pool."""
 
-    panorama_width, frame_height, quality = 1024, 132, 76
-    front_side, end_side, whole = 480, 160, True
+    panorama_width, frame_height, quality = 1024, 132, 60
+    front_side, end_side, goal_side, map_side, whole = 480, 160, 480, 1100, True
 
     def __init__(self, folder: Path, pool: Executor) -> None:
+        super().__init__()
         self._folder, self._pool = folder, pool
         self._folder.mkdir()
         self._sizes: dict[str, int] = {}
@@ -46,41 +47,37 @@ class Beside(Album):
         return sum(self._sizes.values())
 
     def put(self, name: str, kind: str, data: bytes) -> str:
-        """The picture's address, seen from an episode's page. Names are numbers and our own words, never the run's."""
-        file = self._folder / _file(name, kind)
+        """Return the picture's address, relative to an episode's page. No text of the run is part of a name."""
+        file = self._folder / f"{name}.{kind}"
         if file.name not in self._sizes:
             file.write_bytes(data)
             self._sizes[file.name] = len(data)
         return f"../{self._folder.name}/{file.name}"
 
-    def draw(self, name: str, make: Callable[[], bytes]) -> str:
-        """The address of a picture that will be there after `finish`."""
-        self._making.append(self._pool.submit(lambda: self.put(name, "jpeg", make())))
-        return f"../{self._folder.name}/{_file(name, 'jpeg')}"
+    def draw(self, name: str, make: Callable[[], bytes]) -> Picture:
+        """Return a picture whose file is there after `finish`."""
+        self._making.append(self._pool.submit(lambda: self.put(name, "webp", make())))
+        return Picture(f"../{self._folder.name}/{name}.webp")
 
     def finish(self) -> None:
-        """Waits for the pictures that are being made; raises what making one has raised."""
+        """Wait for the pictures that are being made; raise the error of one that could not be made."""
         making, self._making = self._making, []
         for picture in making:
             picture.result()
 
 
-def _file(name: str, kind: str) -> str:
-    return f"{name}.{'jpg' if kind == 'jpeg' else kind}"
-
-
 @dataclass(frozen=True)
 class Cell:
-    """How an episode ended in one arm, for the list."""
+    """Outcome of an episode in one arm, for the list."""
 
     arm: str
     state: str
-    """"reached" (a success), "missed", "failed" (infrastructure) or "open" (not run yet)."""
+    """"success", "failure", "error" (of the infrastructure) or "open" (not run yet)."""
     text: str
     about: str
-    """What the text says."""
+    """Explanation of the text."""
     short: bool = False
-    """Whether it says how far from the goal the episode ended."""
+    """Whether the text is the distance to the goal at the end."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +92,12 @@ class Line:
 
     @property
     def group(self) -> str:
-        """What the list can be narrowed to: its kind where its task has several, else its scene."""
+        """Value that the list is filtered by: its kind where its task has several, else its scene."""
         return self.episode.kind or self.episode.scene
 
     @property
-    def told_to(self) -> str:
-        """What was asked for in words, where the task does so."""
+    def instruction(self) -> str:
+        """Instruction in words, where the task gives one."""
         return str(self.episode.info.get("instruction", ""))
 
     @property
@@ -109,14 +106,14 @@ class Line:
         return f"{self.index:04d}.html"
 
     @property
-    def told(self) -> bool:
-        """Whether there is a page: an arm has ended it."""
+    def has_page(self) -> bool:
+        """Whether there is a page: at least one arm has ended the episode."""
         return any(cell.state != "open" for cell in self.cells)
 
 
 @dataclass(frozen=True)
 class Site:
-    """What was written."""
+    """Files that `write_view` wrote."""
 
     index: Path
     """The page to open."""
@@ -127,7 +124,7 @@ class Site:
 
 
 def write_view(run: Run, folder: Path) -> Site:
-    """Writes `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
+    """Write `index.html`, `episodes/` and `images/` into a new folder. All text from the run is escaped.
 
     Raises:
         FileError: the folder holds something that is no view, or cannot be written.
@@ -140,19 +137,19 @@ def write_view(run: Run, folder: Path) -> Site:
         lines = _lines(run, outcomes)
         common = _common(run)
         (draft / "index.html").write_text(_index(run, lines, common), encoding="utf-8")
-        told = [line for line in lines if line.told]
-        for number, line in enumerate(told):
-            scenes: dict[str, str] = {}
-            story = tell(run.store, line.index, line.episode, outcomes[line.index], scenes, album)
-            common |= {"before": told[number - 1] if number else None}
-            common |= {"after": told[number + 1] if number + 1 < len(told) else None}
+        listed = [line for line in lines if line.has_page]
+        for number, line in enumerate(listed):
+            scenes: dict[str, Picture] = {}
+            story = read_story(run.store, line.index, line.episode, outcomes[line.index], scenes, album)
+            common |= {"before": listed[number - 1] if number else None}
+            common |= {"after": listed[number + 1] if number + 1 < len(listed) else None}
             (pages / line.file).write_text(_episode(story, scenes, common), encoding="utf-8")
             album.finish()
-    return Site(folder / "index.html", len(told), album.count, album.size)
+    return Site(folder / "index.html", len(listed), album.count, album.size)
 
 
 def is_view(folder: Path) -> bool:
-    """Whether a folder holds a view and nothing else, so that a new one may take its place."""
+    """Return whether a folder holds a view and nothing else, so that a new one may take its place."""
     return (folder / "index.html").is_file() and {path.name for path in folder.iterdir()} <= {
         "index.html",
         "episodes",
@@ -165,9 +162,9 @@ def _index(run: Run, lines: list[Line], common: Mapping[str, Any]) -> str:
     return template.render(**common, lines=lines, groups=list(dict.fromkeys(line.group for line in lines)))
 
 
-def _episode(story: Story, scenes: Mapping[str, str], values: Mapping[str, Any]) -> str:
+def _episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any]) -> str:
     template = environment().get_template("episode_page.html.j2")
-    return template.render(**values, story=story, pictures=scenes)
+    return template.render(**values, story=story, maps=maps)
 
 
 def _common(run: Run) -> dict[str, Any]:
@@ -202,14 +199,14 @@ def _lines(run: Run, outcomes: Mapping[int, Mapping[str, Any]]) -> list[Line]:
 def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: Sequence[str]) -> Cell:
     if outcome is None:
         return Cell(arm, "open", "to run", "not run yet")
-    if outcome["status"] == "failed":
-        return Cell(arm, "failed", "failed", "failed for infrastructure")
+    if outcome["status"] == "error":
+        return Cell(arm, "error", "error", "infrastructure error, excluded from scores")
     metrics = outcome["metrics"]
     count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
     if metrics.get("success"):
-        return Cell(arm, "reached", count, f"{words.won}; decisions taken")
+        return Cell(arm, "success", count, f"{words.won}; number of decisions")
     if choices:
-        return Cell(arm, "missed", taken_for(metrics, choices) or "no answer", f"{words.lost}; what it was taken for")
+        return Cell(arm, "failure", final_answer(metrics, choices) or "no answer", f"{words.lost}; its answer")
     if "distance_to_goal" in metrics:
-        return Cell(arm, "missed", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; metres short", True)
-    return Cell(arm, "missed", count, f"{words.lost}; decisions taken")
+        return Cell(arm, "failure", f"{metrics['distance_to_goal']:.1f} m", f"{words.lost}; distance to the goal", True)
+    return Cell(arm, "failure", count, f"{words.lost}; number of decisions")

@@ -58,11 +58,11 @@ class Stage:
     """Height of the table's top."""
 
     def pixels(self, points: ArrayLike) -> NDArray[np.float64]:
-        """float64 [N, 2] of world points [N, 3]."""
-        return self.camera.pixels_of(points, (SIDE, SIDE))
+        """Return float64 [N, 2] of world points [N, 3]."""
+        return self.camera.project_points(points, (SIDE, SIDE))
 
     def draw(self, start: Sequence[float], plan: Plan) -> Drawing:
-        """A plan from the place where the gripper was."""
+        """Return the drawing of a plan from the gripper's position `start`."""
         way = np.array([start, *(pose[:3] for pose in plan)], np.float64)
         seen, feet = self.pixels(way), self.pixels(np.c_[way[:, :2], np.full(len(way), self.ground)])
         shut = [pose[6] < SHUT for pose in plan]
@@ -72,7 +72,7 @@ class Stage:
         return Drawing(_polyline(seen), stops)
 
     def trail(self, arm: str, decisions: Sequence[Mapping[str, Any]]) -> Trail:
-        """The way that the decisions of one episode took, with a stop where each begins."""
+        """Return the path that the decisions of one episode took, with a stop where each starts."""
         way = self.pixels(np.concatenate([np.asarray(row["path"], np.float64) for row in decisions]))
         ends = [(row["before_x"], row["before_y"], row["before_z"]) for row in decisions]
         ends.append(tuple(decisions[-1][f"after_{axis}"] for axis in "xyz"))
@@ -80,18 +80,18 @@ class Stage:
 
 
 def stage_of(info: Mapping[str, Any]) -> Stage | None:
-    """The stage that a run's information describes, if its task has one."""
+    """Return the stage that a run's information describes, if its task has one."""
     kept = info.get("stage")
     return None if kept is None else Stage(Camera(**kept["camera"]), float(kept["ground"]))
 
 
 def _polyline(pixels: NDArray[np.float64]) -> str:
-    """Points [N, 2] as SVG writes them."""
+    """Return points [N, 2] as SVG text."""
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in pixels)
 
 
 def signs(plan: Plan, start: Sequence[float], shut: bool = False) -> str:
-    """A plan as arrows, with marks where the gripper closes and opens: "↘ ↧● ↥ ← ↧○".
+    """Return a plan as arrows, with marks where the gripper closes and opens: "↘ ↧● ↥ ← ↧○".
 
     Args:
         plan: poses [K, 7].

@@ -12,20 +12,20 @@ import numpy as np
 
 from wiw.report.plans import Poses, Primitives
 from wiw.report.story import Album, Candidate, Step
-from wiw.runs.rows import kept_frames
+from wiw.runs.rows import select_frames
 
 
 def step(row: Mapping[str, Any], images: Mapping[str, bytes], way: Primitives | Poses, album: Album, name: str) -> Step:
-    """A decision; `name` tells its pictures from others of the run."""
+    """Return a decision; `name` makes the names of its pictures unique."""
     seen = images.get(way.view)
     return Step(
         row["decision"] + 1,
         way.text(row["executed"]),
-        album.draw(f"{name}-seen", partial(way.seen, seen, album)) if seen else None,
+        album.draw(f"{name}-seen", partial(way.observation, seen, album)) if seen else None,
         tuple(_candidates(row, images, way, album, name)),
         way.text(row["actions"]) if row["chosen"] is None else "",
-        _left(row, "before"),
-        _left(row, "after"),
+        _remaining_distance(row, "before"),
+        _remaining_distance(row, "after"),
         row["note"],
         _fidelity(row["fidelity"]),
         row["seconds"],
@@ -37,30 +37,30 @@ def step(row: Mapping[str, Any], images: Mapping[str, bytes], way: Primitives | 
 
 
 def _fidelity(found: Mapping[str, Any] | None) -> str:
-    """E.g. "rank agreement +0.33 · regret 0.120"."""
+    """Return e.g. "rank agreement +0.33 · regret 0.120"."""
     said = {"rank agreement": ("rank", "{:+.2f}"), "regret": ("regret", "{:.3f}")}
-    return _spoken(found or {}, said)
+    return _join_numbers(found or {}, said)
 
 
 def _truth(found: Mapping[str, Any] | None, index: int) -> tuple[str, bool]:
-    """What is known of a candidate's true future, in words, and whether that scores best."""
+    """Return the measurements of a candidate's true future, and whether it scores best."""
     if found is None:
         return "", False
     own = {name: found[name][index] for name in ("scores", "psnr", "ssim", "lpips") if name in found}
     said = {"true score": ("scores", "{:.3f}"), "PSNR": ("psnr", "{:.1f} dB"), "SSIM": ("ssim", "{:.2f}")}
     said["LPIPS"] = ("lpips", "{:.2f}")
     known = [score for score in found["scores"] if score is not None]
-    return _spoken(own, said), own["scores"] is not None and own["scores"] == max(known)
+    return _join_numbers(own, said), own["scores"] is not None and own["scores"] == max(known)
 
 
-def _spoken(values: Mapping[str, Any], said: Mapping[str, tuple[str, str]]) -> str:
-    """The numbers that are there, with their names."""
+def _join_numbers(values: Mapping[str, Any], said: Mapping[str, tuple[str, str]]) -> str:
+    """Return the numbers that are there, with their names."""
     return " · ".join(
         f"{title} {form.format(values[name])}" for title, (name, form) in said.items() if values.get(name) is not None
     )
 
 
-def _left(row: Mapping[str, Any], when: str) -> float | None:
+def _remaining_distance(row: Mapping[str, Any], when: str) -> float | None:
     geodesic, straight = row[f"{when}_geodesic"], row[f"{when}_distance"]
     known = geodesic if geodesic is not None and np.isfinite(geodesic) else straight
     return None if known is None else float(known)
@@ -75,7 +75,7 @@ def _candidates(
     found = []
     for index, proposal in enumerate(proposals):
         real = row["real_frames"][index] if row["real_frames"] else []
-        kept = kept_frames(len(real) or len(proposal["actions"]))
+        kept = select_frames(len(real) or len(proposal["actions"]))
         shown = {
             kind: album.draw(f"{name}-{kind}-{index}", partial(way.strip, jpeg, len(kept), album))
             for kind in ("imagined", "true")
@@ -101,7 +101,7 @@ def _candidates(
 
 
 def _shares(scores: Sequence[float | None]) -> list[float]:
-    """0 for the worst score to 1 for the best."""
+    """Return scores scaled from 0 for the worst to 1 for the best."""
     finite = [score for score in scores if score is not None]
     low, high = (min(finite), max(finite)) if finite else (0.0, 0.0)
     return [(score - low) / (high - low) if score is not None and high > low else 1.0 for score in scores]

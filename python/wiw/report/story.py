@@ -1,42 +1,79 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pages tell of episodes, as values that templates fill in."""
+"""Episodes as values that the page templates show."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from wiw.report import cuts
 from wiw.report.maps import MapFrame, Mark, Trail
 from wiw.report.stage import Drawing
 from wiw.types import Episode, Wording
 
 
-class Album:
-    """Where the pictures of a page go: into the page itself, as data URIs."""
+@dataclass(frozen=True)
+class Picture:
+    """A picture on a page."""
 
-    panorama_width, frame_height, quality = 760, 104, 68
-    front_side, end_side = 300, 150
+    source: str
+    """Address or data URI."""
+    id: str = ""
+    """Id among the pictures that the page defines once; empty where `source` is the address of a file."""
+    width: int = 0
+    height: int = 0
+    """Pixels; 0 where the browser reads them from the file."""
+
+
+class Album:
+    """Pictures inside a page, as data URIs; equal pictures, such as those of two arms, are stored once."""
+
+    panorama_width, frame_height, quality = 520, 64, 30
+    front_side, end_side = 256, 128
     """Pixels of the front views of a gripper: of real ones, and of imagined ones."""
+    goal_side, map_side = 280, 700
     whole = False
-    """Whether imagined ways of a gripper are shown frame by frame, or their ends alone."""
+    """Whether imagined futures of a gripper are shown frame by frame, or only their last frames."""
+
+    def __init__(self) -> None:
+        self._pictures: dict[bytes, Picture] = {}
+
+    @property
+    def pictures(self) -> list[Picture]:
+        """All pictures that the page has to define."""
+        return list(self._pictures.values())
 
     def put(self, name: str, kind: str, data: bytes) -> str:
-        """What an `src` attribute says of a picture; `name` tells it from the others of the run."""
+        """Return the `src` attribute of a picture; `name` is unique within the run."""
         return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
 
-    def draw(self, name: str, make: Callable[[], bytes]) -> str:
-        """The same for a JPEG that is still to be made."""
-        return self.put(name, "jpeg", make())
+    def put_map(self, name: str, webp: bytes) -> Picture:
+        """Return the picture of a scene's map, whose coordinates are pixels of `webp` whatever its file's size."""
+        width, height = Image.open(io.BytesIO(webp)).size
+        small = cuts.shrink_map(webp, self.map_side)
+        return Picture(self.put(name, "webp", small), name, width, height)
+
+    def draw(self, name: str, make: Callable[[], bytes]) -> Picture:
+        """Return a picture of which `make` returns the WebP bytes; `name` is unique within the run."""
+        data = make()
+        key = hashlib.sha256(data).digest()
+        if key not in self._pictures:
+            width, height = Image.open(io.BytesIO(data)).size
+            self._pictures[key] = Picture(self.put(name, "webp", data), f"p{len(self._pictures)}", width, height)
+        return self._pictures[key]
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One plan and what was imagined of it."""
+    """One candidate plan and its imagined future."""
 
     actions: str
     score: float | None
@@ -44,10 +81,10 @@ class Candidate:
     """0 (worst of the decision) to 1 (best), for a bar."""
     chosen: bool
     note: str
-    strip: str | None
-    """What was imagined; as `Album.put` says."""
-    true: str | None
-    """What would really have been seen."""
+    strip: Picture | None
+    """Imagined future."""
+    true: Picture | None
+    """True future."""
     truth: str
     """Score of what would really have been seen, and how near to it imagination came; empty where not measured."""
     truly_best: bool
@@ -67,8 +104,8 @@ class Step:
 
     number: int
     executed: str
-    seen: str | None
-    """What the agent saw; as `Album.put` says."""
+    seen: Picture | None
+    """Observation."""
     candidates: tuple[Candidate, ...]
     rewritten: str
     """The plan, where it is none of the candidates."""
@@ -106,30 +143,30 @@ class Attempt:
     choices: Sequence[str] = ()
     """What answers are chosen from, where the task asks for any."""
     film: str | None = None
-    """The episode in motion; as `Album.put` says."""
+    """Film of the episode; as `Album.put` returns it."""
     end: str = ""
     """Id of what was seen at the end among the story's shots; empty where it was not kept."""
 
     @property
-    def reached(self) -> bool:
+    def success(self) -> bool:
         """Whether the episode was a success."""
         return bool(self.outcome["metrics"].get("success"))
 
     @property
     def text(self) -> str:
-        """How it ended, in words."""
-        if self.outcome["status"] == "failed":
-            return "failed for infrastructure"
+        """Outcome in words."""
+        if self.outcome["status"] == "error":
+            return "infrastructure error, excluded from scores"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
-        if self.reached:
+        if self.success:
             return f"{self.words.won} in {count}"
         due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
         if self.choices:
-            label = taken_for(metrics, self.choices)
-            return (f"taken for {label} in {count}" if label else f"not answered in {count}") + due
-        left = f", {metrics['distance_to_goal']:.1f} m short" if "distance_to_goal" in metrics else ""
-        return f"{self.words.lost} in {count}{left}{due}"
+            label = final_answer(metrics, self.choices)
+            return (f"answered {label} after {count}" if label else f"no answer after {count}") + due
+        left = f", {metrics['distance_to_goal']:.1f} m from the goal" if "distance_to_goal" in metrics else ""
+        return f"{self.words.lost} after {count}{left}{due}"
 
 
 @dataclass(frozen=True)
@@ -138,7 +175,7 @@ class Story:
 
     index: int
     episode: Episode
-    goal: str | None
+    goal: Picture | None
     picture: str | None
     """Id of the scene's map among the page's shared pictures."""
     frame: MapFrame | None
@@ -149,8 +186,8 @@ class Story:
     words: Wording
     poses: bool = False
     """Whether plans are of poses of a gripper."""
-    shots: Mapping[str, str] = field(default_factory=dict)
-    """What a gripper's camera saw, by id; as `Album.put` says."""
+    shots: Mapping[str, Picture] = field(default_factory=dict)
+    """Images of a gripper's camera, by id."""
 
     @property
     def place(self) -> str:
@@ -158,13 +195,13 @@ class Story:
         return where(self.episode)
 
     @property
-    def told(self) -> str:
-        """What was asked for in words, where the task does so."""
+    def instruction(self) -> str:
+        """Instruction in words, where the task gives one."""
         return str(self.episode.info.get("instruction", ""))
 
     @property
     def way(self) -> str:
-        """E.g. " · 4.2 m to the goal"; nothing where no arm could measure it."""
+        """E.g. " · 4.2 m to the goal"; empty where no arm could measure it."""
         length = self.episode.geodesic
         return f" · {length:.1f} m {self.words.way}" if np.isfinite(length) else ""
 
@@ -174,17 +211,17 @@ class Story:
         return str(self.episode.info.get("category", ""))
 
 
-def taken_for(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
-    """The final answer, where the task asks for any; empty where none was given."""
+def final_answer(metrics: Mapping[str, Any], choices: Sequence[str]) -> str:
+    """Return the final answer, where the task asks for one; empty where none was given."""
     predicted = int(metrics.get("predicted", -1))
     return choices[predicted] if 0 <= predicted < len(choices) else ""
 
 
 def place(scene: str) -> str:
-    """A scene's name without its folders."""
+    """Return a scene's name without its folders."""
     return scene if scene.startswith("apartments:") else Path(scene).name
 
 
 def where(episode: Episode) -> str:
-    """The kind of an episode where its task has several, else its scene's name without its folders."""
+    """Return the kind of an episode where its task has several, else its scene's name without its folders."""
     return episode.kind.replace("_", " ") or place(episode.scene)

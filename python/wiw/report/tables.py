@@ -1,41 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A summary as tables for the terminal; where that is narrow, intervals go below their estimates."""
+"""A run's numbers as tables for the terminal; narrow ones stack columns and put intervals below estimates."""
 
 from __future__ import annotations
 
 import io
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.console import Group as Lines
 from rich.table import Table
 from rich.text import Text
 
+from wiw.analysis.costs import cost_columns, costs
+from wiw.analysis.fidelity import fidelity, shown_columns
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import (
     ArmSummary,
     Group,
     Summary,
     column_title,
+    list_columns,
     notes,
     show_estimate,
     show_p,
     show_utility,
-    shown_headlines,
 )
-from wiw.metrics.headlines import SUCCESS
+from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html
+from wiw.runs.run import Run
 
-COUNTS = (("n", "judged", ""), ("failed", "failed", "red"), ("to run", "pending", ""))
+COUNTS = (("n", "judged", ""), ("errors", "errors", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
-
-
 NARROW = 3
 """Arms that fit beside each other with their intervals on one line."""
 ROOMY = 96
-"""Columns that a table of differences takes with an estimate and its interval on one line."""
+"""Terminal columns from which on an estimate and its interval stand on one line."""
+LONGEST_NAME = 24
+"""Terminal columns of an arm's name; longer ones take several lines."""
+EDGES, GAP = 1, 2
+"""Terminal columns of a table's edges, and between two of its columns."""
 
 
 class SummaryTable(Summary):
@@ -57,26 +64,99 @@ class SummaryTable(Summary):
 
 
 def print_summary(summary: SummaryTable) -> None:
-    """Prints the tables, as wide as the terminal; a file or a pipe sets no limit."""
+    """Print the tables, as wide as the terminal; for a file or a pipe at least `ROOMY` columns wide."""
     console = Console()
     Console(width=None if console.is_terminal else max(console.width, ROOMY)).print(summary)
 
 
 def as_text(summary: SummaryTable) -> str:
-    """The tables as plain text."""
+    """Return the tables as plain text."""
     console = Console(width=ROOMY, file=io.StringIO(), record=True)
     console.print(summary)
     return console.export_text()
 
 
+def print_costs(run: Run) -> None:
+    """Print what each arm cost per episode; nothing where no episode has ended."""
+    lines = costs(run)
+    titles = [title for title, _ in cost_columns(lines)]
+    print_stacked("Costs per episode", [line.arm for line in lines], titles, [line.cells() for line in lines])
+
+
+def print_fidelity(run: Run) -> None:
+    """Print how accurate each arm's imagination was; nothing where the run did not measure it."""
+    lines = fidelity(run)
+    columns = shown_columns(lines)
+    titles = [column.title for column in columns]
+    print_stacked(
+        "Fidelity of imagination, means over decisions",
+        [line.arm for line in lines],
+        titles,
+        [line.cells(columns) for line in lines],
+    )
+
+
+def print_stacked(title: str, arms: list[str], titles: list[str], rows: list[list[str]]) -> None:
+    """Print a row per arm, in several tables where the terminal is too narrow for one."""
+    if not arms:
+        return
+    console = Console()
+    console = Console(width=None if console.is_terminal else max(console.width, ROOMY))
+    columns = [Column(title, [row[index] for row in rows]) for index, title in enumerate(titles)]
+    for table in stack_tables(title, arms, columns, console.width):
+        console.print(table)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of numbers."""
+
+    title: str
+    cells: Sequence[str | Text]
+    style: str = ""
+
+    @property
+    def width(self) -> int:
+        """Terminal columns that it needs so that nothing is cut."""
+        return max(cell_len(line) for cell in (self.title, *self.cells) for line in str(cell).split("\n"))
+
+
+def stack_tables(
+    title: str, names: Sequence[str], columns: Sequence[Column], width: int, heading: str = "arm"
+) -> list[Table]:
+    """Return as many tables as it takes to fit `columns` into a terminal, with a row per name in each.
+
+    Long names are folded; numbers are never cut.
+    """
+    first = min(max(map(cell_len, names), default=0), LONGEST_NAME)
+    groups: list[list[Column]] = [[]]
+    for column in columns:
+        needed = EDGES + first + sum(GAP + one.width for one in (*groups[-1], column))
+        if groups[-1] and needed > width:
+            groups.append([])
+        groups[-1].append(column)
+    tables: list[Table] = []
+    for group in groups:
+        table = _table(f"{title} (continued)" if tables else title)
+        table.add_column(heading, style="bold", width=max(first, len(heading)), overflow="fold")
+        for column in group:
+            table.add_column(column.title, justify="right", style=column.style, no_wrap=True, min_width=column.width)
+        for row, name in enumerate(names):
+            table.add_row(name, *(column.cells[row] for column in group))
+        tables.append(table)
+    return tables
+
+
 def summary_tables(summary: Summary, width: int) -> Any:
-    """Something that rich can print into so many columns."""
-    parts: list[Any] = [_arms(summary)]
+    """Return what rich prints into `width` columns."""
+    gap = " " if width >= ROOMY else "\n"
+    parts: list[Any] = [*_arm_tables(summary, width)]
     if summary.utilities:
         parts.append(_utilities(summary))
     if len(summary.kinds) > 1:
-        parts.append(_kinds(summary, "\n" if len(summary.arms) > NARROW else " "))
-    parts += [_differences(summary, group, " " if width >= ROOMY else "\n") for group in summary.groups()]
+        parts += _kind_tables(summary, "\n" if len(summary.arms) > NARROW else " ", width)
+    for group in summary.groups():
+        parts += _difference_tables(summary, group, gap, width)
     styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
     return Lines(*parts, *styled)
 
@@ -87,19 +167,15 @@ def _table(title: str) -> Table:
     )
 
 
-def _arms(summary: Summary) -> Table:
-    which = "on the same episodes" if summary.same_episodes else "each on the episodes that it has finished"
-    table = _table(f"Arms, {which}")
+def _arm_tables(summary: Summary, width: int) -> list[Table]:
+    which = "on the same episodes" if summary.same_episodes else "each on the episodes scored in it"
     counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in summary.arms)]
-    _add_arm_column(table, [line.name for line in summary.arms])
-    for headline in shown_headlines(summary):
-        table.add_column(column_title(headline), justify="right")
-    for name, _, style in counts:
-        table.add_column(name, justify="right", style=style)
-    for line in summary.arms:
-        cells = [_cell(line, headline.metric) for headline in shown_headlines(summary)]
-        table.add_row(line.name, *cells, *(str(getattr(line, attribute)) for _, attribute, _ in counts))
-    return table
+    columns = [
+        Column(column_title(metric), [_cell(line, metric.name) for line in summary.arms])
+        for metric in list_columns(summary)
+    ]
+    columns += [Column(name, [str(getattr(line, key)) for line in summary.arms], style) for name, key, style in counts]
+    return stack_tables(f"Arms, {which}", [line.name for line in summary.arms], columns, width)
 
 
 def _cell(line: ArmSummary, metric: str) -> str:
@@ -107,52 +183,46 @@ def _cell(line: ArmSummary, metric: str) -> str:
     return "–" if estimate is None else show_estimate(estimate)
 
 
-def _add_arm_column(table: Table, names: list[str]) -> None:
-    table.add_column("arm", style="bold", min_width=min(16, max(map(len, names), default=0)))
-
-
 def _utilities(summary: Summary) -> Table:
     table = _table("Utility U, from copy (0) to oracle (1)")
-    _add_arm_column(table, [found.arm for found in summary.utilities])
+    table.add_column("arm", style="bold", overflow="fold")
     for title in ("U ↑", "n"):
-        table.add_column(title, justify="right")
+        table.add_column(title, justify="right", no_wrap=True)
     table.add_column("")
     for found in summary.utilities:
-        style = "" if found.identifiable and not found.reference else "dim"
+        style = "" if found.is_defined and not found.reference else "dim"
         shown = Text(show_utility(found), style=style)
         table.add_row(found.arm, shown, str(found.n), Text("reference" if found.reference else "", style="dim"))
     return table
 
 
-def _kinds(summary: Summary, gap: str) -> Table:
-    """`gap` stands between an estimate and its interval."""
-    table = _table(f"{column_title(SUCCESS)} by kind of task")
-    table.add_column("task", style="bold")
-    for line in summary.arms:
-        table.add_column(line.name, justify="right")
-    table.add_column("n", justify="right")
-    for kind, found in summary.kinds.items():
-        cells = [show_estimate(found[line.name]) if line.name in found else "–" for line in summary.arms]
-        count = max(estimate.n for estimate in found.values())
-        table.add_row(kind, *(cell.replace(" ", gap, 1) for cell in cells), str(count))
-    return table
+def _kind_tables(summary: Summary, gap: str, width: int) -> list[Table]:
+    """Return success rates by kind of task; `gap` stands between an estimate and its interval."""
+    columns = [
+        Column(
+            line.name,
+            [show_estimate(found[line.name]).replace(" ", gap, 1) if line.name in found else "–" for found in rows],
+        )
+        for rows in [list(summary.kinds.values())]
+        for line in summary.arms
+    ]
+    columns.append(Column("n", [str(max(one.n for one in found.values())) for found in summary.kinds.values()]))
+    return stack_tables(f"{column_title(SUCCESS)} by kind of task", list(summary.kinds), columns, width, "task")
 
 
-def _differences(summary: Summary, group: Group, gap: str) -> Table:
-    """`gap` stands between an estimate and its interval."""
-    table = _table(group.title)
-    _add_arm_column(table, list(group.rows))
-    for headline in shown_headlines(summary):
-        table.add_column(column_title(headline), justify="right")
-    for title in ("W/L", "p"):
-        table.add_column(title, justify="right", min_width=5)
-    for label, row in group.rows.items():
-        found = [row[headline.metric] for headline in shown_headlines(summary)]
-        score = f"{found[0].wins}/{found[0].losses}"
-        table.add_row(label, *(_signed(d.estimate, gap) for d in found), score, show_p(found[0].p_adjusted))
-    return table
+def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
+    """Return one group's paired differences; `gap` stands between an estimate and its interval."""
+    metrics, rows = list_columns(summary), list(group.rows.values())
+    columns = [
+        Column(column_title(metric), [_format_difference(row[metric.name].estimate, gap) for row in rows])
+        for metric in metrics
+    ]
+    leading = [row[metrics[0].name] for row in rows]
+    columns.append(Column("W/L", [f"{one.wins}/{one.losses}" for one in leading]))
+    columns.append(Column("p", [show_p(one.p_adjusted) for one in leading]))
+    return stack_tables(group.title, list(group.rows), columns, width)
 
 
-def _signed(estimate: Estimate, gap: str) -> Text:
+def _format_difference(estimate: Estimate, gap: str) -> Text:
     shown = show_estimate(estimate, signed=True).replace(" ", gap, 1)
     return Text(shown, style="bold" if estimate.excludes_zero else "")

@@ -26,24 +26,24 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"column": column_title, "p": show_p, "signed": signed, "how": _how, "number": _number}
+    made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
     made.filters["asset"] = _read_asset
     made.tests |= {"binding": _binding, "known": _known}
     return made
 
 
-def signed(value: float) -> str:
+def format_signed(value: float) -> str:
     """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
     return f"{value:+.1f}".replace("-", "\u2212")
 
 
 def _number(value: float) -> str:
-    """Two digits, with a true minus sign."""
+    """Return two digits, with a true minus sign."""
     return f"{value:.2f}".replace("-", "\u2212")
 
 
 def _how(estimate: Estimate) -> str:
-    """How an interval was made, and the second opinion on it."""
+    """Return the method of an interval, with the bootstrap as a second opinion."""
     if estimate.bootstrap is None:
         return estimate.method
     low, high = estimate.bootstrap

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from wiw.errors import Error, InfrastructureError, StoreError
-from wiw.runs.films import keep_films
+from wiw.runs.films import film_episodes
+from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
-from wiw.runs.scene_map import keep_scene_maps
+from wiw.runs.scene_map import draw_scene_maps
 from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Plan, Row, run_here, run_in_workers
@@ -32,7 +33,7 @@ def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
             "call the same wiw.evaluate(..., out=..., resume=True) again, or begin runs with names: "
             "wiw.runs.recipes.AgentRecipe, or `wiw run`"
         )
-    return TaskRecipe(**info["task"]), {arm: AgentRecipe(**recipe) for arm, recipe in info["agents"].items()}
+    return TaskRecipe(**info["task"]), {arm: AgentRecipe.from_json(recipe) for arm, recipe in info["agents"].items()}
 
 
 def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:
@@ -56,16 +57,11 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
         raise
 
 
-def require_of(task: Any, episodes: Iterable[Episode]) -> dict[str, Any]:
-    """Asks a task that can tell whether all that its episodes need is there, before anything is run, and what it is."""
-    return dict(task.require(episodes)) if hasattr(task, "require") else {}
-
-
-def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_failed: bool = False) -> None:
-    """The same for the episodes that a run has left."""
+def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: bool = False) -> None:
+    """See that the episodes that a run has left are run with what the others were run with."""
     episodes = store.episodes()
     try:
-        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_failed)])
+        require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_errors)])
     except Error:
         store.close()
         raise
@@ -79,18 +75,8 @@ def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> N
         StoreError: what belongs to a scene has come or gone.
     """
     kept = store.info.get("scenes", {})
-    used = require_of(task, episodes)
+    used = task.require(episodes)
     store.require_same({scene: kept[scene] for scene in used if scene in kept}, used if kept else {})
-
-
-def with_pictures(episodes: Sequence[Episode], count: int) -> list[int]:
-    """`count` indices spread evenly over the episodes, and the first of each kind of task that has none among them."""
-    count, last = min(count, len(episodes)), len(episodes) - 1
-    kept = {round(i * last / max(1, count - 1)) for i in range(count)}
-    for index, episode in enumerate(episodes):
-        if count and episode.kind not in {episodes[other].kind for other in kept}:
-            kept.add(index)
-    return sorted(kept)
 
 
 def run_pending(
@@ -112,10 +98,12 @@ def run_pending(
     try:
         for arm, indices in pending.items():
             store.discard(arm, indices)
-        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, _budget(store), board))
+        built = task.build()
+        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, built.decisions, board))
         _run_jobs(plan, episodes, pending, desk, workers)
-        keep_scene_maps(store, task)
-        keep_films(store, task)
+        drop_spare_pictures(store)
+        draw_scene_maps(store, built)
+        film_episodes(store, built)
     finally:
         board.close()
         store.close()
@@ -135,11 +123,6 @@ def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[in
         run_here(plan, jobs, desk)
     else:
         run_in_workers(plan, jobs, desk, workers)
-
-
-def _budget(store: RunStore) -> int:
-    """Most decisions of an episode, as far as the task tells."""
-    return int(store.config["task"].get("decisions", 20))
 
 
 SAME_ERRORS = 5
@@ -190,6 +173,7 @@ class _Desk:
         errors.append(result.error.strip().splitlines()[-1] if result.error.strip() else "")
         if len(errors) == SAME_ERRORS and len({error.partition(":")[0] for error in errors}) == 1:
             raise InfrastructureError(
-                f"the first {SAME_ERRORS} episodes of arm '{arm}' all failed alike, so the run was stopped: "
-                f"{errors[0]}. Mend the cause, then `wiw resume --retry-failed`; the tracebacks are in the run store"
+                f"the first {SAME_ERRORS} episodes of arm '{arm}' all ended with the same error, so the run was "
+                f"stopped: {errors[0]}. Fix the cause, then `wiw resume --retry-errors`; the run "
+                "store has the tracebacks"
             )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a full disk or a damaged run store means to whoever runs `wiw`."""
+"""Errors of SQLite as messages that say what is wrong with a run store and what to do."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ _DAMAGED = ("malformed", "not a database", "no such table", "no such column", "u
 
 
 @contextmanager
-def explained(path: Path) -> Iterator[None]:
-    """Turns what SQLite raises on the run store at `path` into a `StoreError` that says what to do."""
+def explain_faults(path: Path) -> Iterator[None]:
+    """Turn an error of SQLite about the run store at `path` into a `StoreError` that says what to do."""
     try:
         yield
     except sqlite3.DatabaseError as error:
-        raise StoreError(f"{path}: {error}; {remedy(path, str(error))}") from error
+        raise StoreError(f"{path}: {error}; {find_remedy(path, str(error))}") from error
 
 
-def remedy(path: Path, error: str) -> str:
-    """What was expected of the run store at `path`, and what to do, after SQLite's `error`."""
+def find_remedy(path: Path, error: str) -> str:
+    """Return what was expected of the run store at `path` and what to do, given the text of an SQLite error."""
     if any(words in error for words in _UNWRITTEN):
         return (
             f"expected free space, and the right to write, in {path.parent}. What was recorded before is kept: "

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.tabletop.workbench import Workbench
+from wiw.tasks.base import Task
 
-SIDE = (320, 320)
+SIDE = (256, 256)
 """Pixels."""
 SPEED = 2.0
 """Of what is shown, against what happened."""
@@ -32,30 +33,32 @@ QUALITY = 85
 """Of WebP; below it, where the arm was shines through."""
 
 
-def keep_films(store: RunStore, task: Any) -> None:
-    """Films the first episode of each kind that keeps pictures, in every arm, where the task is one at a table."""
-    built = task.build()
-    if not hasattr(built, "table") or "attributes" in store.config:  # failures that are run again have no page
+def film_episodes(store: RunStore, task: Task) -> None:
+    """Film the first episode of each kind that has pictures, in every arm, where the task has tables to film."""
+    if "attributes" in store.config:  # failures that are run again have no page
         return
     episodes, known = store.episodes(), dict[tuple[int, str], bytes]()
-    for arm, index in _wanted(store):
+    for arm, index in _list_films(store):
         if store.film(arm, index) is None:
             executed = [pose for row in store.decisions(arm, index) for pose in row["executed"]]
             name = index, str(executed)
             if name not in known:  # arms that did the same look the same
-                known[name] = film(built.table(episodes[index]).bench, executed)
+                table = task.set_table(episodes[index])
+                if table is None:
+                    continue
+                known[name] = film(table.bench, executed)
             store.write_film(arm, index, known[name])
 
 
 def film(bench: Workbench, poses: Sequence[Sequence[float]]) -> bytes:
-    """Animated WebP of what the front camera sees while the gripper goes to these poses."""
+    """Return the animated WebP of what the front camera sees while the gripper goes to these poses."""
     frames = list(_frames(bench, poses))
     every = -(-len(frames) // MOST)
-    return animated([*frames[:-1:every], frames[-1]])
+    return encode_film([*frames[:-1:every], frames[-1]])
 
 
-def animated(frames: Sequence[NDArray[np.uint8]]) -> bytes:
-    """Animated WebP of pictures uint8 [H, W, 3] at `RATE`, over and over."""
+def encode_film(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """Return the animated WebP of pictures uint8 [H, W, 3] at `RATE`, over and over."""
     first, *others = (Image.fromarray(frame) for frame in frames)
     lasting = [round(1000 / RATE)] * len(others) + [LAST]
     file = io.BytesIO()
@@ -63,15 +66,15 @@ def animated(frames: Sequence[NDArray[np.uint8]]) -> bytes:
     return file.getvalue()
 
 
-def _wanted(store: RunStore) -> Iterator[tuple[str, int]]:
+def _list_films(store: RunStore) -> Iterator[tuple[str, int]]:
     episodes = store.episodes()
-    first = {episodes[index].kind: index for index in reversed(store.info["pictures"])}
+    first = {episodes[index].kind: index for index in reversed(pictured_episodes(store))}
     ended = {(row["arm"], row["episode"]) for row in store.outcomes() if row["status"] == "done"}
     yield from ((arm, index) for arm, index in sorted(ended) if index in first.values())
 
 
 def _frames(bench: Workbench, poses: Sequence[Sequence[float]]) -> Iterator[NDArray[np.uint8]]:
-    """Pictures at even times, and of the end."""
+    """Return pictures at even times, and of the end."""
     due, period = bench.seconds, SPEED / RATE
     for pose in poses:
         begin = bench.seconds
@@ -79,6 +82,6 @@ def _frames(bench: Workbench, poses: Sequence[Sequence[float]]) -> Iterator[NDAr
         step = (bench.seconds - begin) / max(1, len(way) - 1)
         for k in range(len(way)):
             if begin + k * step >= due:
-                yield way[k].picture("front", SIDE)["color"]
+                yield way[k].render_view("front", SIDE)["color"]
                 due += period
-    yield bench.picture("front", SIDE)["color"]
+    yield bench.render_view("front", SIDE)["color"]

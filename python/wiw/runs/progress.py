@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bar for each arm: in a terminal by rich, in a notebook by the browser."""
+"""Progress bars, one per arm: in a terminal by rich, in a notebook by the browser."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from wiw.types import EpisodeResult
 
 @dataclass
 class ArmProgress:
-    """How far an arm is, and how well it does so far."""
+    """Progress of one arm, and its success rate so far."""
 
     total: int
     """Episodes to run."""
     decisions_each: int
     """Most decisions an episode may take; ends early where the goal is reached."""
     ended: int = 0
-    failed: int = 0
+    errors: int = 0
     successes: float = 0.0
     decisions: int = 0
 
@@ -33,24 +33,24 @@ class ArmProgress:
     @property
     def text(self) -> str:
         """E.g. "7/20 episodes, SR 43 %"."""
-        judged = self.ended - self.failed
-        rate = f", SR {100 * self.successes / judged:.0f} %" if judged else ""
-        failed = f", {self.failed} failed" if self.failed else ""
-        return f"{self.ended}/{self.total} episodes{rate}{failed}"
+        scored = self.ended - self.errors
+        rate = f", SR {100 * self.successes / scored:.0f} %" if scored else ""
+        count = "1 error" if self.errors == 1 else f"{self.errors} errors"
+        return f"{self.ended}/{self.total} episodes{rate}{f', {count}' if self.errors else ''}"
 
 
 class Board(Protocol):
-    """Where progress is shown."""
+    """Displays progress."""
 
     def show(self, arm: str, progress: ArmProgress) -> None:
-        """An arm has moved on."""
+        """Show an arm's new state."""
 
     def close(self) -> None:
-        """The run has ended or was stopped."""
+        """Finish: the run has ended or was stopped."""
 
 
 class Tracker:
-    """Counts what happens in a run and tells the board."""
+    """Counts decisions and episodes of a run and updates the board."""
 
     def __init__(self, totals: Mapping[str, int], decisions_each: int, board: Board) -> None:
         self._arms = {arm: ArmProgress(total, decisions_each) for arm, total in totals.items()}
@@ -60,33 +60,33 @@ class Tracker:
             board.show(arm, progress)
 
     def decision(self, arm: str, episode: int) -> None:
-        """A decision was taken."""
+        """Count a decision."""
         self._running[arm, episode] = self._running.get((arm, episode), 0) + 1
         self._arms[arm].decisions += 1
         self._board.show(arm, self._arms[arm])
 
     def forget(self, arm: str, episode: int) -> None:
-        """An episode's decisions count no more: it has ended, or begins again."""
+        """Drop the decisions of an episode that has ended or starts again."""
         self._arms[arm].decisions -= self._running.pop((arm, episode), 0)
 
     def episode(self, arm: str, result: EpisodeResult) -> None:
-        """An episode has ended."""
+        """Count an episode that has ended."""
         self.forget(arm, result.episode)
         progress = self._arms[arm]
         progress.ended += 1
-        progress.failed += result.status == "failed"
+        progress.errors += result.status == "error"
         progress.successes += result.metrics.get("success", 0.0)
         self._board.show(arm, progress)
 
 
 class SilentBoard:
-    """Shows nothing."""
+    """Displays nothing."""
 
     def show(self, arm: str, progress: ArmProgress) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 class TerminalBoard:
@@ -112,7 +112,7 @@ class TerminalBoard:
         self._bars.start()
 
     def show(self, arm: str, progress: ArmProgress) -> None:
-        """Moves the arm's bar."""
+        """Move the arm's bar."""
         if not self._console.is_terminal:
             self._line(arm, progress)
             return
@@ -129,7 +129,7 @@ class TerminalBoard:
             self._console.print(f"{arm}: {progress.text}", highlight=False)
 
     def close(self) -> None:
-        """Leaves the bars as they stand."""
+        """Leave the bars as they are."""
         self._bars.stop()
 
 
@@ -145,7 +145,7 @@ class NotebookBoard:
         self._handle = display(HTML(""), display_id=True)
 
     def show(self, arm: str, progress: ArmProgress) -> None:
-        """Redraws, at most five times a second."""
+        """Redraw, at most five times a second."""
         self._arms[arm] = progress
         if time.monotonic() - self._shown > 0.2:
             self._draw()
@@ -162,12 +162,12 @@ class NotebookBoard:
         self._handle.update(self._html(f"<table>{rows}</table>"))
 
     def close(self) -> None:
-        """Draws the last state."""
+        """Draw the last state."""
         self._draw()
 
 
 def make_board(wanted: bool) -> Board:
-    """The board that fits where the program runs."""
+    """Return a board for a terminal or a notebook, or one that displays nothing."""
     if not wanted:
         return SilentBoard()
     return NotebookBoard() if in_notebook() else TerminalBoard()

@@ -68,7 +68,7 @@ class AgentRow:
 
 
 def to_json(value: Any) -> str:
-    """Standard JSON of arrays and numbers; what is not finite becomes null.
+    """Return the standard JSON of arrays and numbers; what is not finite becomes null.
 
     Raises:
         ArgumentError: a value has no JSON form.
@@ -92,7 +92,7 @@ def _plain(value: Any) -> Any:
 
 
 def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> DecisionRow:
-    """The row of a decision; pictures only where they are wanted, for they are most of the bytes."""
+    """Return the row of a decision, with pictures only if asked: they are most of the bytes."""
     decision = record.decision
     proposals = [
         {"actions": p.actions, "prior": p.prior, "note": p.note} | ({"text": p.text} if p.text else {})
@@ -165,18 +165,18 @@ def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:
         yield "goal", encode_jpeg(decision.goal.image)
     for index, rollout in enumerate(decision.rollouts or ()):
-        yield f"imagined/{index}", encode_jpeg(strip(rollout.frames[kept_frames(len(rollout.frames))]))
+        yield f"imagined/{index}", encode_jpeg(strip(rollout.frames[select_frames(len(rollout.frames))]))
     for index, rollout in enumerate(decision.fidelity.rollouts if decision.fidelity else ()):
-        yield f"true/{index}", encode_jpeg(strip(rollout.frames[kept_frames(len(rollout.frames))]))
+        yield f"true/{index}", encode_jpeg(strip(rollout.frames[select_frames(len(rollout.frames))]))
 
 
-def kept_frames(count: int) -> NDArray[np.int64]:
-    """Which of so many frames are kept: all where they are few, else evenly spread ones with the last."""
+def select_frames(count: int) -> NDArray[np.int64]:
+    """Return the indices of the frames to store: all where they are few, else evenly spread ones with the last."""
     return np.round(np.linspace(count - 1, 0, min(count, MOST_FRAMES))).astype(np.int64)[::-1]
 
 
 def strip(frames: NDArray[np.uint8], height: int = STRIP_HEIGHT) -> NDArray[np.uint8]:
-    """Frames side by side, uint8 [height, K * width, 3]; several views of a frame stand above one another.
+    """Return the frames side by side, uint8 [height, K * width, 3]; several views of a frame stand above one another.
 
     Args:
         frames: uint8 [K, H, W, 3] or [K, V, H, W, 3].
@@ -192,13 +192,13 @@ def strip(frames: NDArray[np.uint8], height: int = STRIP_HEIGHT) -> NDArray[np.u
 
 
 def encode_jpeg(image: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> bytes:
-    """JPEG bytes of an RGB image."""
+    """Return JPEG bytes of an RGB image."""
     _, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     return bytes(data)
 
 
 def decode_jpeg(data: bytes) -> NDArray[np.uint8]:
-    """RGB image [H, W, 3] from JPEG bytes."""
+    """Return RGB image [H, W, 3] from JPEG bytes."""
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise StoreError(f"a picture of {len(data)} bytes is no JPEG; the run store is damaged")

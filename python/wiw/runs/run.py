@@ -14,7 +14,7 @@ class Records(list[dict[str, Any]]):
     """A list of plain dicts that turns into a pandas DataFrame on request."""
 
     def to_pandas(self) -> Any:
-        """The records as a DataFrame, nested metrics as columns.
+        """Return the records as a DataFrame, nested metrics as columns.
 
         Raises:
             ArgumentError: pandas is not installed.

@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from wiw.runs.pictures import pictured_episodes
 from wiw.runs.store import RunStore
+from wiw.tasks.base import Task
 
 HFOV_DEG = 15.0
 """So narrow that walls lean outward by little: 0.3 m at the edge of a 15 m wide scene."""
@@ -37,26 +39,23 @@ class View:
     """float64 [2, 3]: pixel (u, v) = A [x, z, 1] for points on the floor."""
 
 
-def keep_scene_maps(store: RunStore, task: Any) -> None:
-    """Draws the scenes of the episodes that keep pictures, where the task's scenes can be drawn."""
-    built = task.build()
-    if not hasattr(built, "scenes"):
-        return
-    from wiw.datasets.worlds import world
-
+def draw_scene_maps(store: RunStore, task: Task) -> None:
+    """Draw the scenes of the episodes that have pictures, where the task has scenes to draw."""
     episodes = store.episodes()
-    for index in store.info["pictures"]:
+    for index in pictured_episodes(store):
         episode = episodes[index]
         if store.scene_map(episode.scene) is None:
-            place = world(episode.scene, built.backend)
-            image, matrix = draw(place.scene, place.navmesh, episode.start_position[1], built.backend)
+            place = task.open_world(episode)
+            if place is None:
+                continue
+            image, matrix = draw(place.scene, place.navmesh, episode.start_position[1], place.backend)
             store.write_scene_map(episode.scene, _encode(image), matrix)
 
 
 def draw(
     scene: Any, navmesh: Any, floor: float, backend: Any = "auto"
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """A scene from above.
+    """Return a scene from above.
 
     Args:
         scene: a `wiw.scenes.Scene`.
@@ -73,17 +72,17 @@ def draw(
     renderer = Renderer(scene, backend=backend, samples=4)
     hidden = [item for item in scene.instances if item["bounds"][0][1] > floor + OVERHEAD]
     if hidden:
-        renderer.set_poses([item["id"] for item in hidden], np.stack([_lifted(item) for item in hidden]))
+        renderer.set_poses([item["id"] for item in hidden], np.stack([_lift(item) for item in hidden]))
     seen = renderer.perspective(view.T_world_camera[None], view.size, HFOV_DEG)
     triangles, _ = navmesh.triangles()
-    if _roofed(seen["depth"][0], triangles, view, floor):
+    if _has_roof(seen["depth"][0], triangles, view, floor):
         return _flat(triangles, view), view.world_to_pixel
     opaque = np.where(seen["instance"][0] > 0, 255, 0).astype(np.uint8)
     return np.dstack([seen["color"][0], opaque]), view.world_to_pixel
 
 
 def look_down(bounds: NDArray[np.float64], floor: float) -> View:
-    """The camera over the middle of `bounds` [2, 3], with -Z up in the picture."""
+    """Return the camera over the middle of `bounds` [2, 3], with -Z up in the picture."""
     low, high = bounds[0] - MARGIN, bounds[1] + MARGIN
     width, depth = high[0] - low[0], high[2] - low[2]
     scale = LONG_SIDE / max(width, depth)
@@ -96,21 +95,21 @@ def look_down(bounds: NDArray[np.float64], floor: float) -> View:
 
 
 def to_pixels(world_to_pixel: ArrayLike, points: ArrayLike) -> NDArray[np.float64]:
-    """Pixels [N, 2] of world points [N, 3]."""
+    """Return the pixels [N, 2] of world points [N, 3]."""
     matrix, positions = np.asarray(world_to_pixel, np.float64), np.asarray(points, np.float64)
     pixels: NDArray[np.float64] = positions[:, [0, 2]] @ matrix[:, :2].T + matrix[:, 2]
     return pixels
 
 
-def _lifted(item: dict[str, Any]) -> NDArray[np.float64]:
-    """The instance's pose high above, behind the camera."""
+def _lift(item: dict[str, Any]) -> NDArray[np.float64]:
+    """Return the instance's pose high above, behind the camera."""
     pose = np.array(item["T_world_instance"], np.float64)
     pose[1, 3] += 1e4
     return pose
 
 
-def _roofed(depth: NDArray[np.float32], triangles: NDArray[np.float32], view: View, floor: float) -> bool:
-    """Whether most walkable places on this floor are hidden from above by something higher than a person."""
+def _has_roof(depth: NDArray[np.float32], triangles: NDArray[np.float32], view: View, floor: float) -> bool:
+    """Return whether something higher than a person hides most walkable places on this floor from above."""
     centers = triangles.mean(1)
     centers = centers[np.abs(centers[:, 1] - floor) < 1]
     if len(centers) == 0:
@@ -122,7 +121,7 @@ def _roofed(depth: NDArray[np.float32], triangles: NDArray[np.float32], view: Vi
 
 
 def _flat(triangles: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
-    """Where one can walk, as a plain shape."""
+    """Draw the walkable area as a plain shape."""
     image = np.full((*view.size, 4), BACKGROUND, np.uint8)
     corners = to_pixels(view.world_to_pixel, triangles.reshape(-1, 3)).reshape(-1, 3, 2)
     cv2.fillPoly(image, list(np.round(corners).astype(np.int32)), (*FLOOR_COLOR, 255))
@@ -130,6 +129,6 @@ def _flat(triangles: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
 
 
 def _encode(image: NDArray[np.uint8]) -> bytes:
-    """WebP bytes of an RGBA image."""
+    """Return WebP bytes of an RGBA image."""
     _, data = cv2.imencode(".webp", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_WEBP_QUALITY, 80])
     return bytes(data)

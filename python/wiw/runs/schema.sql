@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 7 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 8 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -20,10 +20,10 @@ CREATE TABLE episode (              -- the episodes that every arm runs
 CREATE TABLE outcome (              -- how an episode ended in an arm; absent while it is to be run
     arm TEXT NOT NULL,
     episode INTEGER NOT NULL REFERENCES episode (episode),
-    status TEXT NOT NULL CHECK (status IN ('done', 'failed')),  -- failed: infrastructure, never the task
+    status TEXT NOT NULL CHECK (status IN ('done', 'error')),   -- error: something broke; never an outcome of the task
     metrics TEXT NOT NULL,          -- JSON: name to number
     seconds REAL NOT NULL,
-    error TEXT NOT NULL,            -- traceback; empty where nothing failed
+    error TEXT NOT NULL,            -- traceback; empty where nothing broke
     kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind> | vlm/<kind>; else empty
     PRIMARY KEY (arm, episode)
 ) WITHOUT ROWID;

@@ -43,7 +43,8 @@ INFO: Any = {
     "workers": WHOLE,
     "limits": {},
 }
-ACTIONS = [Either(WHOLE, [NUMBER])]
+ACTIONS = [Either((int, float), [NUMBER])]
+"""A number or a vector for each action."""
 COLUMNS: Mapping[str, Any] = {
     "config": CONFIG,
     "info": INFO,
@@ -114,9 +115,8 @@ def check_decision(row: Mapping[str, Any], where: str) -> None:
     count = len(row["proposals"])
     fits = all(row[name] is None or len(row[name]) == count for name in ("scores", "real_frames"))
     chosen = row["chosen"] is None or 0 <= row["chosen"] < count
-    poses = [action for action in (*row["actions"], *row["executed"]) if isinstance(action, list)]
-    fits = fits and len(row["actions"]) > 0 and len(poses) in (0, len(row["actions"]) + len(row["executed"]))
-    fits = fits and all(len(pose) == 7 for pose in poses)
+    lengths = {len(own) if isinstance(own, list) else None for own in (*row["actions"], *row["executed"])}
+    fits = fits and len(row["actions"]) > 0 and len(lengths) == 1
     if not fits or not chosen or not row["path"] or any(len(place) != 3 for place in row["path"]):
         raise StoreError(
             f"{where}: expected actions of one kind, a score and frames for each of {count} proposals, one of them "

@@ -11,7 +11,7 @@ import fcntl
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -20,12 +20,13 @@ from typing import Any
 
 import wiw
 from wiw.errors import ArgumentError, StoreError
-from wiw.runs.faults import explained, remedy
+from wiw.runs.faults import explain_faults, find_remedy
+from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 DECISION_JSON = (
     "actions",
     "executed",
@@ -49,7 +50,7 @@ _SCHEMA = Path(__file__).with_name("schema.sql")
 
 
 def store_path(run: str | Path) -> Path:
-    """The store's file, from a run's folder or the file itself."""
+    """Return the store's file, from a run's folder or the file itself."""
     path = Path(run).expanduser()
     return path if path.suffix == ".sqlite" else path / FILE_NAME
 
@@ -66,13 +67,13 @@ class RunStore:
     def create(
         cls, run: str | Path, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
     ) -> RunStore:
-        """A new store for writing.
+        """Create a store for writing.
 
         Raises:
             StoreError: a run is already there, or the folder cannot be written.
         """
         path = store_path(run)
-        if cls.begun(run):
+        if cls.exists(run):
             raise StoreError(
                 f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
@@ -101,14 +102,14 @@ class RunStore:
         return store
 
     @staticmethod
-    def begun(run: str | Path) -> bool:
-        """Whether a run is there, rather than nothing or a creation that was cut off."""
+    def exists(run: str | Path) -> bool:
+        """Return whether a run is there, rather than nothing or a creation that was cut off."""
         path = store_path(run)
         return path.exists() and not _blank(path)
 
     @classmethod
     def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:
-        """An existing store for writing; partial episodes are discarded.
+        """Open an existing store for writing and discard partial episodes.
 
         Raises:
             StoreError: missing, damaged, of another version, of another configuration than `config`, or in use.
@@ -124,7 +125,7 @@ class RunStore:
         return store
 
     def require_version(self) -> None:
-        """Holds the run to the version of wiw that began it.
+        """Check that this is the version of wiw that started the run.
 
         Raises:
             StoreError: this is another.
@@ -136,7 +137,7 @@ class RunStore:
             )
 
     def require_task(self, task: dict[str, Any]) -> None:
-        """Holds the run to the task it was begun with, whose preset may be a file that has changed since.
+        """Check that the task is the one the run was started with; its preset may be a file that has changed.
 
         Raises:
             StoreError: the task differs; says in what.
@@ -144,7 +145,7 @@ class RunStore:
         _require_same(self.path, self.config["task"], json.loads(to_json(task)))
 
     def require_same(self, begun_with: dict[str, Any], now: dict[str, Any]) -> None:
-        """Holds the run to something else it was begun with.
+        """Check a mapping against the one that the run was started with.
 
         Raises:
             StoreError: it differs; says in what.
@@ -153,7 +154,7 @@ class RunStore:
 
     @classmethod
     def read(cls, run: str | Path) -> RunStore:
-        """An existing store for reading, also while it is being written.
+        """Open an existing store for reading, also while it is being written.
 
         Raises:
             StoreError: missing, damaged or of another version.
@@ -168,13 +169,14 @@ class RunStore:
         with store._closed_on_error():
             store._require_whole()
             store._require_readable()
+            store._update_schema()
         return store
 
     def _require_whole(self) -> None:
-        """A last page that is cut short reads as zeros, of which SQLite thinks nothing."""
+        """Check the file's length: SQLite reads a last page that is cut short as zeros."""
         pages, size = (self._rows(f"PRAGMA {name}")[0][name] for name in ("page_count", "page_size"))
         if not _has_log(self.path) and self.path.stat().st_size < pages * size:  # in this order: a log may just go
-            raise StoreError(f"{self.path}: the file is cut short; {remedy(self.path, 'malformed')}")
+            raise StoreError(f"{self.path}: the file is cut short; {find_remedy(self.path, 'malformed')}")
 
     def _require_readable(self) -> None:
         application, version = (self._rows(f"PRAGMA {name}")[0][name] for name in ("application_id", "user_version"))
@@ -183,11 +185,25 @@ class RunStore:
                 f"{self.path} is no run store of wiw: expected application id {APPLICATION_ID:#x}, got "
                 f"{application:#x}. If its creation was cut off, begin the run again; else name another folder"
             )
-        if version != SCHEMA_VERSION:
+        if not OLDEST_READABLE <= version <= SCHEMA_VERSION:
             raise StoreError(
                 f"{self.path} was written by wiw {self.wiw_version} with schema version {version}; this is wiw "
-                f"{wiw.__version__}, which reads version {SCHEMA_VERSION}: use the one that wrote it, or run anew"
+                f"{wiw.__version__}, which reads versions {OLDEST_READABLE} to {SCHEMA_VERSION}: use the one that "
+                "wrote it, or start a new run"
             )
+
+    def _update_schema(self) -> None:
+        """Bring an older store to the current schema: in the file if it may be written, else for this reader alone."""
+        version = self._rows("PRAGMA user_version")[0]["user_version"]
+        if version == SCHEMA_VERSION:
+            return
+        if self._lock is None:
+            with explain_faults(self.path):
+                show_as_current(self._connection, version)
+            return
+        with self._writing() as connection:
+            migrate(connection, version)
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
     # -- what the run is -------------------------------------------------------------------------------------------
 
@@ -212,13 +228,13 @@ class RunStore:
         return dict(parse_column("info", self._value("info"), str(self.path)))
 
     def episodes(self) -> list[Episode]:
-        """The episodes that every arm runs; their place in the list is their index."""
+        """Return the episodes that every arm runs; their place in the list is their index."""
         rows = self._typed("episode", self._rows("SELECT * FROM episode ORDER BY episode"))
         infos = [parse_column("episode.info", row["info"], self._place("episode", row)) for row in rows]
         return [_episode(row, info) for row, info in zip(rows, infos, strict=True)]
 
     def outcomes(self) -> list[dict[str, Any]]:
-        """Ended episodes of all arms; those of a task with several kinds say of which ("task")."""
+        """Return the ended episodes of all arms, with their kind ("task") where a task has several."""
         rows = self._rows(
             "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
             "FROM outcome o JOIN episode e USING (episode) "
@@ -231,7 +247,7 @@ class RunStore:
         ]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
-        """Decisions of ended episodes, of one arm or episode if named, in order."""
+        """Return the decisions of ended episodes in order, of all or of one arm or episode."""
         rows = self._rows(
             "SELECT d.* FROM decision d JOIN outcome USING (arm, episode) WHERE (?1 IS NULL OR arm = ?1) "
             "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
@@ -245,8 +261,10 @@ class RunStore:
         return rows
 
     def totals(self, column: str) -> dict[str, dict[str, float]]:
-        """Sums over the decisions of ended episodes of a column of named numbers ("seconds", "calls", "spent"), by arm,
-        with their number as "decisions".
+        """Return sums over the decisions of ended episodes by arm, with the number of decisions as "decisions".
+
+        Args:
+            column: of named numbers: "seconds", "calls" or "spent".
         """
         if column not in ("seconds", "calls", "spent"):
             raise ArgumentError(f"totals: expected seconds, calls or spent, got '{column}'")
@@ -260,14 +278,14 @@ class RunStore:
         return found
 
     def lost(self) -> dict[str, dict[str, float]]:
-        """By arm and name, what was spent on decisions that failed or were begun again."""
+        """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}
         for row in self._rows("SELECT arm, name, value FROM lost"):
             found.setdefault(row["arm"], {})[row["name"]] = row["value"]
         return found
 
     def images(self, arm: str, episode: int, decision: int) -> dict[str, bytes]:
-        """JPEG by name, empty where no pictures were kept."""
+        """Return JPEG by name, empty where no pictures were kept."""
         rows = self._rows(
             "SELECT name, jpeg FROM image WHERE arm = ? AND episode = ? AND decision = ? ORDER BY name",
             (arm, episode, decision),
@@ -275,20 +293,20 @@ class RunStore:
         return {row["name"]: row["jpeg"] for row in rows}
 
     def film(self, arm: str, episode: int) -> bytes | None:
-        """Animated WebP of an episode, if one was kept."""
+        """Return the animated WebP of an episode, if one was kept."""
         found = self._rows("SELECT webp FROM film WHERE arm = ? AND episode = ?", (arm, episode))
         return found[0]["webp"] if found else None
 
     def scene_map(self, scene: str) -> tuple[bytes, list[list[float]]] | None:
-        """WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
+        """Return WebP of the scene from above and its 2x3 matrix from world (x, z) to pixels, if one was kept."""
         for row in self._rows("SELECT * FROM scene_map WHERE scene = ?", (scene,)):
             where = f"{self.path}: map of {scene}"
             return row["webp"], parse_column("world_to_pixel", row["world_to_pixel"], where)
         return None
 
-    def pending(self, arm: str, retry_failed: bool = False) -> list[int]:
-        """Indices of the episodes still to be run in an arm."""
-        status = "AND status = 'done'" if retry_failed else ""
+    def pending(self, arm: str, retry_errors: bool = False) -> list[int]:
+        """Return indices of the episodes still to be run in an arm."""
+        status = "AND status = 'done'" if retry_errors else ""
         rows = self._rows(
             f"SELECT episode FROM episode WHERE episode NOT IN "
             f"(SELECT episode FROM outcome WHERE arm = ? {status}) ORDER BY episode",
@@ -299,7 +317,7 @@ class RunStore:
     # -- writing ---------------------------------------------------------------------------------------------------
 
     def write(self, row: DecisionRow | OutcomeRow) -> None:
-        """Writes one decision with its pictures, or one episode's end, as one transaction.
+        """Write one decision with its pictures, or one episode's end, as one transaction.
 
         An episode whose file gave no length takes it from the first arm that has measured it ("shortest").
         """
@@ -332,7 +350,7 @@ class RunStore:
                     )
 
     def write_agent(self, row: AgentRow) -> None:
-        """Keeps what an arm's agent says of itself, as `info["built"][arm]`.
+        """Store the description of an arm's agent as `info["built"][arm]`.
 
         Raises:
             StoreError: the arm was begun with an agent that said otherwise, such as one of other weights.
@@ -348,33 +366,44 @@ class RunStore:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 
     def write_lost(self, row: LostRow) -> None:
-        """Books what a failed decision had spent."""
+        """Record what an interrupted decision had spent."""
         with self._writing() as connection:
             connection.executemany(
                 f"INSERT INTO lost VALUES (?, ?, ?) {_ADD}", [(row.arm, *item) for item in row.spent.items()]
             )
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
-        """Forgets what was written of episodes that are to be run again, but for what it cost."""
+        """Delete episodes that are to be run again; their costs are recorded as lost."""
         with self._writing() as connection:
             for episode in episodes:
                 _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
                 connection.execute("DELETE FROM outcome WHERE arm = ? AND episode = ?", (arm, episode))
 
+    def keep_pictures(self, episodes: Sequence[int]) -> None:
+        """Drop the pictures of all other episodes; `info["pictures"]` has these, the one to show first in front."""
+        info = {name: value for name, value in self.info.items() if name != "keep_images"} | {"pictures": episodes}
+        numbers = ", ".join(str(int(episode)) for episode in episodes)
+        with self._writing() as connection:
+            dropped = connection.execute(f"DELETE FROM image WHERE episode NOT IN ({numbers})").rowcount
+            connection.execute("UPDATE run SET info = ?", (to_json(info),))
+        if dropped:
+            with suppress(sqlite3.OperationalError):  # a reader or a full disk: the file stays larger than it must be
+                self._connection.execute("VACUUM")
+
     def write_scene_map(self, scene: str, webp: bytes, world_to_pixel: Any) -> None:
-        """Keeps how a scene looks from above."""
+        """Store a picture of a scene from above."""
         with self._writing() as connection:
             connection.execute(
                 "INSERT OR REPLACE INTO scene_map VALUES (?, ?, ?)", (scene, webp, to_json(world_to_pixel))
             )
 
     def write_film(self, arm: str, episode: int, webp: bytes) -> None:
-        """Keeps how an episode went."""
+        """Store the film of an episode."""
         with self._writing() as connection:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def close(self) -> None:
-        """Closes the file and lets others write."""
+        """Close the file and lets others write."""
         self._connection.close()
         if self._lock is not None:
             self._lock.close()
@@ -404,12 +433,12 @@ class RunStore:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        with explained(self.path), self._connection as connection:
+        with explain_faults(self.path), self._connection as connection:
             connection.execute("BEGIN IMMEDIATE")
             yield connection
 
     def _rows(self, query: str, values: tuple[Any, ...] = ()) -> list[dict[str, Any]]:
-        with explained(self.path):
+        with explain_faults(self.path):
             return [dict(row) for row in self._connection.execute(query, values)]
 
     def _typed(self, table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -418,7 +447,7 @@ class RunStore:
         Raises:
             StoreError: a value is of another type.
         """
-        columns = self._rows(f"PRAGMA table_info({table})")
+        columns = self._rows(f"PRAGMA main.table_info({table})")
         declared = {
             column["name"]: _TYPES[column["type"]] + (() if column["notnull"] or column["pk"] else (type(None),))
             for column in columns
@@ -463,17 +492,17 @@ def removed_if_empty(path: Path) -> Iterator[None]:
 
 
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
-    """A connection; one that may write is for whoever holds the lock, which is given up if there can be none."""
+    """Connect; a connection that may write is for the holder of the lock, which is released if connecting fails."""
     try:
-        with explained(path):
-            return _opened(path, writing=lock is not None)
+        with explain_faults(path):
+            return _open_file(path, writing=lock is not None)
     except StoreError:
         if lock is not None:
             lock.close()
         raise
 
 
-def _opened(path: Path, writing: bool) -> sqlite3.Connection:
+def _open_file(path: Path, writing: bool) -> sqlite3.Connection:
     uri = f"{path.absolute().as_uri()}?mode={'rwc' if writing else 'ro'}"
     connection = _plain(uri)
     if writing:
@@ -498,22 +527,22 @@ def _plain(uri: str) -> sqlite3.Connection:
 
 
 def _has_log(path: Path) -> bool:
-    """Whether transactions lie in the log beside the file."""
+    """Return whether transactions lie in the log beside the file."""
     log = path.with_name(path.name + "-wal")
     return log.exists() and log.stat().st_size > 0
 
 
 def _blank(path: Path) -> bool:
-    """Whether a creation was cut off before anything was written: the schema and the run are one transaction."""
-    with explained(path):
-        connection = _opened(path, writing=True)  # also where it was cut off with a log that only a writer takes in
+    """Return whether a creation was cut off before anything was written: the schema and the run are one transaction."""
+    with explain_faults(path):
+        connection = _open_file(path, writing=True)  # also where it was cut off with a log that only a writer takes in
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
         connection.close()
     return bool(tables == 0)
 
 
 def _lock(path: Path) -> Any:
-    """An advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
+    """Take an advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
     try:
         handle = path.with_suffix(".lock").open("w")
     except OSError as error:
@@ -538,7 +567,7 @@ _ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
 
 
 def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
-    """Deletes decisions, pictures and films `d` that meet a condition; what they cost is booked as lost."""
+    """Delete decisions, pictures and films `d` that meet a condition; record their costs as lost."""
     for column, name in (("spent", "key"), ("seconds", "'seconds'")):
         connection.execute(
             f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "

@@ -20,7 +20,9 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, Error, InfrastructureError
+from wiw.errors import Error, InfrastructureError
+from wiw.loop.limits import Limits
+from wiw.runs.compose import RunContext
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
@@ -57,19 +59,6 @@ class Plan:
     """All episodes of the run, for agents that are shown another one's."""
     sources: Mapping[str, str] = field(default_factory=dict)
     """Digests of the user's own source files, which every agent is built of."""
-
-    def strangers(self, agent: Any, indices: Iterable[int]) -> dict[int, Episode]:
-        """For an agent with placebo="swapped" the next episode of each, counted round; else nothing.
-
-        Raises:
-            ArgumentError: the run has a single episode.
-        """
-        if getattr(agent, "placebo", None) != "swapped":
-            return {}
-        count = len(self.episodes)
-        if count < 2:
-            raise ArgumentError("placebo-swapped shows the model another episode: expected at least 2 episodes, got 1")
-        return {index: self.episodes[(index + 1) % count] for index in indices}
 
 
 @dataclass(frozen=True)
@@ -119,7 +108,9 @@ class Runner:
 
         if self._arm != job.arm:
             self._agent = None
-            self._agent = self._plan.agents[job.arm].build(self._task.defaults, self._plan.limits)
+            self._agent = self._plan.agents[job.arm].build(
+                RunContext(self._task, self._plan.episodes), Limits(**self._plan.limits)
+            )
             require_unchanged(self._plan.sources)
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
@@ -131,7 +122,6 @@ class Runner:
             seed=self._plan.seed,
             live=self._plan.live,
             sink=sink,
-            strangers=self._plan.strangers(self._agent, [index for index, _ in job.episodes]),
         )
 
 
@@ -251,7 +241,7 @@ class _Crew:
                 self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
             else:
                 error = f"the worker process died twice on this episode, last: {cause}"
-                result = EpisodeResult(index, episode.episode_id, episode.scene, "failed", error=error, kind="worker")
+                result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
                 self._desk.write(OutcomeRow(worker.job.arm, result))
 
 

@@ -6,6 +6,7 @@ World frame: metres, Y up, right-handed. See `Scene` for what a scene tells abou
 
 from __future__ import annotations
 
+import difflib
 import logging
 import re
 import time
@@ -17,6 +18,7 @@ from typing import Any
 from wiw import _core
 from wiw.errors import ArgumentError, FileError
 from wiw.scenes import isolated, store
+from wiw.suggestions import did_you_mean
 
 Scene = _core.scene.Scene
 
@@ -104,6 +106,8 @@ def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
 
 SPLIT_SIZE = 1000
 """Apartments that a spec without a number stands for."""
+APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
+"""Split, first, end, and number of a single one."""
 
 
 def is_generated(spec: str) -> bool:
@@ -131,19 +135,34 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     if not is_generated(spec):
         if not Path(spec).expanduser().is_file():
             raise FileError(
-                f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]"
+                f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]."
+                f"{_did_you_mean(spec)}"
             )
         return [spec]
-    match = re.fullmatch(r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?", spec)
+    match = re.fullmatch(APARTMENTS, spec)
     if match is None or int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
         raise ArgumentError(
             f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40, apartments:val:40:60 or "
-            "apartments:val/7"
+            f"apartments:val/7.{_did_you_mean(spec)}"
         )
     split, first, end, index = match.groups()
     if index is not None:
         return [spec]
     return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
+
+
+def _did_you_mean(spec: str) -> str:
+    """Return a hint at a split, or at a file beside the one that is not there."""
+    path = Path(spec).expanduser()
+    kind, colon, rest = spec.partition(":")
+    if did_you_mean(kind, ["apartments"]):
+        split = re.split("[:/]", rest)[0]
+        near = difflib.get_close_matches(split, ["train", "val", "test"], 1, 0.5) or ["val"]
+        meant = f"apartments:{near[0]}{rest[len(split) :]}"
+        return did_you_mean(spec, [meant]) if re.fullmatch(APARTMENTS, meant) else ""
+    if colon or not path.parent.is_dir():
+        return ""
+    return did_you_mean(path.name, [file.name for file in path.parent.iterdir()])
 
 
 def open_scene(name: str) -> Scene:

@@ -2,7 +2,7 @@
 """A small OpenAI-compatible server of chat completions on the loopback interface, with any `Client` behind it.
 
 It speaks log-probabilities, images as data URIs, JSON schemas, choices and usage, as far as `wiw` and its tests ask for
-them, and misbehaves on demand.
+them.
 """
 
 from __future__ import annotations
@@ -11,18 +11,28 @@ import json
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from wiw.errors import ArgumentError, Error
-from wiw.serving.misbehaviour import Misbehaviour, spoiled
-from wiw.vlm.base import Call, Client, Completion, Message, Part
+from wiw.vlm.base import Client
 from wiw.vlm.images import from_data_uri
+from wiw.vlm.messages import Call, Completion, Message, Part
 
 MOST_BYTES = 256 << 20
 """Of a request's body."""
 UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError)
 """What a request that makes no sense raises; anything else is a fault of the model or script behind the server."""
+
+
+@dataclass(frozen=True)
+class Response:
+    """What a request is answered."""
+
+    status: int
+    body: Mapping[str, Any]
+    headers: Mapping[str, str] = field(default_factory=dict)
 
 
 class VlmServer:
@@ -31,11 +41,10 @@ class VlmServer:
     Args:
         client: answers the completions.
         port: 0 takes a free one; see `url`.
-        misbehaviour: what goes wrong, and how often.
     """
 
-    def __init__(self, client: Client, port: int = 0, misbehaviour: Misbehaviour | None = None) -> None:
-        self.client, self.misbehaviour = client, misbehaviour or Misbehaviour()
+    def __init__(self, client: Client, port: int = 0) -> None:
+        self.client = client
         self.requests: list[dict[str, Any]] = []
         """Bodies of the latest 1000 requests, without their images' data."""
         self.count = 0
@@ -71,19 +80,23 @@ class VlmServer:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    def answer(self, body: dict[str, Any], number: int, fault: str | None) -> dict[str, Any]:
-        """The completion of one request.
+    def respond(self, body: dict[str, Any], number: int) -> Response:
+        """Answer one request.
 
         Raises:
             Error: the request cannot be understood.
         """
+        return Response(200, make_chat_completion(self.complete(body), self.client.model, number))
+
+    def complete(self, body: dict[str, Any]) -> Completion:
+        """Return the completion that a request asks for."""
         call = call_of(body)
         with self._asking:
             (completion,) = self.client.complete([call])
-        return _chat_completion(spoiled(completion, fault, number), self.client.model, number)
+        return completion
 
-    def numbered(self, body: dict[str, Any]) -> int:
-        """Counts a request and notes it."""
+    def count_request(self, body: dict[str, Any]) -> int:
+        """Number a request and keep it."""
         with self._counting:
             self.requests = [*self.requests[-999:], _without_images(body)]
             self.count += 1
@@ -130,18 +143,8 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             body = json.loads(self.rfile.read(length))
-            number = server.numbered(body)
-            fault = server.misbehaviour.fault(number)
-            if fault == "429":
-                wait = f"{server.misbehaviour.retry_after:g}"
-                self._send(429, _error("too many requests"), {"Retry-After": wait})
-                return
-            if fault == "500":
-                self._send(500, _error("something broke"))
-                return
-            if fault == "slow":
-                time.sleep(server.misbehaviour.slow_seconds)
-            self._send(200, server.answer(body, number, fault))
+            response = server.respond(body, server.count_request(body))
+            self._send(response.status, response.body, response.headers)
         except Exception as error:
             self._send(400 if isinstance(error, UNCLEAR) else 500, _error(f"{type(error).__name__}: {error}"))
 
@@ -206,7 +209,7 @@ def _without_images(body: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _chat_completion(completion: Completion, model: str, number: int) -> dict[str, Any]:
+def make_chat_completion(completion: Completion, model: str, number: int) -> dict[str, Any]:
     refused = completion.finish == "refusal"
     message = {
         "role": "assistant",

@@ -14,7 +14,7 @@ from wiw.errors import ContractError
 from wiw.serving.queue import Job, Queue
 from wiw.wire.messages import Refusal
 from wiw.wire.rows import Row, stack
-from wiw.world_models.base import WorldModel, checked_rollout, patience
+from wiw.world_models.base import WorldModel, check_rollout, patience
 
 Outcome = NDArray[np.uint8] | Refusal
 """Frames of a row, or why there are none."""
@@ -52,7 +52,7 @@ class Worker(threading.Thread):
         for the memory become fewer.
         """
         try:
-            frames = checked_rollout(self._model, *stack(rows))
+            frames = check_rollout(self._model, *stack(rows))
         except ContractError as error:
             return [Refusal(b"", error.kind, str(error)) for _ in rows]
         except BaseException as error:  # SystemExit too: the thread has to go on

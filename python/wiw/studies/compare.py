@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two runs against each other, episode by episode; runs of unlike episodes are refused."""
+"""Compare two runs episode by episode; runs of different episodes are refused."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from wiw.analysis.statistics import adjusted
+from wiw.analysis.statistics import adjust_p_values
 from wiw.analysis.statistics import compare as compare_arms
-from wiw.analysis.summary import ArmSummary, Group, Summary, finished, headlines_of, role_of, summarise
+from wiw.analysis.summary import ArmSummary, Group, Summary, role_of, select_metrics, split_outcomes, summarise
 from wiw.analysis.utility import Utility
 from wiw.errors import ArgumentError, StoreError
 from wiw.report.tables import SummaryTable
@@ -20,40 +20,40 @@ from wiw.studies.run_log import RunLog, load_run
 from wiw.types import Episode
 
 LENGTH_TOLERANCE = 1e-3
-"""Metres by which two machines may measure the shortest way of an episode differently."""
+"""Metres by which the shortest path of an episode may differ between two machines."""
 
 MOST_NAMED = 5
-"""Of the things in which two agents differ."""
+"""Differences between two agents that are listed by name."""
 
 
 @dataclass(frozen=True)
 class Comparison(SummaryTable):
-    """What `wiw.compare` returns: the arms of both runs, and the second run minus the first, arm by arm."""
+    """The result of `wiw.compare`: the arms of both runs, and the second run minus the first, arm by arm."""
 
     runs: tuple[str, str] = ("", "")
-    """What the runs are called in the table."""
+    """Names of the runs in the table."""
     changed: tuple[str, ...] = ()
-    """What differs between the two agents of a row, a sentence each."""
+    """Differences between the two agents of a row, a sentence each."""
 
     def groups(self) -> tuple[Group, ...]:
-        """All differences as one table."""
+        """Return all differences as one table."""
         first, second = self.runs
         rows: dict[str, dict[str, Any]] = {}
         for one in self.differences:
             label = _label(one.arm.removesuffix(f" · {second}"), one.base.removesuffix(f" · {first}"))
             rows.setdefault(label, {})[one.metric] = one
         title = f"{second} minus {first}, paired by episode"
-        return (Group(title, f"What {second} adds to {first}", f"{second} minus {first}", rows),)
+        return (Group(title, f"Gain of {second} over {first}", f"{second} minus {first}", rows),)
 
     def remarks(self) -> tuple[str, ...]:
-        """What differs between the agents."""
+        """Return the differences between the agents."""
         return self.changed
 
 
 def compare(
     a: str | Path | RunLog, b: str | Path | RunLog, arm: str | None = None, other: str | None = None
 ) -> Comparison:
-    """Two runs on the same episodes against each other: run b minus run a, for each arm that both have.
+    """Compare two runs on the same episodes: run b minus run a, for each arm that both have.
 
         wiw.compare("runs/old", "runs/new")                      # every arm of both, under its name
         wiw.compare("runs/a", "runs/b", arm="warp")              # one
@@ -70,7 +70,7 @@ def compare(
         StoreError: a run cannot be read, or the two differ in task, seed or episodes: the first field that differs.
     """
     first, second = (run if isinstance(run, RunLog) else load_run(run) for run in (a, b))
-    require_alike(first, second)
+    require_comparable(first, second)
     pairs = _pairs(first, second, arm, other)
     names = _names(first, second)
     sides = [
@@ -83,36 +83,36 @@ def compare(
     labelled = [tuple(labels[arm] for arm, (_, labels) in zip(pair, sides, strict=True)) for pair in pairs]
     seed = int(first.store.config["seed"])
     both = summarise([label for pair in labelled for label in pair], outcomes, len(first.store.episodes()), seed)
-    done, _ = finished([line.name for line in both.arms], outcomes)
+    done, _ = split_outcomes([line.name for line in both.arms], outcomes)
     found = [
-        compare_arms(theirs, ours, done, headline, seed) for ours, theirs in labelled for headline in headlines_of(done)
+        compare_arms(theirs, ours, done, metric, seed) for ours, theirs in labelled for metric in select_metrics(done)
     ]
     lines = {line.name: line for log, labels in sides for line in _lines(log, both, labels)}
     return Comparison(
         tuple(lines[line.name] for line in both.arms),
-        adjusted([one for one in found if one is not None]),
+        adjust_p_values([one for one in found if one is not None]),
         both.same_episodes,
         tuple(one for log, labels in sides for one in _utilities(log, labels)),
         both.kinds,
         names,
-        tuple(line for pair in pairs for line in _changed(first, second, pair)),
+        tuple(line for pair in pairs for line in _describe_changes(first, second, pair)),
     )
 
 
 def _lines(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
-    """The lines of one run's arms, with the roles that they have there; `labels` by arm."""
+    """Return the lines of one run's arms, with the roles that they have in it; `labels` by arm."""
     policies = [one["name"] for one in log.store.config["arms"] if one["agent"].get("model") is None]
     return [replace(both[label], role=role_of(arm, policies)) for arm, label in labels.items()]
 
 
 def _utilities(log: RunLog, labels: Mapping[str, str]) -> list[Utility]:
-    """Where one run's arms stand between its own floor and ceiling."""
+    """Return the utilities of one run's arms, with its own floor and ceiling."""
     found = log.numbers().utilities
     return [replace(one, arm=labels[one.arm]) for one in found if one.arm in labels]
 
 
-def require_alike(a: RunLog, b: RunLog) -> None:
-    """Holds two runs to the same task, seed and episodes, so that their episodes can be paired.
+def require_comparable(a: RunLog, b: RunLog) -> None:
+    """Check that two runs have the same task, seed and episodes, so that their episodes can be paired.
 
     Raises:
         StoreError: the first field that differs, with both values and what to do.
@@ -138,14 +138,14 @@ def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode,
     for name in described[0]:
         values = [_value(one[name]) for one in described]
         if values[0] != values[1]:
-            _refuse(a, b, f"episode {index}: {name}", values, "they ran on other episodes; run one of them again")
+            _refuse(a, b, f"episode {index}: {name}", values, "they ran on different episodes; run one of them again")
     if all(map(math.isfinite, lengths)) and abs(lengths[0] - lengths[1]) > LENGTH_TOLERANCE:
         advice = "the scene itself has changed (its file, or its navigation mesh); run one of them again"
-        _refuse(a, b, f"episode {index}: shortest way", lengths, advice)
+        _refuse(a, b, f"episode {index}: shortest path", lengths, advice)
 
 
 def _value(value: Any) -> Any:
-    """As it compares: a path by its last part, for runs of two machines keep their scenes in two places."""
+    """Return a value as it is compared: a path by its last part, as scenes lie elsewhere on another machine."""
     if isinstance(value, str) and "/" in value and Path(value).is_absolute():
         return Path(value).name
     return value
@@ -179,7 +179,7 @@ def _pairs(a: RunLog, b: RunLog, arm: str | None, other: str | None) -> list[tup
 
 
 def _names(a: RunLog, b: RunLog) -> tuple[str, str]:
-    """The shortest ends of the two paths that differ."""
+    """Return the shortest ends of the two paths that differ."""
     paths = [log.path.resolve().parts for log in (a, b)]
     if paths[0] == paths[1]:
         return "first", "second"
@@ -194,27 +194,28 @@ def _label(theirs: str, ours: str) -> str:
     return theirs if theirs == ours else f"{theirs} - {ours}"
 
 
-def _changed(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
-    """What the two agents say of themselves that is not the same; and the versions of wiw."""
-    said = [_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
-    differing = [name for name in dict.fromkeys([*said[0], *said[1]]) if said[0].get(name) != said[1].get(name)]
+def _describe_changes(a: RunLog, b: RunLog, pair: tuple[str, str]) -> list[str]:
+    """Return how the two agents differ, by their descriptions and their version of wiw."""
+    described = [_agent(log, arm) for log, arm in zip((a, b), pair, strict=True)]
+    names = dict.fromkeys([*described[0], *described[1]])
+    differing = [name for name in names if described[0].get(name) != described[1].get(name)]
     label = _label(pair[1], pair[0])
     if not differing:
-        return [f"{label}: both runs describe the same agent."]
-    details = [f"{name} {to_json(said[0].get(name))} -> {to_json(said[1].get(name))}" for name in differing]
+        return [f"{label}: same agent in both runs."]
+    details = [f"{name} {to_json(described[0].get(name))} -> {to_json(described[1].get(name))}" for name in differing]
     more = f", and {len(details) - MOST_NAMED} more" if len(details) > MOST_NAMED else ""
     return [f"{label}: {', '.join(details[:MOST_NAMED])}{more}."]
 
 
 def _agent(log: RunLog, arm: str) -> dict[str, Any]:
-    """The agent as it was built, flattened; else as it was asked for."""
-    asked = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
-    return {**_flat(log.store.info.get("built", {}).get(arm, asked)), "wiw": log.store.wiw_version}
+    """Return the agent's description as it was built, flattened; before that, as it was configured."""
+    configured = next(one["agent"] for one in log.store.config["arms"] if one["name"] == arm)
+    return {**_flatten(log.store.info.get("built", {}).get(arm, configured)), "wiw": log.store.wiw_version}
 
 
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, item in value.items():
         key = f"{prefix}{name}"
-        found |= _flat(item, f"{key}.") if isinstance(item, dict) else {key: item}
+        found |= _flatten(item, f"{key}.") if isinstance(item, dict) else {key: item}
     return found

@@ -20,15 +20,16 @@ from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ConstructionError, ContractError
 from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
-from wiw.loop.contract import check_model as check_needs
+from wiw.loop.history import Frame, stack_histories
+from wiw.loop.plan_space import plan_space
 from wiw.studies.frame_faults import altered, exchange_turns, mean_correlation, share_of_jumps
 from wiw.studies.model_networks import place_of_computation, training_networks
 from wiw.studies.questions import Frames, Questions, Row
-from wiw.types import Control, Space
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
 from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
 
-PRIMITIVES = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
+WALKS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT, TURN_RIGHT), (FORWARD,) * 4)
 """No leading turns, which the loop makes itself. The first two begin alike, for models that say they are causal."""
 
 
@@ -43,7 +44,7 @@ POSES = (
     _poses((0.2, 0.0, 1.1), (0.25, 0.0, 1.05), (0.3, 0.0, 1.0), (0.3, 0.0, 0.95)),
 )
 """Likewise of a gripper, over the table."""
-PLANS: Mapping[Space, Any] = {"discrete": PRIMITIVES, "pose7": POSES}
+PLANS: Mapping[str, Any] = {PRIMITIVES: WALKS, GRIPPER_POSES: POSES}
 LENGTH = 4
 """Actions of each."""
 ALIKE = 2
@@ -60,9 +61,9 @@ SETTLE = 0.3
 """Seconds in which an answer that is still written to changes."""
 PICTURES: Mapping[str, str] = {"channels": "pictures", "scale": "pictures"}
 """Kinds of a `ContractError` that belong to another check than the one in which they came up."""
-RUNS: Mapping[Space, tuple[str, int]] = {
-    "discrete": ("100 episodes of ImageNav", 100 * 20 * 3),
-    "pose7": ("200 episodes of manipulation", 200 * 3 * 5),
+RUNS: Mapping[str, tuple[str, int]] = {
+    PRIMITIVES: ("100 episodes of ImageNav", 100 * 20 * 3),
+    GRIPPER_POSES: ("200 episodes of manipulation", 200 * 3 * 5),
 }
 """The paper's, in words, and the rows that it asks for: episodes, decisions and plans, roughly."""
 LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
@@ -82,6 +83,7 @@ CHECKS: Mapping[str, str] = {
     "random": "The same seeds give the same frames",
     "batch": "A row does not depend on the rows beside it",
     "causal": "As declared (causal), frames depend on no later action",
+    "history": "What was observed before makes a difference, if it needs that",
     "inputs": "It leaves alone what it is given",
     "memory": "It leaves alone what it has answered",
     "length": "It takes plans of another length",
@@ -97,7 +99,7 @@ class Finding:
 
     kind: str
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
-    "batch", "causal", "plan", "inputs", "memory", "describe", "version", or "slow"."""
+    "batch", "causal", "history", "plan", "inputs", "memory", "describe", "version", or "slow"."""
     text: str
     """What is wrong, what was seen, and what to do."""
     serious: bool = True
@@ -138,7 +140,8 @@ def check_model(
     Looked at are type, dtype, shape, number of frames and NaN; frame 0; channel order, scale, orientation and order in
     time of the frames, beside what an agent would truly see; networks left in training mode; what it does to its
     inputs and to earlier answers; whether the same seeds give the same frames, whether a row depends on those beside
-    it, whether `causal` is true, whether the plan makes a difference, and how long it takes, if it answers at all.
+    it, whether `causal` is true, whether the plan and, of a model that needs it, the history make a difference, and how
+    long it takes, if it answers at all.
 
     Args:
         model: as `wiw.world_model` takes it: name, `path.py:Class`, class, instance, "remote:ws://...".
@@ -172,7 +175,7 @@ def examine_model(
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
-        check_needs(made, LENGTH, made.accepts.space, semantics=True)
+        plan_space(made.accepts.space).check_model(made, LENGTH)
     except ArgumentError as error:
         return _only(Finding("needs", f"{error}."))
     return _Check(made, str(scenes), deadline).checks()
@@ -208,6 +211,7 @@ class _Check:
             "random": self._again,
             "batch": self._alone,
             "causal": self._causal,
+            "history": self._history,
             "length": self._short,
             "inputs": self._inputs,
             "memory": self._memory,
@@ -254,10 +258,12 @@ class _Check:
 
     def _needless(self, name: str) -> str:
         """Why something need not be looked at, if that is so."""
-        if name in ("batch", "causal") and self._done["random"].findings:
+        if name in ("batch", "causal", "history") and self._done["random"].findings:
             return "every comparison would fail: its answers are random"
         if name == "causal" and not self.accepts.causal:
             return "it declares causal=False"
+        if name == "history" and self.accepts.history < 2:
+            return "it needs none"
         if name == "length" and self.accepts.frames:
             return f"it declares {self.accepts.frames} frames"
         return ""
@@ -308,7 +314,7 @@ class _Check:
 
     def _own(self) -> list[Frames]:
         """The frames of each row that stand for its actions."""
-        if self.accepts.space == "discrete":
+        if self.accepts.space == PRIMITIVES:
             return [frames[1 : 1 + self.steps] for frames in self.frames]
         places = action.frames_of_actions(self.steps, self.frames.shape[1], "resample")[:, 1]
         return [frames[places] for frames in self.frames]
@@ -335,7 +341,7 @@ class _Check:
                 "Time runs backwards: the frames are those of the plan from its end to its beginning. Frame k is what "
                 "follows action k: frames[:, 1:] = frames[:, :0:-1] turns them round.",
             )
-        elif self.accepts.space == "discrete":
+        elif self.accepts.space == PRIMITIVES:
             swapped = self.asking.true_frames(self.rows, [exchange_turns(plan) for plan in plans])
             if mean_correlation(swapped, own) > max(OTHER, alike + MARGIN):
                 yield Finding(
@@ -397,6 +403,16 @@ class _Check:
                 f"It declares causal=True, but frames before a changed action change with it, by up to {off.max()} "
                 "of 255; plans that begin alike would share frames that are not theirs. Declare causal=False.",
                 off,
+            )
+
+    def _history(self) -> Iterator[Finding]:
+        young = self.asking.ask([replace(row, history=_first_moment(row.history)) for row in self.rows])
+        if not _off(young, self.frames, 0, self.steps).any():
+            yield Finding(
+                "history",
+                "What was observed before makes no difference: at an episode's first moment its frames are the same. "
+                "Does `rollout` read `observations.history`? If it needs none, leave it out of `needs`.",
+                serious=False,
             )
 
     def _inputs(self) -> Iterator[Finding]:
@@ -467,6 +483,14 @@ def _begin_alike(one: Control, other: Control) -> bool:
     if one.ids is None or other.ids is None or len(one.ids) == len(one.actions):
         return np.array_equal(one.actions[:ALIKE], other.actions[:ALIKE])
     return np.array_equal(one.ids[: 1 + ALIKE], other.ids[: 1 + ALIKE])
+
+
+def _first_moment(history: History | None) -> History:
+    """Return the history of one row as if its episode began with frame 0."""
+    assert history is not None  # the model needs one
+    most = history.images.shape[1]
+    now = Frame(history.images[0, -1], history.poses[0, -1], history.actions[0, :0, 0])
+    return stack_histories([[now]], most)
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:

@@ -14,15 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import panorama
-from wiw.loop.agent import Query
-from wiw.loop.attempts import DEADLINE, Attempts
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.loop.attempts import DEADLINE, Attempted
 from wiw.loop.clock import Clock
+from wiw.loop.history import EpisodeHistories
+from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.imagine import seed_of
-from wiw.loop.imagine_poses import IMAGINE
-from wiw.policies.base import FrameSpec
+from wiw.loop.plan_space import plan_space
+from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import TASKS
-from wiw.types import Conditioning, Control, Key, Proposal, View
-from wiw.world_models.base import WorldModel
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control, History, Key, Proposal, View
+from wiw.world_models.base import Accepts, WorldModel
 from wiw.world_models.pictures import sample
 
 EPISODES = 2
@@ -33,6 +35,8 @@ SMALL = 96
 TRUE_PANORAMA = (288, 512)
 PLAN = ("actions", "trajectory", "viewpoints", "ids")
 """Arrays of a control."""
+PAST = ("images", "poses", "actions", "lengths", "count")
+"""Arrays of a history."""
 Frames = NDArray[np.uint8]
 
 
@@ -43,11 +47,14 @@ class Row:
     image: Frames
     depth: Any
     semantic: Any
+    history: History | None
+    """Of one row."""
     simulator: Any
+    """As the model is handed it, if it is."""
     control: Control
     seed: np.uint64
-    query: Query
-    """The episode that asks."""
+    truth: Any
+    """Fork of the simulator where the episode stands."""
     plan: NDArray[Any]
     """Its actions, without padding."""
 
@@ -65,9 +72,10 @@ class Questions:
     """
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
-        self._model, self._attempts = model, Attempts(model, deadline)
+        self._model, self._attempts = model, Attempted(model, deadline)
         self._space = model.accepts.space
-        self._queries = _at_tables() if self._space == "pose7" else _in_scenes(scenes)
+        episodes = _at_tables() if self._space == GRIPPER_POSES else _in_scenes(scenes)
+        self._moments = [_later_moment(model.accepts, *each) for each in episodes]
         self.row_seconds = 0.0
         """What a row took in the last call."""
         self.changed: set[str] = set()
@@ -80,14 +88,18 @@ class Questions:
         """The latest answers themselves, and what a sample of their pixels was when they came."""
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
-        """The rows of these plans, of primitives or poses, in each episode."""
+        """Return the rows of these plans, of primitives or poses, in each episode."""
         recorder = _Recorder(self._model)
-        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._queries]
+        proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._moments]
         origins = [range(len(plans)) for _ in proposals]
-        IMAGINE[self._space](recorder, self._queries, proposals, origins, FrameSpec("front", (48, 48)), Clock())
+        space, keys = plan_space(self._space), [moment.key for moment in self._moments]
+        observations = [moment.shown.observation for moment in self._moments]
+        inputs = [moment.shown for moment in self._moments]
+        frames = FrameSpec("front", (48, 48))
+        space.imagine(recorder, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
         asked = {
-            seed_of(query.key, number): (query, np.array(plan))
-            for query in self._queries
+            seed_of(moment.key, number): (moment.shown.simulator, np.array(plan))
+            for moment in self._moments
             for number, plan in enumerate(plans)
         }
         return [
@@ -95,6 +107,7 @@ class Questions:
                 observations.image[place],
                 None if observations.depth is None else observations.depth[place],
                 None if observations.semantic is None else observations.semantic[place],
+                None if observations.history is None else observations.history.rows([place]),
                 None if observations.simulators is None else observations.simulators[place],
                 replace(control, shared=0),
                 seeds[place],
@@ -125,11 +138,15 @@ class Questions:
             np.stack([row.image for row in rows]),
             depth=None if rows[0].depth is None else np.stack([row.depth for row in rows]),
             semantic=None if rows[0].semantic is None else np.stack([row.semantic for row in rows]),
+            history=None if rows[0].history is None else _history_of(rows),
             simulators=None if rows[0].simulator is None else [row.simulator for row in rows],
         )
         controls, seeds = [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
         given = [("seeds", seeds)]
         given += [(f"observations.{name}", getattr(observations, name)) for name in ("image", "depth", "semantic")]
+        if observations.history is not None:
+            past = observations.history
+            given += [(f"observations.history.{name}", getattr(past, name)) for name in PAST]
         given += [(f"control.{name}", getattr(control, name)) for control in controls for name in PLAN]
         given = [(name, array) for name, array in given if array is not None]
         kept = [array.copy() for _, array in given]
@@ -153,28 +170,46 @@ class Questions:
         uint8 [K, H, W, 3], in the model's view, of some small size.
         """
         accepts = self._model.accepts
-        truth = _true_fronts if self._space == "pose7" else _true_views
+        truth = _true_fronts if self._space == GRIPPER_POSES else _true_views
         height, width = accepts.size
         small = max(1, round(SMALL * height / width)), SMALL
-        return [truth(row.query.simulator, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
+        return [truth(row.truth, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
 
 
-class _Recorder(Attempts):
+class _Recorder(WorldModel):
     """Notes what the loop asks of a model, and answers that nothing moves."""
 
     def __init__(self, model: WorldModel) -> None:
-        super().__init__(model)
+        self._model = model
         self.asked: list[tuple[Conditioning, Sequence[Control], NDArray[np.uint64]]] = []
 
-    def __call__(
+    @property
+    def accepts(self) -> Accepts:  # type: ignore[override]
+        """The model's."""
+        return self._model.accepts
+
+    def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
+        """Note the question."""
         self.asked.append((observations, controls, seeds))
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
 
 
+@dataclass(frozen=True)
+class _Moment:
+    """Where an episode stands."""
+
+    key: Key
+    shown: ModelInput
+
+
+def _history_of(rows: Sequence[Row]) -> History:
+    return History.concatenate([row.history for row in rows if row.history is not None])
+
+
 def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
-    """What an agent that walks sees."""
+    """Return what an agent that walks sees."""
     poses = simulator.camera_poses_after(plan.astype(np.int8))
     panoramas = np.empty((len(plan), *TRUE_PANORAMA, 3), np.uint8)
     simulator.renderer.panorama(poses, TRUE_PANORAMA, panoramas, None, None)
@@ -184,27 +219,44 @@ def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view:
 
 
 def _true_fronts(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
-    """What stands before the camera of a manipulator."""
-    return np.asarray(simulator.fork().fronts_after(plan, size))
+    """Return what stands before the camera of a manipulator."""
+    return np.asarray(simulator.fork().render_fronts_after(plan, size))
 
 
-def _in_scenes(scenes: str) -> list[Query]:
-    """The first moments of some episodes of an agent that walks."""
+def _in_scenes(scenes: str) -> list[tuple[Any, Any, Key]]:
+    """Return some episodes of an agent that walks: environment, first observation and key."""
     task = TASKS.make("imagenav", scenes=scenes)
-    queries = []
-    for index in range(EPISODES):
-        env = task.environment(depth=True)
-        observation = env.begin(task.episode(index))
-        queries.append(Query(observation, env.goal, Key(0, index), env.fork(), semantic=env.semantic()))
-    return queries
+    envs = [task.environment(depth=True) for _ in range(EPISODES)]
+    return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
 
 
-def _at_tables() -> list[Query]:
-    """The first moments of some episodes of an arm."""
+def _at_tables() -> list[tuple[Any, Any, Key]]:
+    """Return some episodes of an arm."""
     task = TASKS.make("manipulation")
-    queries = []
-    for index in range(EPISODES):
-        env = task.environment(depth=True)
-        observation = env.begin(task.episode(index))
-        queries.append(Query(observation, env.goal, Key(0, index), env.fork()))
-    return queries
+    envs = [task.environment(depth=True) for _ in range(EPISODES)]
+    return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
+
+
+def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Moment:
+    """Return an episode's first moment; of a model with a memory, a moment some decisions later.
+
+    One episode is older than the other, and its segments are shorter, so that histories differ in padding.
+    """
+    histories, executed = EpisodeHistories(accepts), list[Any]()
+    decisions = 1 + key.episode if accepts.history else 0
+    for decision in range(decisions):
+        histories.add([Situation(observation, env.goal, key.at(decision), None, tuple(executed))])
+        plan = _segment(accepts.space, observation, 3 - key.episode)
+        observation = env.run(plan).observation
+        executed += plan.tolist()
+    semantic = env.semantic() if accepts.space == PRIMITIVES else None
+    (history,) = histories.add([Situation(observation, env.goal, key.at(decisions), None, tuple(executed))])
+    return _Moment(key.at(decisions), ModelInput(observation, env.fork(), semantic, history))
+
+
+def _segment(space: str, observation: Any, length: int) -> NDArray[Any]:
+    """Return what is carried out at a decision: some way ahead and a turn, or a gripper's way up."""
+    if space == PRIMITIVES:
+        return np.array([FORWARD] * (length - 1) + [TURN_LEFT], np.int8)
+    ways = np.arange(1, length + 1)[:, None] * (0, 0, 0.01, 0, 0, 0, 0)
+    return np.asarray(observation.pose + ways, np.float64)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from wiw.analysis.blame import blame
+from wiw.analysis.blame import read_blame
 from wiw.analysis.costs import costs
 from wiw.analysis.fidelity import fidelity
 from wiw.analysis.summary import arm_table, summarise_run
@@ -23,7 +23,7 @@ class RunLog(Run):
 
     @property
     def valid(self) -> bool:
-        """Whether every arm has ended every episode and at most 1 % of them failed for infrastructure."""
+        """Whether every arm has ended every episode and at most 1 % of them ended with an infrastructure error."""
         return self.complete and not self.numbers().invalid
 
     def numbers(self) -> SummaryTable:
@@ -53,11 +53,11 @@ class RunLog(Run):
         return Records(line.as_dict() for line in fidelity(self))
 
     def blame(self) -> Records:
-        """Return the stage that each arm's failures are due to, as far as they were attributed: one dict per arm.
+        """Return the stages to blame for each arm's failures, as far as they were rerun: one dict per arm.
 
         See `wiw.analysis.blame.ArmBlame`.
         """
-        found = blame(self.store)
+        found = read_blame(self.store)
         return Records(line.as_dict() for line in found.arms) if found is not None else Records()
 
     def report(self, path: str | Path | None = None) -> Path:

@@ -19,13 +19,17 @@ from wiw.analysis.costs import costs
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
-from wiw.runs.recipes import AgentRecipe, task_recipe
+from wiw.report.tables import print_stacked
+from wiw.runs.config import RunConfig, take_settings
+from wiw.runs.recipes import agent_recipe
 from wiw.runs.rows import to_json
 from wiw.studies.evaluate import run_arms
 from wiw.studies.run_log import RunLog
 
+EPISODES = 20
+"""Where neither the caller nor the config says how many."""
 CANDIDATES = (1, 2, 4, 8)
-"""Swept where nothing is said."""
+"""Values of the sweep by default."""
 
 
 @dataclass(frozen=True)
@@ -38,30 +42,30 @@ class ScalePoint:
     value: float
     success: Estimate
     rollouts: float
-    """Imagined futures an episode, whether the model or the cache gave them: the paper's world-model inferences."""
+    """Imagined futures per episode, from the model or the cache: the paper's world-model inferences."""
     consultations: float
-    """Decisions an episode for which the model was consulted."""
+    """Decisions per episode that consulted the model."""
     calls: float
-    """Batches an episode that the model was asked for, without what came from the cache."""
+    """Batches per episode sent to the model, without rollouts from the cache."""
     cached: float
     """Share of the rollouts that came from the cache."""
     seconds: float
-    """Wall time an episode, all stages."""
+    """Wall time per episode, all stages."""
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """What `wiw.scale` found."""
+    """The result of `wiw.scale`."""
 
     log: RunLog
     points: tuple[ScalePoint, ...]
 
     def to_json(self) -> str:
-        """The points as JSON."""
+        """Return the points as JSON."""
         return json.dumps({"points": json.loads(to_json([asdict(point) for point in self.points]))}, indent=2)
 
     def svg(self) -> str:
-        """Success against imagined futures, with intervals."""
+        """Return the plot of success against imagined futures, with intervals."""
         from wiw.report.plots import success_by_rollouts
 
         series: dict[str, list[tuple[float, Estimate, str]]] = {}
@@ -70,27 +74,25 @@ class Scaling:
         return str(success_by_rollouts({name.replace("_", " "): points for name, points in series.items()}))
 
     def save(self) -> tuple[Path, Path]:
-        """Writes scale.json and scale.svg into the run's folder."""
+        """Write scale.json and scale.svg into the run's folder."""
         written = self.log.path / "scale.json", self.log.path / "scale.svg"
         for path, text in zip(written, (self.to_json(), self.svg()), strict=True):
             path.write_text(text, encoding="utf-8")
         return written
 
     def summary(self) -> None:
-        """Prints the table."""
-        from rich import box
-        from rich.console import Console
-        from rich.table import Table
-
-        table = Table(title="More imagination", title_justify="left", title_style="bold", box=box.SIMPLE_HEAD)
-        for title in ("arm", "SR % ↑", "rollouts", "consulted", "calls", "cached", "s"):
-            table.add_column(title, justify="left" if title == "arm" else "right")
-        for point in self.points:
-            numbers = (f"{value:.1f}" for value in (point.rollouts, point.consultations, point.calls))
-            cached, seconds = f"{100 * point.cached:.0f} %", f"{point.seconds:.2f}"
-            table.add_row(point.arm, show_estimate(point.success), *numbers, cached, seconds)
-        console = Console()
-        Console(width=None if console.is_terminal else max(console.width, 100)).print(table)
+        """Print the table."""
+        rows = [
+            [
+                show_estimate(point.success),
+                *(f"{value:.1f}" for value in (point.rollouts, point.consultations, point.calls)),
+                f"{100 * point.cached:.0f} %",
+                f"{point.seconds:.2f}",
+            ]
+            for point in self.points
+        ]
+        titles = ["SR % ↑", "rollouts", "consulted", "calls", "cached", "s"]
+        print_stacked("Inference-time scaling, per episode", [point.arm for point in self.points], titles, rows)
 
 
 def scale(
@@ -98,20 +100,11 @@ def scale(
     agent: Any,
     candidates: Sequence[int] | None = None,
     imagine_fraction: Sequence[float] | None = None,
-    episodes: int = 20,
-    seed: int | None = None,
-    out: str | Path | None = None,
-    workers: int = 1,
-    progress: bool = True,
     *,
-    live: int = 4,
-    deadline: float | None = None,
-    cache: str | Path | None = None,
-    cache_gb: float | None = None,
-    resume: bool = False,
-    **task_options: Any,
+    config: RunConfig | None = None,
+    **settings: Any,
 ) -> Scaling:
-    """Runs an agent with different amounts of imagination on the same episodes.
+    """Run an agent with different amounts of imagination on the same episodes.
 
         found = wiw.scale("imagenav", wiw.Agent("matcher", "warp"), candidates=[1, 2, 4, 8], scenes="apartments:val")
         found.summary()
@@ -122,17 +115,8 @@ def scale(
         candidates: plans imagined at each decision; 1, 2, 4, 8 where this and `imagine_fraction` are None.
         imagine_fraction: shares of decisions for which the model is consulted, with the agent's own candidates; 0 is
             the proposer's own preference.
-        episodes: how many.
-        seed: of the run; None means the task's own.
-        out: folder of the run; None means `runs/scale-<time>`.
-        workers: processes.
-        progress: whether to show bars.
-        live: episodes kept live at a time in each process.
-        deadline: see `wiw.evaluate`.
-        cache: see `wiw.evaluate`; a folder spares any model what several amounts imagine.
-        cache_gb: see `wiw.evaluate`.
-        resume: whether to go on with the run in `out` where it was stopped.
-        task_options: options of a task given by name, such as `scenes` and `preset`.
+        config: how the run goes; a folder as `cache` spares any model what several amounts imagine.
+        settings: any of `RunConfig`'s in place of the config's, and options of a task given by name.
 
     Raises:
         ArgumentError: an agent without a world model; no amounts, equal ones or ones out of range.
@@ -141,19 +125,17 @@ def scale(
         raise ArgumentError("scale: expected an agent with a world model, got one without")
     amounts = _amounts(candidates, imagine_fraction)
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
-    task = task_recipe(env_or_task, task_options)
-    folder = out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
-    log = run_arms(
-        task, agents, episodes, seed, folder, workers, progress,
-        live=live, keep_images=0, resume=resume, deadline=deadline, cache=cache, cache_gb=cache_gb,
-    )  # fmt: skip
+    own, task_options = take_settings(config, settings)
+    out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
+    run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)
+    log = run_arms(env_or_task, agents, config=run_config, **task_options)
     return Scaling(log, _points(log, {f"{sweep}={value:g}": (sweep, value) for sweep, value in amounts}))
 
 
 def _amounts(
     candidates: Sequence[int] | None, fractions: Sequence[float] | None
 ) -> dict[tuple[str, float], dict[str, Any]]:
-    """What is changed of the agent for each (sweep, value)."""
+    """Return the options of the agent for each (sweep, value)."""
     if candidates is None and fractions is None:
         candidates = CANDIDATES
     for name, values in (("candidates", candidates), ("imagine_fraction", fractions)):
@@ -172,22 +154,22 @@ def _amounts(
 
 
 def _with(agent: Any, changes: Mapping[str, Any]) -> Any:
-    return replace(agent, **changes) if isinstance(agent, AgentRecipe) else agent.but(**changes)
+    return replace(agent_recipe(agent), **changes)
 
 
 def _points(log: RunLog, amounts: Mapping[str, tuple[str, float]]) -> tuple[ScalePoint, ...]:
-    """One point for each arm of which an episode was judged."""
+    """Return one point per arm that has a scored episode."""
     summary, found = log.numbers(), []
     for line in costs(log):
-        judged = summary[line.arm].estimates.get("success")
-        if judged is None:
+        success = summary[line.arm].estimates.get("success")
+        if success is None:
             continue
         rows = line.calls.get("rows", 0.0)
         found.append(
             ScalePoint(
                 line.arm,
                 *amounts[line.arm],
-                judged,
+                success,
                 rows / line.episodes,
                 line.calls.get("consultations", 0.0) / line.episodes,
                 line.spent.get("calls", 0.0) / line.episodes,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Points in the world from pictures with depth."""
+"""Point clouds from depth images."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def points_of(depth: NDArray[np.float32], hfov_deg: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-    """What each pixel of a pinhole picture shows.
+def unproject_depth(
+    depth: NDArray[np.float32], hfov_deg: float, T_world_camera: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """Return the 3D point that each pixel of a pinhole camera's depth image shows.
 
     Args:
         depth: float32 [H, W], planar metres; 0 where nothing is hit.

@@ -15,16 +15,16 @@ import numpy as np
 
 from wiw.physics import Articulation
 from wiw.scenes.isolated import read_in_child
-from wiw.tabletop.looks import Looks, looks_of
+from wiw.tabletop.link_meshes import LinkMeshes, build_link_meshes
 from wiw.tabletop.shapes import Mesh
 
 
 @dataclass(frozen=True)
 class Description:
-    """A robot, and what its links look like."""
+    """A robot, and its link meshes."""
 
     articulation: Articulation
-    looks: Looks
+    link_meshes: LinkMeshes
 
 
 def read_description(path: Path) -> Description:
@@ -38,19 +38,21 @@ def read_description(path: Path) -> Description:
         out = Path(folder) / "looks.npz"
         reply = read_in_child("wiw.tabletop.description_worker", {"path": str(path), "out": str(out)})
         with np.load(out, allow_pickle=False) as arrays:
-            looks = tuple((link, _mesh(arrays, i)) for i, link in enumerate(reply["links"]))
-    return Description(Articulation.from_parts(reply["robot"]), looks)
+            link_meshes = tuple((link, _read_mesh(arrays, i)) for i, link in enumerate(reply["links"]))
+    return Description(Articulation.from_parts(reply["robot"]), link_meshes)
 
 
 def write_description(job: dict[str, Any]) -> dict[str, Any]:
     """Do the child's part of `read_description`."""
     articulation = Articulation(job["path"])
-    looks = looks_of(articulation)
-    arrays: dict[str, Any] = {f"{i}/{name}": array for i, (_, mesh) in enumerate(looks) for name, array in mesh.items()}
+    link_meshes = build_link_meshes(articulation)
+    arrays: dict[str, Any] = {
+        f"{i}/{name}": array for i, (_, mesh) in enumerate(link_meshes) for name, array in mesh.items()
+    }
     np.savez(job["out"], **arrays)
-    return {"robot": articulation.to_parts(), "links": [link for link, _ in looks]}
+    return {"robot": articulation.to_parts(), "links": [link for link, _ in link_meshes]}
 
 
-def _mesh(arrays: Any, index: int) -> Mesh:
+def _read_mesh(arrays: Any, index: int) -> Mesh:
     start = f"{index}/"
     return {name.removeprefix(start): arrays[name] for name in arrays.files if name.startswith(start)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Push one to three buttons in the order that is asked for."""
+"""Push one to three buttons in the requested order."""
 
 from __future__ import annotations
 
@@ -12,8 +12,18 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.physics import Articulation, Cylinder, place
-from wiw.tabletop.colours import alike, pixels_at
-from wiw.tabletop.kind import PALETTE, Kind, Setup, above, chosen, colours_in, key_of, raised, scattered
+from wiw.tabletop.base import (
+    PALETTE,
+    TableSetup,
+    TabletopTask,
+    choose_names,
+    derive_key,
+    find_colours,
+    make_action,
+    plan_lift,
+    scatter_places,
+)
+from wiw.tabletop.colours import compare_colour, sample_pixels
 from wiw.tabletop.workbench import LAMPS, TABLE, WOOD, Pose, Thing, Workbench
 from wiw.types import ArmObservation
 
@@ -23,125 +33,127 @@ SPRING = 4.0
 TOP = 0.038
 """Metres from the table to the plate's top."""
 RING, HIGH = 0.056, 0.016
-"""Metres of the dark ring around the plate: its radius, wide enough to be seen from the front, and its height."""
+"""Metres: radius and height of the dark ring around the plate; wide enough to be visible from the front."""
 LAMP = Cylinder(RING + 0.0005, HIGH + 0.001)
-"""Over the ring when it is lit."""
-DARK = (0.2, 0.2, 0.22)
-"""Of the ring that is not lit."""
-PLAIN = 0.3
-"""Likeness of all rings together to those of a stage, below which they show another push; three may be hidden."""
-DOUBT = 0.1
-"""Squared likeness of a pixel to what is expected nowhere, so that the hand before a ring says nothing."""
-SURE = 0.3
-"""Share of a ring that has to be seen to be sure of it."""
-UNSEEN = 0.7
-"""What a ring counts that the hand hides, where a seen one counts 1."""
+"""The shape that covers the ring when it is lit."""
+UNLIT_COLOUR = (0.2, 0.2, 0.22)
+"""Colour of the ring when it is not lit."""
+MIN_STAGE_SCORE = 0.3
+"""Score of a stage below which the rings show another sequence of pushes; three of them may be hidden."""
+BACKGROUND_WEIGHT = 0.1
+"""Squared similarity to a colour that occurs nowhere, so that a hand in front of a ring counts for nothing."""
+CERTAIN_SHARE = 0.3
+"""Share of a ring that must be visible for certainty about its lamp."""
+HIDDEN_SCORE = 0.7
+"""Score of a ring that the hand hides; a visible one scores up to 1."""
 COLOURS = [name for name in PALETTE if name not in (*LAMPS, "yellow")]
-"""Of plates; none is that of a lamp, or near."""
+"""Colours of plates; none resembles a lamp's."""
 PHRASES = ("push the {0} button", "press the {0} button", "push down the button that is {0}")
 AND_THEN = (", then push the {0} one", ", then press the {0} one", ", and after it the {0} one")
 
 
-class PushButtons(Kind):
-    """Three buttons on springs, the first so many of which are to be pushed, and no other before or between them."""
+class PushButtons(TabletopTask):
+    """Three buttons on springs; the first one, two or three are to be pushed, with no other push before or between."""
 
     name = "push_buttons"
     noun = "button"
     variations = 50
 
-    def setup(self, seed: int, variation: int) -> Setup:
-        """Variation v asks for 1 + v mod 3 pushes."""
-        colours = chosen(key_of(seed, variation, 1), COLOURS, BUTTONS)
-        places = scattered(key_of(seed, variation, 2), BUTTONS, 0.13)
+    def create_setup(self, seed: int, variation: int) -> TableSetup:
+        """Create the table; variation v asks for 1 + v mod 3 pushes."""
+        colours = choose_names(derive_key(seed, variation, 1), COLOURS, BUTTONS)
+        places = scatter_places(derive_key(seed, variation, 2), BUTTONS, 0.13)
         asked = tuple(colours[: 1 + variation % BUTTONS])
-        instruction = self.say(asked, variation // BUTTONS)
+        instruction = self.phrase_instruction(asked, variation // BUTTONS)
         things = tuple(
-            (Thing(colour, mechanism=_button(PALETTE[colour]), lamp=LAMP), place(x, y, TABLE + HIGH / 2))
+            (Thing(colour, mechanism=_build_button(PALETTE[colour]), lamp=LAMP), place(x, y, TABLE + HIGH / 2))
             for colour, (x, y) in zip(colours, places, strict=True)
         )
-        return Setup(things, instruction, asked, dict.fromkeys(colours, SPRING), tuple(colours))
+        return TableSetup(things, instruction, asked, dict.fromkeys(colours, SPRING), tuple(colours))
 
-    def say(self, target: Any, wording: int = 0) -> str:
-        """E.g. "push the navy button, then push the teal one"."""
+    def phrase_instruction(self, target: Any, wording: int = 0) -> str:
+        """Return, e.g., "push the navy button, then push the teal one"."""
         words = wording % len(PHRASES)
         return PHRASES[words].format(target[0]) + "".join(AND_THEN[words].format(name) for name in target[1:])
 
-    def target_of(self, text: str) -> tuple[str, ...]:
-        """The colours that an instruction names, in their order.
+    def parse_target(self, text: str) -> tuple[str, ...]:
+        """Return the colours that an instruction names, in order.
 
         Raises:
             ArgumentError: none, more than there are buttons, or one twice.
         """
-        found = tuple(colours_in(text))
+        found = tuple(find_colours(text))
         if not 1 <= len(found) <= BUTTONS or len(set(found)) < len(found):
             raise ArgumentError(
                 f"push_buttons: expected an instruction that names 1 to {BUTTONS} colours, got {text!r}"
             )
         return found
 
-    def alternatives(self, objects: Sequence[str], target: Any) -> list[Any]:
-        """As many pushes, of others or in another order."""
+    def list_alternatives(self, objects: Sequence[str], target: Any) -> list[Any]:
+        """Return the other sequences of as many pushes."""
         return [order for order in permutations(objects, len(target)) if order != tuple(target)]
 
-    def left(self, seen: ArmObservation, target: Any) -> Any:
-        """The pushes to come, by the rings that are lit; None also where they show another push."""
-        alike = _stages(seen.front, seen.places, target)
+    def find_remaining_target(self, observation: ArmObservation, target: Any) -> Any:
+        """Return the remaining pushes, by the lamps that are lit; None also where they show a wrong push."""
+        alike = _score_stages(observation.front, observation.places, target)
         pushed = int(np.argmax(alike))
-        return tuple(target[pushed:]) if alike[pushed] > PLAIN and pushed < len(target) else None
+        return tuple(target[pushed:]) if alike[pushed] > MIN_STAGE_SCORE and pushed < len(target) else None
 
-    def succeeded(self, bench: Workbench, setup: Setup) -> bool:
-        """The pushes so far are those that are asked for."""
-        return bench.pressed == setup.target
+    def is_success(self, bench: Workbench, setup: TableSetup) -> bool:
+        """Return whether the pushes so far are the requested ones."""
+        return bench.pressed_buttons == setup.target
 
-    def expert(
+    def plan_expert(
         self, places: Mapping[str, Pose], target: Any, hand: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Down and up again over each, with shut fingers."""
-        plan = raised(hand, TOP + 0.083, 0.0)
+        """Move down and up again over each button, with closed fingers."""
+        plan = plan_lift(hand, TOP + 0.083, 0.0)
         for name in target:
             x, y, _ = places[name][:3, 3]
-            plan += [above(x, y, TOP + h, 0.0) for h in (0.083, -0.01, 0.083)]
+            plan += [make_action(x, y, TOP + h, 0.0) for h in (0.083, -0.01, 0.083)]
         return np.array(plan)
 
-    def looks_done(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
-        """The share of the pushes, in their turn, that the rings show; less for rings that do not fit."""
-        alike = _stages(front, places, target)
+    def estimate_completion(self, front: NDArray[np.uint8], places: Mapping[str, Pose], target: Any) -> float:
+        """Return the share of the pushes, in order, that the lamps show; less if other lamps are lit."""
+        alike = _score_stages(front, places, target)
         return float((alike * np.arange(len(alike))).max() / len(target))
 
 
-def _stages(front: NDArray[np.uint8], places: Mapping[str, Pose], target: Sequence[str]) -> NDArray[np.float64]:
-    """float64 [n + 1] from 0 to 1: how much all rings look as they do after the first 0 to n pushes of a target."""
-    lit = {name: _lights(front, place) for name, place in places.items()}
+def _score_stages(front: NDArray[np.uint8], places: Mapping[str, Pose], target: Sequence[str]) -> NDArray[np.float64]:
+    """Return how well all rings match their look after the first 0 to n pushes of a target: float64 [n + 1], 0 to 1."""
+    lit = {name: _score_lamps(front, place) for name, place in places.items()}
     turns = {name: turn for turn, name in enumerate(target, 1)}
     stages = []
     for pushed in range(len(target) + 1):
         wanted = {name: turn if (turn := turns.get(name, 0)) <= pushed else 0 for name in places}
-        stages.append(np.prod([lit[name][turn] + UNSEEN * (1 - lit[name].sum()) for name, turn in wanted.items()]))
+        stages.append(
+            np.prod([lit[name][turn] + HIDDEN_SCORE * (1 - lit[name].sum()) for name, turn in wanted.items()])
+        )
     return np.array(stages)
 
 
-def _lights(front: NDArray[np.uint8], button: Pose) -> NDArray[np.float64]:
-    """float64 [1 + 3]: how much a ring looks dark, or lit by the first, second or third push; less than 1 in all where
-    the hand hides it.
+def _score_lamps(front: NDArray[np.uint8], button: Pose) -> NDArray[np.float64]:
+    """Return how likely a ring is dark, or lit by the first, second or third push: float64 [1 + 3]; the sum is below 1
+    where the hand hides it.
     """
-    pixels = pixels_at(front, button[:3, 3] + _VISIBLE)
-    likeness = np.stack([alike(pixels, colour) ** 2 for colour in (WOOD, DARK, *LAMPS.values())])
-    shares = (likeness / (likeness.sum(axis=0) + DOUBT)).mean(axis=1)
-    lights = np.clip(shares[1:] / SURE, 0, 1)
+    pixels = sample_pixels(front, button[:3, 3] + _VISIBLE_RING_POINTS)
+    likeness = np.stack([compare_colour(pixels, colour) ** 2 for colour in (WOOD, UNLIT_COLOUR, *LAMPS.values())])
+    shares = (likeness / (likeness.sum(axis=0) + BACKGROUND_WEIGHT)).mean(axis=1)
+    lights = np.clip(shares[1:] / CERTAIN_SHARE, 0, 1)
     return lights / max(1.0, lights.sum())
 
 
-def _button(colour: tuple[float, float, float]) -> Articulation:
-    """A plate on a spring in a dark ring."""
+def _build_button(colour: tuple[float, float, float]) -> Articulation:
+    """Build a plate on a spring in a dark ring."""
     rgba = " ".join(f"{value}" for value in (*colour, 1.0))
-    return Articulation.from_text(_URDF.format(rgba=rgba, dark=" ".join(map(str, DARK)), ring=RING, high=HIGH))
+    return Articulation.from_text(_URDF.format(rgba=rgba, dark=" ".join(map(str, UNLIT_COLOUR)), ring=RING, high=HIGH))
 
 
 _ANGLES, _RADII = (grid.ravel() for grid in np.meshgrid(np.linspace(-1.7, 1.7, 35), [0.041, 0.046, 0.051]))
-_VISIBLE = np.stack(
+_VISIBLE_RING_POINTS = np.stack(
     [_RADII * np.cos(_ANGLES), _RADII * np.sin(_ANGLES), np.full(_RADII.shape, HIGH / 2 + 0.001)], axis=1
 )
-"""[N, 3] points on a ring, from its middle, that the plate does not hide from the front."""
+"""[N, 3] points on a ring, from its middle, that the plate does not hide from the front camera."""
 
 _URDF = """<robot name="button">
   <link name="base">

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The arm that works at the table: the project's own Panda, or one that is described by a URDF file.
+"""The arm at the table: the project's own Panda, or one described by a URDF file.
 
-What a description does not say is found in it: two links that slide on the same one are the fingers, and that one is
-the hand; the point between the finger tips is the link whose name says so (`TOOLS`).
+What a description leaves open is inferred: two links that slide on the same link are the fingers, and that link is the
+hand; the point between the finger tips is the link whose name says so (`TOOL_WORDS`).
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.physics import PANDA_READY, PANDA_TCP, Articulation, Gripper, InverseKinematics, World, panda
 from wiw.tabletop.description import read_description
-from wiw.tabletop.looks import Looks, looks_of
+from wiw.tabletop.link_meshes import LinkMeshes, build_link_meshes
 
-TOOLS = ("tcp", "grasptarget", "grasp_target", "tool", "tip", "ee")
-"""Words in the name of the link between the finger tips, the most telling first."""
+TOOL_WORDS = ("tcp", "grasptarget", "grasp_target", "tool", "tip", "ee")
+"""Words in the name of the link between the finger tips, the most specific first."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """An arm with two fingers, and how it is used.
+    """An arm with two fingers.
 
     The frame of `tcp` lies between the finger tips: z points out of the hand, the fingers move along y.
     """
@@ -42,29 +42,30 @@ class Robot:
     finger_joints: tuple[str, str]
     identity: dict[str, Any] = field(default_factory=dict)
     """JSON-able: equal for equal robots."""
-    file_looks: Looks | None = field(default=None, compare=False, repr=False)
-    """What the links look like, of a robot whose files were read in a process of their own."""
+    file_meshes: LinkMeshes | None = field(default=None, compare=False, repr=False)
+    """Link meshes of a robot whose files were read in a separate process."""
 
     @cached_property
-    def looks(self) -> Looks:
-        """(link, mesh in the link's frame) of every link that is seen."""
-        return looks_of(self.description) if self.file_looks is None else self.file_looks
+    def link_meshes(self) -> LinkMeshes:
+        """(link, mesh in the link's frame) of every visible link."""
+        return build_link_meshes(self.description) if self.file_meshes is None else self.file_meshes
 
     @cached_property
-    def tcp_index(self) -> int:
-        """Of the link between the finger tips."""
+    def tool_index(self) -> int:
+        """Index of the link between the finger tips."""
         return self.description.link_index(self.tcp)
 
-    def gripper(self, world: World, arm: int) -> Gripper:
-        """Its fingers in a world."""
+    def create_gripper(self, world: World, arm: int) -> Gripper:
+        """Create the gripper of this robot's instance `arm` in a world."""
         return Gripper(world, arm, joints=self.finger_joints, fingers=self.fingers, hand=self.hand)
 
     @cached_property
-    def ready(self) -> NDArray[np.float64]:
-        """float64 [dof]: the hand points down before the base, where the Panda's usual start has it; fingers open.
+    def ready_joints(self) -> NDArray[np.float64]:
+        """Joint positions float64 [dof] with the hand pointing down in front of the base, as in the Panda's usual
+        start pose, fingers open.
 
         Raises:
-            ArgumentError: the arm does not come there.
+            ArgumentError: the arm cannot reach that pose.
         """
         limits = self.description.limits
         if self.description.joints == panda().joints:
@@ -87,13 +88,13 @@ class Robot:
 
 
 @cache
-def own_panda() -> Robot:
-    """The Franka Panda of simple shapes that the project describes itself."""
-    return _robot(panda(), PANDA_TCP, {"name": "panda"})
+def load_panda() -> Robot:
+    """Return the Franka Panda, which the project describes by simple shapes."""
+    return _build_robot(panda(), PANDA_TCP, {"name": "panda"})
 
 
-def robot_of(file: str | PathLike[str], tcp: str = "") -> Robot:
-    """The robot that a URDF file describes.
+def load_robot(file: str | PathLike[str], tcp: str = "") -> Robot:
+    """Load the robot that a URDF file describes.
 
     Args:
         file: its description; meshes are found beside it, `package://NAME/...` in the folders above it.
@@ -101,62 +102,64 @@ def robot_of(file: str | PathLike[str], tcp: str = "") -> Robot:
 
     Raises:
         FileError: the file or a mesh is missing or damaged; the message names the link.
-        ArgumentError: it has no two fingers, or no such link, or another frame there; the message says what was looked
-            for and what there is.
+        ArgumentError: it has no two fingers, or no such link, or another frame there; the message says what was
+            expected and what was found.
     """
     path = Path(file).expanduser().absolute()
-    known = _KNOWN.get((path, tcp))
-    if known is not None and known.digest == _digest_of(path, known.meshes):
-        return known.robot
+    cached = _CACHE.get((path, tcp))
+    if cached is not None and cached.digest == _compute_digest(path, cached.meshes):
+        return cached.robot
     description = read_description(path)
     meshes = tuple(map(Path, description.articulation.meshes))
-    digest = _digest_of(path, meshes)
+    digest = _compute_digest(path, meshes)
     identity = {"name": path.name, "digest": digest, **({"tcp": tcp} if tcp else {})}
-    robot = _robot(description.articulation, tcp, identity, description.looks)
-    _ = robot.ready  # an arm that does not come there is refused here
-    _KNOWN[path, tcp] = _Known(digest, meshes, robot)
+    robot = _build_robot(description.articulation, tcp, identity, description.link_meshes)
+    _ = robot.ready_joints  # an arm that does not come there is refused here
+    _CACHE[path, tcp] = _CachedRobot(digest, meshes, robot)
     return robot
 
 
 @dataclass(frozen=True)
-class _Known:
-    """A robot, and what it was read from."""
+class _CachedRobot:
+    """A robot, and the files it was read from."""
 
     digest: str
     meshes: tuple[Path, ...]
     robot: Robot
 
 
-_KNOWN: dict[tuple[Path, str], _Known] = {}
-"""By file and link between the finger tips."""
+_CACHE: dict[tuple[Path, str], _CachedRobot] = {}
+"""Loaded robots by file and tool link."""
 
 
-def _digest_of(path: Path, meshes: Sequence[Path]) -> str:
-    """Digest of a description and its meshes."""
+def _compute_digest(path: Path, meshes: Sequence[Path]) -> str:
+    """Return the digest of a description and its meshes."""
     state = hashlib.sha256(path.read_bytes() if path.is_file() else b"")
     for mesh in meshes:
         state.update(mesh.read_bytes() if mesh.is_file() else b"")
     return state.hexdigest()[:16]
 
 
-def _robot(description: Articulation, tcp: str, identity: dict[str, Any], looks: Looks | None = None) -> Robot:
-    left, right = _fingers(description)
+def _build_robot(
+    description: Articulation, tcp: str, identity: dict[str, Any], link_meshes: LinkMeshes | None = None
+) -> Robot:
+    left, right = _find_finger_joints(description)
     hand = left["parent"]
     robot = Robot(
         description,
-        tcp or _tool(description, hand),
+        tcp or _find_tool_link(description, hand),
         hand,
         (left["child"], right["child"]),
         (left["name"], right["name"]),
         identity,
-        looks,
+        link_meshes,
     )
     _check_frame(robot)
     return robot
 
 
-def _fingers(description: Articulation) -> list[dict[str, str]]:
-    """The two joints whose links slide on the same one."""
+def _find_finger_joints(description: Articulation) -> list[dict[str, str]]:
+    """Return the two joints whose links slide on the same link."""
     sliding: dict[str, list[dict[str, str]]] = {}
     for joint in description.tree:
         if joint["type"] == "prismatic":
@@ -170,24 +173,25 @@ def _fingers(description: Articulation) -> list[dict[str, str]]:
     )
 
 
-def _tool(description: Articulation, hand: str) -> str:
-    """The link between the finger tips: fixed to the hand, or to what is fixed to it, and called so."""
+def _find_tool_link(description: Articulation, hand: str) -> str:
+    """Return the link between the finger tips: fixed to the hand, directly or not, and named accordingly."""
     fixed = [hand]
     for joint in description.tree:  # parents come first
         if joint["type"] == "fixed" and joint["parent"] in fixed:
             fixed.append(joint["child"])
-    for word in TOOLS:
+    for word in TOOL_WORDS:
         for name in fixed[1:]:
             if word in name.lower() if "_" in word else word in re.split(r"[^a-z0-9]+", name.lower()):
                 return name
     raise ArgumentError(
         f"robot {description.name}: expected a link between the finger tips, fixed to '{hand}' and with one of the "
-        f"words {', '.join(TOOLS)} in its name; name another by robot_tcp=LINK, among {', '.join(description.links)}"
+        f"words {', '.join(TOOL_WORDS)} in its name; name another by robot_tcp=LINK, among "
+        f"{', '.join(description.links)}"
     )
 
 
 def _check_frame(robot: Robot) -> None:
-    """That the frame between the finger tips is turned as poses of the gripper are."""
+    """Check that the frame between the finger tips is oriented as gripper poses are."""
     description, ends = robot.description, []
     for end in ("lower", "upper"):
         limits = description.limits
@@ -195,7 +199,7 @@ def _check_frame(robot: Robot) -> None:
         for joint in robot.finger_joints:
             positions[description.joint_index(joint)] = limits[end][description.joint_index(joint)]
         ends.append(description.forward_kinematics(positions))
-    tip = np.linalg.inv(ends[0][robot.tcp_index])
+    tip = np.linalg.inv(ends[0][robot.tool_index])
     way = tip[:3, :3] @ (ends[1] - ends[0])[description.link_index(robot.fingers[0]), :3, 3]
     behind = (tip @ ends[0][description.link_index(robot.hand)])[2, 3]
     if abs(way[1]) < 0.99 * np.linalg.norm(way) or not np.linalg.norm(way) or behind >= 0:

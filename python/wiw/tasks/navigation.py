@@ -1,30 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What navigation tasks have in common: where episodes come from, and the environments they are run in."""
+"""Tasks in which an agent walks: where their episodes come from, and the environments they are run in."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
+from wiw.datasets import episodes as episode_file
 from wiw.datasets.worlds import World, navmesh_file, world
+from wiw.envs.episode_state import NavigationSpec
 from wiw.envs.navigation import NavigationEnv
-from wiw.envs.pointing import Pointing
-from wiw.envs.trip import Trip
 from wiw.envs.vector import VectorEnv
 from wiw.errors import ArgumentError, FileError
 from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
-from wiw.types import Episode, Goal, Wording, checked_seed
+from wiw.tasks.base import Task
+from wiw.types import Episode, checked_seed
 
 
-class NavigationTask(ABC):
+class NavigationTask(NavigationSpec, Task):
     """Base of the tasks in which an agent walks; a subclass says what its goal is and when it is reached.
 
     Args:
@@ -37,17 +35,13 @@ class NavigationTask(ABC):
             wiw, else the present one.
         per_scene: generated episodes a scene.
         backend: renderer, "auto", "cpu" or "gpu".
+        rules: rules of the task, and of the generator (`generator_class`).
     """
 
-    name: str
-    metrics: tuple[str, ...]
     rules_class: type
-    default_policy: str
-    """Runs it where none is named."""
-    wording = Wording()
-    """How reports speak of its episodes."""
-    choices: tuple[str, ...] = ()
-    """What answers are chosen from, where the task asks for any."""
+    generator_class: type
+    """Dataclass of the rules that generated episodes satisfy, all with defaults."""
+    has_guide = True
 
     def __init__(
         self,
@@ -60,69 +54,39 @@ class NavigationTask(ABC):
         backend: Literal["auto", "cpu", "gpu"] = "auto",
         **rules: Any,
     ) -> None:
-        self.given = frozenset(rules)
-        """Names of the rules that were given as options."""
-        self.rules: Any = presets.rules(self.rules_class, self.name, preset, rules)
+        own, generator = presets.rule_names(self.rules_class), presets.rule_names(self.generator_class)
+        presets.refuse_unknown(rules, [*own, *generator], f"options of {self.name}")
+        self.overridden = {name: value for name, value in rules.items() if name in own}
+        """Rules that were given as options."""
+        owner = presets.find_owner(type(self))
+        self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
+        self._generator_rules = {name: value for name, value in rules.items() if name not in own}
+        self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
         self.scenes, self.seed = absolute(scenes), checked_seed(seed)
         self.backend, self.per_scene = backend, per_scene
         self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
         self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""
         self._episodes: list[Episode] = []
 
-    # -- what a task says of itself ------------------------------------------------------------------------------------
+    # -- what a task says of itself, besides `NavigationSpec` ----------------------------------------------------------
+
+    def load_episodes(self) -> list[Episode]:
+        """Return the episodes of `episode_file`."""
+        assert self.episode_file is not None
+        return episode_file.load(self.episode_file, self.scene_folder)
 
     @abstractmethod
-    def goal(self, place: World, episode: Episode) -> Goal:
-        """What the agent is asked to do."""
-
-    @abstractmethod
-    def goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
-        """Where distances to the goal end."""
-
-    @abstractmethod
-    def succeeded(self, trip: Trip) -> bool:
-        """Whether an episode has been successful so far."""
-
-    @abstractmethod
-    def result(self, trip: Trip) -> dict[str, float]:
-        """Metrics of one finished episode."""
-
-    @abstractmethod
-    def of_file(self) -> list[Episode]:
-        """The episodes of `episode_file`."""
-
-    @abstractmethod
-    def of_scene(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
-        """`per_scene` generated episodes of a scene, from its number `first` on, after those `before`."""
-
-    @property
-    def pointing(self) -> Pointing | None:
-        """How the task points its target out, where it has one."""
-        return None
-
-    def sure(self, trip: Trip) -> bool:
-        """Whether the answers given so far end the episode."""
-        return False
-
-    def destination(self, trip: Trip) -> NDArray[np.float64]:
-        """Where an agent that knew the scene would go."""
-        return trip.goal_position
-
-    def progress(self, trip: Trip, fork: Any, left: float) -> float:
-        """How good it would be to stand where a fork of the simulator stands, the higher the better.
-
-        `left` counts the primitives of the shortest way from there to the destination; here the fewer, the better.
-        """
-        return -left
+    def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
+        """Return `per_scene` generated episodes of a scene, from its number `first` on, after those `before`."""
 
     # ------------------------------------------------------------------------------------------------------------------
 
     @staticmethod
-    def portable(options: Mapping[str, Any]) -> dict[str, Any]:
-        """The same options, with paths that mean the same in any folder and the renderer that "auto" stands for."""
+    def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the same options, with absolute paths and the renderer that "auto" stands for."""
         ways: dict[str, Callable[[Any], str]] = {
             "scenes": absolute,
-            "preset": presets.absolute,
+            "preset": presets.make_absolute,
             "backend": resolve_backend,
             "episode_file": lambda path: str(Path(path).expanduser().absolute()),
             "scene_folder": lambda path: str(Path(path).expanduser().absolute()),
@@ -134,8 +98,13 @@ class NavigationTask(ABC):
 
     @property
     def motion(self) -> str:
-        """What happens to a blocked move: "refuse" or "slide"."""
+        """Rule for blocked moves: "refuse" or "slide"."""
         return str(self.rules.motion)
+
+    @property
+    def decisions(self) -> int:
+        """K: decisions that an episode may take."""
+        return int(self.rules.decisions)
 
     @property
     def budget(self) -> int:
@@ -144,59 +113,84 @@ class NavigationTask(ABC):
         return int(self.rules.decisions * (execute if execute > 0 else max(1, self.rules.horizon + execute)))
 
     @property
-    def size(self) -> int | None:
+    def episode_count(self) -> int | None:
         """How many episodes there are; None where a single scene gives as many as are asked for."""
         if self.episode_file:
-            self._episodes = self._episodes or self.of_file()
-            return len(self._episodes)
+            return len(self._read_file())
         scenes = resolve(self.scenes)
         return None if len(scenes) == 1 else len(scenes) * self.per_scene
+
+    @property
+    def default_episodes(self) -> int:
+        """All of an episode file; else 20."""
+        return len(self._read_file()) if self.episode_file else super().default_episodes
 
     @property
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
 
+    @property
+    def file_header(self) -> dict[str, Any]:
+        """Header of a file of its episodes."""
+        return {"seed": self.seed, "scenes": self.scenes}
+
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity: what must be equal for two runs to be comparable."""
-        source = (
-            {"episode_file": self.episode_file}
-            if self.episode_file
-            else {"scenes": self.scenes, "per_scene": self.per_scene}
-        )
+        """Return the JSON-able identity: what must be equal for two runs to be comparable."""
+        source: dict[str, Any] = {"scenes": self.scenes, "per_scene": self.per_scene}
+        if self._generator_rules:
+            source["generator"] = self._generator_rules
+        if self.episode_file:
+            source = {"episode_file": self.episode_file}
         backend = resolve_backend(self.backend)
         return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules)}
 
     def environment(self, depth: bool = False) -> NavigationEnv:
-        """A gymnasium environment of this task; `depth` adds it to the observations."""
+        """Return a gymnasium environment of this task; `depth` adds it to the observations."""
         return NavigationEnv(self, depth)
 
     def vector_environment(self, num_envs: int, depth: bool = False) -> VectorEnv:
-        """A gymnasium vector environment of this task, with `num_envs` episodes at a time."""
+        """Return a gymnasium vector environment of this task, with `num_envs` episodes at a time."""
         return VectorEnv(self, num_envs, depth)
 
     def episodes(self, count: int) -> list[Episode]:
-        """The first `count` episodes; generated scene by scene, `per_scene` each.
+        """Return the first `count` episodes; generated scene by scene, `per_scene` each.
 
         Raises:
             ArgumentError: the episode file or the scenes hold fewer.
         """
-        if not self._episodes and self.episode_file:
-            self._episodes = self.of_file()
-        scenes = [] if self.episode_file else resolve(self.scenes)
+        if self.episode_file:
+            return self._first_of_file(count)
+        scenes = resolve(self.scenes)
         whole_scene = len(scenes) == 1
-        while len(self._episodes) < count and not self.episode_file:
+        while len(self._episodes) < count:
             done = len(self._episodes) // self.per_scene
             if not whole_scene and done >= len(scenes):
                 break
             self._add(scenes[0] if whole_scene else scenes[done], done if whole_scene else 0)
         if len(self._episodes) < count:
-            more = "ask for fewer" if self.episode_file else "name more scenes (apartments:val:N) or raise per_scene"
-            raise ArgumentError(f"{self.name}: asked for {count} episodes, but there are {len(self._episodes)}; {more}")
+            raise ArgumentError(
+                f"{self.name}: asked for {count} episodes, but there are {len(self._episodes)}; "
+                "name more scenes (apartments:val:N) or raise per_scene"
+            )
         return self._episodes[:count]
 
+    def _first_of_file(self, count: int) -> list[Episode]:
+        found = self._read_file()
+        if len(found) < count:
+            raise ArgumentError(
+                f"{self.name}: asked for {count} episodes, but {self.episode_file} has {len(found)}; "
+                "ask for fewer, or leave the number open to run all of them"
+            )
+        return found[:count]
+
+    def _read_file(self) -> list[Episode]:
+        """Return the episodes of the file, which is read once."""
+        self._episodes = self._episodes or self.load_episodes()
+        return self._episodes
+
     def require(self, episodes: Iterable[Episode]) -> dict[str, dict[str, str]]:
-        """Finds out whether the scenes of episodes are there, without loading any.
+        """Check that the scenes of episodes are there, without loading any.
 
         Returns:
             For each scene, what it is used with: its "navmesh", a file or "built".
@@ -218,11 +212,15 @@ class NavigationTask(ABC):
         return used
 
     def episode(self, index: int) -> Episode:
-        """Episode `index` of the task."""
-        return self.episodes(index + 1)[index]
+        """Return episode `index` of the task."""
+        return Task.episode(self, index)
+
+    def open_world(self, episode: Episode) -> World:
+        """Return the scene of an episode with renderer and navigation mesh."""
+        return world(episode.scene, self.backend)
 
     def _add(self, scene: str, block: int) -> None:
-        """One block of episodes in one scene, numbered on from those before it."""
-        made = self.of_scene(world(scene, self.backend), self.per_scene * block, self._episodes)
+        """Add one block of episodes in one scene, numbered on from those before it."""
+        made = self.generate_episodes(world(scene, self.backend), self.per_scene * block, self._episodes)
         first = len(self._episodes)
         self._episodes += [replace(episode, episode_id=f"{first + i:04d}") for i, episode in enumerate(made)]

@@ -8,12 +8,13 @@ decisions: 40
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 from wiw.errors import ArgumentError, FileError
+from wiw.suggestions import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "configs"
 DEFAULT = "paper"
@@ -21,60 +22,112 @@ DEFAULT = "paper"
 Rules = TypeVar("Rules")
 
 
-def names(task: str) -> list[str]:
-    """Shipped presets of a task, the default first."""
+def list_presets(task: str) -> list[str]:
+    """Return the shipped presets of a task, the default first."""
     found = sorted(path.parent.name for path in FOLDER.glob(f"*/{task}.yaml"))
     return sorted(found, key=lambda name: name != DEFAULT)
 
 
-def about(task: str, preset: str) -> str:
-    """What a shipped preset says of itself."""
+def describe_preset(task: str, preset: str) -> str:
+    """Return what a shipped preset says of itself."""
     return str(_read(FOLDER / preset / f"{task}.yaml").get("about", ""))
 
 
-def absolute(preset: str | Path) -> str:
-    """The preset with its path, if it is one, made absolute, so that it means the same in any folder."""
+def make_absolute(preset: str | Path) -> str:
+    """Return the preset with its path, if it is one, made absolute, so that it means the same in any folder."""
     path = Path(preset).expanduser()
     return str(path.resolve()) if path.suffix in (".yaml", ".yml") else str(preset)
 
 
-def rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mapping[str, Any]) -> Rules:
-    """The rules of a preset, by name or by the path of a YAML file, with `overrides` on top.
+def find_owner(task: type) -> str:
+    """Return whose presets a task has: its own, else those of the nearest task it derives from that has some."""
+    names = [str(vars(base)["name"]) for base in task.__mro__ if isinstance(vars(base).get("name"), str)]
+    return next((name for name in names if list_presets(name)), names[0] if names else task.__name__)
+
+
+def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mapping[str, Any]) -> Rules:
+    """Return the rules of a preset, by name or by the path of a YAML file, with `overrides` on top.
+
+    What neither says is the default of `cls`, so that a task of one's own needs no preset: for a task that ships none,
+    the default preset stands for these values.
 
     Raises:
         ArgumentError: no such preset; a key that is no rule; a value of another type. Names the file or argument.
         FileError: the file cannot be read, or does not hold a mapping.
     """
-    known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
     values: dict[str, Any] = {}
     for path in _chain(task, preset):
-        values |= _checked(cls, known, _without_header(_read(path)), str(path))
-    values |= _checked(cls, known, overrides, f"options of {task}")
-    missing = [name for name in known if name not in values]
+        values |= check_values(cls, _without_header(_read(path)), str(path))
+    values |= check_values(cls, overrides, f"options of {task}")
+    missing = [field.name for field in _open_fields(cls) if field.name not in values]
     if missing:
-        raise ArgumentError(f"preset '{preset}' of {task} leaves open {', '.join(missing)}; give `base: {DEFAULT}`")
+        ships = f"; give `base: {DEFAULT}`" if list_presets(task) else f", or give {cls.__name__} defaults"
+        raise ArgumentError(f"preset '{preset}' of {task} leaves open {', '.join(missing)}{ships}")
     return cls(**values)
 
 
+def rule_names(cls: type) -> list[str]:
+    """Return the names of the rules that a dataclass declares."""
+    return [field.name for field in fields(cls)]
+
+
+def check_values(cls: type, values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return the values, with whole numbers made floats where a rule is a float.
+
+    Raises:
+        ArgumentError: a name that is no rule, or a value of another type; names `where`.
+    """
+    refuse_unknown(values, rule_names(cls), where)
+    types = get_type_hints(cls)
+    return {name: _typed(types[name], value, f"{where}: {name}") for name, value in values.items()}
+
+
+def refuse_unknown(values: Iterable[str], known: Sequence[str], where: str) -> None:
+    """Check that all names are known.
+
+    Raises:
+        ArgumentError: some are not; names `where`, what is like them, and what there is.
+    """
+    unknown = [str(name) for name in values if name not in known]
+    if unknown:
+        hint = did_you_mean(unknown[0], known)
+        raise ArgumentError(f"{where}: unknown rules {', '.join(unknown)}; there are {', '.join(known)}.{hint}")
+
+
+def _open_fields(cls: type) -> list[Field[Any]]:
+    """Return the rules that have no default."""
+    return [field for field in fields(cls) if field.default is MISSING and field.default_factory is MISSING]
+
+
 def _chain(task: str, preset: str | Path) -> list[Path]:
-    """The files of a preset, what it is based on first."""
-    path = _path(task, preset)
-    base = _read(path).get("base", DEFAULT if path.parent.parent != FOLDER else None)
+    """Return the files of a preset, what it is based on first."""
+    path = _find(task, preset)
+    if path is None:
+        return []
+    shipped = list_presets(task)
+    base = _read(path).get("base", DEFAULT if shipped and path.parent.parent != FOLDER else None)
     if base is None:
         return [path]
-    if base not in names(task) or _path(task, base) == path:
-        raise ArgumentError(f"{path}: base '{base}' is not one of {', '.join(names(task))}")
+    if base not in shipped or _find(task, base) == path:
+        raise ArgumentError(
+            f"{path}: base '{base}' is not one of {', '.join(shipped) or '(none)'}.{did_you_mean(str(base), shipped)}"
+        )
     return [*_chain(task, base), path]
 
 
-def _path(task: str, preset: str | Path) -> Path:
-    if preset in names(task):
+def _find(task: str, preset: str | Path) -> Path | None:
+    """Return a preset's file; None for the default preset of a task that ships none."""
+    shipped = list_presets(task)
+    if preset in shipped:
         return FOLDER / preset / f"{task}.yaml"
     path = Path(preset).expanduser()
     if path.suffix in (".yaml", ".yml"):
         return path.resolve()
+    if not shipped and preset == DEFAULT:
+        return None
+    there = f"there are {', '.join(shipped)}, or give" if shipped else "it ships none; give"
     raise ArgumentError(
-        f"{task}: no preset '{preset}'; there are {', '.join(names(task))}, or give the path of a .yaml file"
+        f"{task}: no preset '{preset}'; {there} the path of a .yaml file.{did_you_mean(str(preset), shipped)}"
     )
 
 
@@ -92,15 +145,6 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in content.items() if name not in ("base", "about")}
-
-
-def _checked(cls: type, known: list[str], values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """The values, with whole numbers made floats where a rule is a float."""
-    unknown = [str(name) for name in values if name not in known]
-    if unknown:
-        raise ArgumentError(f"{where}: unknown rules {', '.join(unknown)}; there are {', '.join(known)}")
-    types = get_type_hints(cls)
-    return {name: _typed(types[name], value, f"{where}: {name}") for name, value in values.items()}
 
 
 def _typed(kind: Any, value: Any, where: str) -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains armnet on plays, and measures it on plays that it never saw."""
+"""Train armnet on plays, and evaluate it on held-out plays."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.training.checkpoint import Checkpoint, Kept
-from wiw.training.course import taught, up_and_down
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.plays import POSES, Plays
+from wiw.training.trainer import run_training, warmup_cosine_schedule
 from wiw.world_models.armnet.body import plate
 from wiw.world_models.armnet.motion import motion as motion_of
 from wiw.world_models.armnet.network import (
@@ -35,44 +35,47 @@ from wiw.world_models.armnet.network import (
 )
 
 HELD_OUT = 150
-"""Plays that it is measured on."""
-OTHERS = 1000
-"""Added to the seed of what is learnt from: that of what is not."""
-STEPS = (1, 2, 3, 5)
-"""Poses after the observation that the model is measured at."""
-NEAR, DEARER = 0.03, 0.02
-"""Of colour: differences within which sources are about as near; what paint counts as farther off, for it is soft."""
-CHANGED = 0.06
-"""Difference of a channel from which on a pixel counts as changed."""
+"""Number of plays that the network is evaluated on."""
+HELD_OUT_SEED_OFFSET = 1000
+"""Added to the seed of the training plays to get the seed of the held-out ones."""
+EVALUATED_STEPS = (1, 2, 3, 5)
+"""Numbers of poses after the observation at which the network is evaluated."""
+SOURCE_TOLERANCE, PAINT_PENALTY = 0.03, 0.02
+"""Colour differences: sources closer together than the tolerance count as equally good; paint, which is blurred, is
+taken to be farther off by the penalty.
+"""
+CHANGE_THRESHOLD = 0.06
+"""A pixel counts as changed if one of its channels differs by more than this."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the network is trained."""
+    """Hyper-parameters of the training."""
 
     epochs: int = 4
-    """How often each pose of each play is gone to, on average."""
+    """How often each pose of each play is predicted, on average."""
     batch: int = 4
-    """Plays at once."""
+    """Plays in a batch."""
     steps: int = 3
-    """Poses that are gone to one after another."""
+    """Successive poses predicted for each play of a batch."""
     free: float = 0.25
-    """Share of batches in which each pose is gone to from what the network itself made of the one before; in the others
-    what went wrong before is put right, so that nothing is asked for that cannot be known."""
+    """Share of free-running batches, in which each prediction starts from the one before. The others are
+    teacher-forced: they start from true views, so that the network is never asked for what it cannot know.
+    """
     widths: tuple[int, int, int] = (32, 64, 96)
-    """Channels of the U-Net."""
+    """Channels of the U-Net's levels."""
     rate: float = 1.5e-3
     decay: float = 0.01
     changes: float = 15.0
-    """Weight of pixels that are neither as before nor the arm, beside 1 of all others."""
+    """Weight of pixels that neither stay as they were nor show the arm, beside 1 for all others."""
     edges: float = 1.0
     """Weight of errors of the differences between neighbouring pixels."""
     paint: float = 0.3
-    """Weight of errors of the paint alone, where things change: it learns what is to be seen before it is used."""
+    """Weight of errors of the paint alone, where things change: the paint learns to predict before it is used."""
     shares: float = 0.05
-    """Weight of the shares' cross-entropy, where things change, with a choice of the source that is nearest."""
+    """Weight of the cross-entropy between the mixing shares and the nearest source, where things change."""
     bfloat16: bool = True
-    """Products in half the bits: faster on CPUs that can (AVX512-BF16), slower on others."""
+    """Compute products in bfloat16: faster on CPUs with AVX512-BF16, slower on others."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -84,29 +87,35 @@ def train(
     plays: Plays,
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
-    show: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[Network, Recipe]:
-    """A trained network, and the recipe that would give the same one again.
+    """Train a network; return it with the recipe that reproduces it without a time limit.
 
     Args:
         plays: to learn from.
-        recipe: see there.
-        minutes: if given, epochs are left out so that training takes about as long, by the speed of some trial steps.
-        show: called after each step with its number, how many there are, and a running mean of the loss.
-        checkpoint: where the state of training is kept, and gone on from.
+        recipe: how to train; see `Recipe`.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        checkpoint: where the state of training is saved, and from where it resumes.
     """
-    an_epoch = max(1, len(plays) * POSES // (recipe.batch * recipe.steps))
-    lesson, recipe = taught(
-        lambda: _Lesson(plays, recipe), recipe, an_epoch, minutes, up_and_down(0.03), show, checkpoint
+    steps_per_epoch = max(1, len(plays) * POSES // (recipe.batch * recipe.steps))
+    trainer, recipe = run_training(
+        lambda: _Trainer(plays, recipe),
+        recipe,
+        steps_per_epoch,
+        minutes,
+        warmup_cosine_schedule(0.03),
+        on_step,
+        checkpoint,
     )
-    return lesson.network.eval(), recipe
+    return trainer.network.eval(), recipe
 
 
-class _Lesson(Kept):
-    """A network in training, with all that its next step depends on."""
+class _Trainer(ResumableTrainer):
+    """The network in training, with everything that its next step depends on."""
 
-    parts = ("network", "optimiser")
+    stateful_parts = ("network", "optimiser")
 
     def __init__(self, plays: Plays, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xA111]) % 2**63)
@@ -114,19 +123,19 @@ class _Lesson(Kept):
         self.network = Network(recipe.widths)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
-    def step(self, rate: float) -> float:
-        """Learns from one batch of short ways; its loss."""
+    def train_step(self, learning_rate: float) -> float:
+        """Train on one batch of short sequences and return its loss."""
         for group in self.optimiser.param_groups:
-            group["lr"] = float(rate)
+            group["lr"] = float(learning_rate)
         self.optimiser.zero_grad(set_to_none=True)
         recipe, total = self.recipe, 0.0
-        rng = np.random.default_rng(core.fold_key([recipe.seed, 0xA112, self.count]))
-        self.count += 1
-        batch = drawn(self.plays, recipe.batch, recipe.steps, rng)
-        follow = followed if rng.random() < recipe.free else led
+        rng = np.random.default_rng(core.fold_key([recipe.seed, 0xA112, self.step_count]))
+        self.step_count += 1
+        batch = sample_sequences(self.plays, recipe.batch, recipe.steps, rng)
+        predict = predict_free_running if rng.random() < recipe.free else predict_teacher_forced
         network = self.network.train()
-        for part in follow(network, batch, recipe.bfloat16):
-            loss = _loss(part, recipe) * len(part.made) / (recipe.batch * recipe.steps)
+        for part in predict(network, batch, recipe.bfloat16):
+            loss = _compute_loss(part, recipe) * len(part.prediction) / (recipe.batch * recipe.steps)
             loss.backward()
             total += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -135,100 +144,103 @@ class _Lesson(Kept):
 
 
 @dataclass(frozen=True)
-class Ways:
-    """T poses gone to one after another, and what is seen before and after each."""
+class Sequences:
+    """T poses reached one after another, with the views before and after each."""
 
-    seen: list[Tensor]
-    """T + 1 of [B, 3, h, w]."""
+    views: list[Tensor]
+    """T + 1 tensors [B, 3, h, w]."""
     arms: list[Arm]
-    """T + 1, over the bare table."""
+    """T + 1 renderings of the arm over the bare table."""
     motions: list[Motion]
-    """T."""
+    """T motions of the gripper."""
 
 
-def drawn(plays: Plays, count: int, steps: int, rng: np.random.Generator) -> Ways:
-    """Ways from anywhere in as many plays."""
+def sample_sequences(plays: Plays, count: int, steps: int, rng: np.random.Generator) -> Sequences:
+    """Sample sequences of `steps` poses that begin anywhere in `count` random plays."""
     rows = rng.integers(0, len(plays), count)
-    return ways(plays, rows, rng.integers(0, POSES + 1 - steps, count), steps)
+    return build_sequences(plays, rows, rng.integers(0, POSES + 1 - steps, count), steps)
 
 
-def ways(plays: Plays, rows: NDArray[np.int64], first: NDArray[np.int64], steps: int) -> Ways:
-    """Those of some plays from some of their views on."""
+def build_sequences(plays: Plays, rows: NDArray[np.int64], first: NDArray[np.int64], steps: int) -> Sequences:
+    """Return the sequences of the plays `rows` that begin with their views `first`."""
     at = [first + k for k in range(steps + 1)]
     arms = [
-        Arm(_images(plays.bare[rows, t]), torch.from_numpy(plays.arm[rows, t][:, None].astype(np.float32))) for t in at
+        Arm(_to_tensor(plays.bare[rows, t]), torch.from_numpy(plays.arm[rows, t][:, None].astype(np.float32)))
+        for t in at
     ]
     poses = plays.poses
     motions = [motion_of(poses[rows, t], poses[rows, t + 1]) for t in at[:-1]]
-    return Ways([_images(plays.seen[rows, t]) for t in at], arms, motions)
+    return Sequences([_to_tensor(plays.views[rows, t]) for t in at], arms, motions)
 
 
-def _images(images: NDArray[np.uint8]) -> Tensor:
-    """Float [B, 3, H, W] in [0, 1] of uint8 [B, H, W, 3]."""
+def _to_tensor(images: NDArray[np.uint8]) -> Tensor:
+    """Convert images uint8 [B, H, W, 3] to float [B, 3, H, W] in [0, 1]."""
     return torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255
 
 
-def bare_table() -> Tensor:
-    """[1, 3, h, w]: the window of the table without arm and things."""
-    return _images(plate(FRONT).color[WINDOW][None].copy())
+def load_bare_table() -> Tensor:
+    """Return the network's window of the table without arm and objects, [1, 3, h, w]."""
+    return _to_tensor(plate(FRONT).color[WINDOW][None].copy())
 
 
 @dataclass(frozen=True)
-class Step:
-    """What the network makes of one motion, and what is truly seen."""
+class StepPrediction:
+    """The network's prediction for one motion, with the true view."""
 
-    made: Tensor
+    prediction: Tensor
     target: Tensor
     still: Tensor
     """The view if nothing but the arm had moved."""
     shares: Tensor
     sources: Tensor
-    """What `made` is composed of."""
+    """The images that `prediction` is mixed from."""
 
 
-def followed(network: Network, ways: Ways, bfloat16: bool = False) -> Iterator[Step]:
-    """Each step from the canvas that the one before has left."""
-    plate = bare_table()
-    canvas = clear_view(ways.seen[0], ways.arms[0], plate)
-    for k, motion in enumerate(ways.motions):
-        before, arm = ways.arms[k : k + 2]
-        step = _step(network, canvas, before.mask, arm, motion, ways.seen[k + 1], bfloat16)
-        canvas = clear_arm(step.made.detach(), arm, find_visible_arm(step.shares.detach(), arm), plate, canvas)
+def predict_free_running(network: Network, sequences: Sequences, bfloat16: bool = False) -> Iterator[StepPrediction]:
+    """Predict step after step, each from the canvas that the prediction before has left."""
+    plate = load_bare_table()
+    canvas = clear_canvas(sequences.views[0], sequences.arms[0], plate)
+    for k, motion in enumerate(sequences.motions):
+        before, arm = sequences.arms[k : k + 2]
+        step = _predict_step(network, canvas, before.mask, arm, motion, sequences.views[k + 1], bfloat16)
+        canvas = clear_arm(step.prediction.detach(), arm, find_visible_arm(step.shares.detach(), arm), plate, canvas)
         yield step
 
 
-def clear_view(seen: Tensor, arm: Arm, before: Tensor) -> Tensor:
-    """The canvas after a true view."""
-    return clear_arm(seen, arm, in_sight(seen, arm), bare_table(), before)
+def clear_canvas(seen: Tensor, arm: Arm, before: Tensor) -> Tensor:
+    """Return the canvas after a true view."""
+    return clear_arm(seen, arm, in_sight(seen, arm), load_bare_table(), before)
 
 
-def led(network: Network, ways: Ways, bfloat16: bool = False) -> Iterator[Step]:
-    """All steps at once, each from the canvas that true views have left."""
-    plate = bare_table()
-    canvases = [plate.expand_as(ways.seen[0])]
-    for seen, arm in zip(ways.seen[:-1], ways.arms[:-1], strict=True):
-        canvases.append(clear_view(seen, arm, canvases[-1]))
-    arm = Arm(torch.cat([each.color for each in ways.arms[1:]]), torch.cat([each.mask for each in ways.arms[1:]]))
-    before = torch.cat([each.mask for each in ways.arms[:-1]])
+def predict_teacher_forced(network: Network, sequences: Sequences, bfloat16: bool = False) -> Iterator[StepPrediction]:
+    """Predict all steps at once, each from the canvas that the true views before it have left."""
+    plate = load_bare_table()
+    canvases = [plate.expand_as(sequences.views[0])]
+    for seen, arm in zip(sequences.views[:-1], sequences.arms[:-1], strict=True):
+        canvases.append(clear_canvas(seen, arm, canvases[-1]))
+    arm = Arm(
+        torch.cat([each.color for each in sequences.arms[1:]]), torch.cat([each.mask for each in sequences.arms[1:]])
+    )
+    before = torch.cat([each.mask for each in sequences.arms[:-1]])
     fields = ("before", "after", "scalars", "below")
-    motion = Motion(*(torch.cat([getattr(each, name) for each in ways.motions]) for name in fields))
-    yield _step(network, torch.cat(canvases[1:]), before, arm, motion, torch.cat(ways.seen[1:]), bfloat16)
+    motion = Motion(*(torch.cat([getattr(each, name) for each in sequences.motions]) for name in fields))
+    yield _predict_step(network, torch.cat(canvases[1:]), before, arm, motion, torch.cat(sequences.views[1:]), bfloat16)
 
 
-def _step(
+def _predict_step(
     network: Network, canvas: Tensor, before: Tensor, arm: Arm, motion: Motion, target: Tensor, bfloat16: bool
-) -> Step:
-    plate = bare_table()
+) -> StepPrediction:
+    plate = load_bare_table()
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         mixture = network(canvas, arm, before, motion, plate)
     parts = sources(mixture, canvas, arm, motion, plate)
-    return Step(compose_view(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
+    return StepPrediction(compose_view(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
 
 
-def _loss(step: Step, recipe: Recipe) -> Tensor:
-    differs = ((step.target - step.still).abs().amax(1, keepdim=True) > CHANGED).float()
+def _compute_loss(step: StepPrediction, recipe: Recipe) -> Tensor:
+    differs = ((step.target - step.still).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD).float()
     weight = 1 + recipe.changes * functional.max_pool2d(differs, 3, 1, 1)
-    gap = step.made - step.target
+    gap = step.prediction - step.target
 
     def error(a: Tensor, w: Tensor) -> Tensor:
         return (a.abs() * w).sum() / (3 * weight.sum())
@@ -236,8 +248,8 @@ def _loss(step: Step, recipe: Recipe) -> Tensor:
     across = gap[..., 1:] - gap[..., :-1], torch.maximum(weight[..., 1:], weight[..., :-1])
     down = gap[..., 1:, :] - gap[..., :-1, :], torch.maximum(weight[..., 1:, :], weight[..., :-1, :])
     off = (step.sources - step.target[:, None]).abs().mean(2)
-    aside = off.detach() + DEARER * torch.tensor([0.0, 0.0, 0.0, 1.0])[:, None, None]
-    choice = -((-aside / NEAR).softmax(1) * (step.shares + 1e-6).log()).sum(1, keepdim=True)
+    aside = off.detach() + PAINT_PENALTY * torch.tensor([0.0, 0.0, 0.0, 1.0])[:, None, None]
+    choice = -((-aside / SOURCE_TOLERANCE).softmax(1) * (step.shares + 1e-6).log()).sum(1, keepdim=True)
     count = differs.sum() + 1
     return (
         error(gap, weight)
@@ -250,29 +262,30 @@ def _loss(step: Step, recipe: Recipe) -> Tensor:
 # -- measuring ---------------------------------------------------------------------------------------------------------
 
 
-def measured(network: Network, plays: Plays) -> dict[str, Any]:
-    """How far `copy`, the arm alone and the network are from the truth, by the number of poses gone to.
+def evaluate(network: Network, plays: Plays) -> dict[str, Any]:
+    """Compare `copy`, the arm alone and the network with the true views, by the number of poses after the observation.
 
-    {"plays": N, "changed": {"copy": {"1": error, ...}, "arm": ..., "armnet": ...}, "psnr": likewise}. "changed" is the
-    mean absolute error, in parts of 255, of pixels that truly differ from the view with only the arm moved and from
-    things left where they were seen at first; "psnr" is in dB over the whole window.
+    Returns:
+        {"plays": N, "changed": {"copy": {"1": error, ...}, "arm": ..., "armnet": ...}, "psnr": likewise}. "changed" is
+        the mean absolute error, in units of 1/255, over the pixels whose true colour differs from the first view with
+        only the arm moved; "psnr" is in dB over the whole window.
     """
-    most = max(STEPS)
+    most = max(EVALUATED_STEPS)
     rows = np.arange(len(plays))
     errors: dict[str, dict[str, list[float]]] = {name: {} for name in ("copy", "arm", "armnet")}
     noise: dict[str, dict[str, list[float]]] = {name: {} for name in errors}
     for part in np.array_split(rows, max(1, len(rows) // 16)):
-        batch = ways(plays, part, np.zeros(len(part), np.int64), most)
-        plate = bare_table()
-        first = clear_view(batch.seen[0], batch.arms[0], plate)
+        batch = build_sequences(plays, part, np.zeros(len(part), np.int64), most)
+        plate = load_bare_table()
+        first = clear_canvas(batch.views[0], batch.arms[0], plate)
         with torch.inference_mode():
-            for number, step in enumerate(followed(network, batch), 1):
-                if number not in STEPS:
+            for number, step in enumerate(predict_free_running(network, batch), 1):
+                if number not in EVALUATED_STEPS:
                     continue
                 arm = batch.arms[number]
                 alone = still(first, arm, plate)
-                changed = (step.target - alone).abs().amax(1, keepdim=True) > CHANGED
-                for name, made in (("copy", batch.seen[0]), ("arm", alone), ("armnet", step.made)):
+                changed = (step.target - alone).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
+                for name, made in (("copy", batch.views[0]), ("arm", alone), ("armnet", step.prediction)):
                     gap = made - step.target
                     wrong = (gap.abs().mean(1, keepdim=True) * changed).sum((1, 2, 3)), changed.sum((1, 2, 3))
                     errors[name].setdefault(str(number), []).extend(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a training stands, in a file, so that one that was stopped goes on to the same end."""
+"""The state of a training in a file, so that an interrupted training resumes and ends with the same weights."""
 
 from __future__ import annotations
 
@@ -15,55 +15,55 @@ from wiw.errors import ArgumentError, FileError
 from wiw.files import whole_file
 
 
-class Kept:
-    """A lesson whose next step depends on how many it has done, on what it is taught, and on its `parts` alone."""
+class ResumableTrainer:
+    """A trainer whose next step depends only on its step count, its data, its recipe and its `stateful_parts`."""
 
-    parts: ClassVar[tuple[str, ...]]
-    """Names of attributes with a state: networks, and what optimises them."""
-    count = 0
-    """Steps done."""
+    stateful_parts: ClassVar[tuple[str, ...]]
+    """Names of the attributes that have a state: networks and optimisers."""
+    step_count = 0
+    """Number of steps done."""
 
-    def state(self) -> dict[str, Any]:
-        """All that the next step depends on, but for what is taught and how."""
-        return {"count": self.count, **{name: getattr(self, name).state_dict() for name in self.parts}}
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next step depends on, except the data and the recipe."""
+        return {"count": self.step_count, **{name: getattr(self, name).state_dict() for name in self.stateful_parts}}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Goes on from a state."""
-        self.count = state["count"]
-        for name in self.parts:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Resume from a state that `state_dict` returned."""
+        self.step_count = state["count"]
+        for name in self.stateful_parts:
             getattr(self, name).load_state_dict(state[name])
 
 
 @dataclass(frozen=True)
-class Stand:
+class TrainingState:
     """How far a training has come."""
 
     epochs: int
-    """Of the whole training."""
+    """Epochs of the whole training."""
     step: int
-    """Steps done."""
+    """Number of steps done."""
     state: Mapping[str, Any]
 
 
 class Checkpoint:
-    """A file that is written about once a minute and removed at the end.
+    """A checkpoint file, written about once a minute during training and removed at the end.
 
     Args:
-        path: of the file.
-        of: what is trained on and how, JSON-able; a file of another training is not gone on from.
-        seconds: from one writing to the next.
+        path: the file.
+        identity: JSON-able description of the data and the recipe; the checkpoint of another training is refused.
+        seconds: least time between two writes.
     """
 
-    def __init__(self, path: Path, of: Mapping[str, Any], seconds: float = 60.0) -> None:
+    def __init__(self, path: Path, identity: Mapping[str, Any], seconds: float = 60.0) -> None:
         self.path, self.seconds = path, seconds
-        self._of = json.dumps(dict(of), sort_keys=True)
-        self._last = time.monotonic()
+        self._identity = json.dumps(dict(identity), sort_keys=True)
+        self._last_saved = time.monotonic()
 
-    def stand(self) -> Stand | None:
-        """What the file says; None where there is none.
+    def load(self) -> TrainingState | None:
+        """Read the file; None where there is none.
 
         Raises:
-            ArgumentError: it is of another training.
+            ArgumentError: it belongs to another training.
             FileError: it is damaged.
         """
         import torch
@@ -71,32 +71,34 @@ class Checkpoint:
         if not self.path.exists():
             return None
         try:
-            held = torch.load(self.path, weights_only=True)
-            of, stand = held["of"], Stand(held["epochs"], held["step"], held["state"])
+            content = torch.load(self.path, weights_only=True)
+            identity = content["of"]
+            state = TrainingState(content["epochs"], content["step"], content["state"])
         except Exception as error:  # what torch's unpickler meets in damaged bytes raises nearly anything
-            raise FileError(f"{self.path}: damaged ({error}); delete it to begin anew") from error
-        if of != self._of:
+            raise FileError(f"{self.path}: damaged ({error}); delete it to start again") from error
+        if identity != self._identity:
             raise ArgumentError(
-                f"{self.path}: another training stopped there; delete it to begin anew, or ask for that"
+                f"{self.path} is the checkpoint of a training with other data or options; delete it to start again, "
+                "or resume with the same options"
             )
-        return stand
+        return state
 
-    def keep(self, lesson: Kept, epochs: int, step: int) -> None:
-        """Writes the file, whole or not at all, if the last time is long enough ago.
+    def save_if_due(self, trainer: ResumableTrainer, epochs: int, step: int) -> None:
+        """Write the file atomically, if the last write was long enough ago.
 
         Raises:
             FileError: it cannot be written.
         """
         import torch
 
-        if time.monotonic() < self._last + self.seconds:
+        if time.monotonic() < self._last_saved + self.seconds:
             return
-        packed = io.BytesIO()  # torch's own writer tells a full disk by a bare RuntimeError
-        torch.save({"of": self._of, "epochs": epochs, "step": step, "state": lesson.state()}, packed)
+        packed = io.BytesIO()  # torch's own writer reports a full disk by a bare RuntimeError
+        torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": trainer.state_dict()}, packed)
         with whole_file(self.path) as draft:
             draft.write_bytes(packed.getbuffer())
-        self._last = time.monotonic()
+        self._last_saved = time.monotonic()
 
     def remove(self) -> None:
-        """At the end."""
+        """Delete the file at the end of training."""
         self.path.unlink(missing_ok=True)

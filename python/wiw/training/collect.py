@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Demonstrations of manipulation tasks by those who know where things are, for networks to learn from.
+"""Collect demonstrations of manipulation tasks by experts that know where objects are, as training data.
 
-Each demonstration is a function of the seed, its task and its number; a file is renamed to its name once it is whole.
-Hence a collection that was stopped goes on, and ends as any other.
+Each demonstration is a pure function of the seed, its task and its number, and a file gets its name once it is
+complete. An interrupted collection therefore resumes, and ends with the same files.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from wiw.datasets.demonstrations import MANIFEST, Demonstrations, read_manifest,
 from wiw.errors import ArgumentError, FileError, InfrastructureError
 from wiw.files import sweep, whole_file
 from wiw.render import resolve_backend
-from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS
-from wiw.training.demonstrate import Collection, demonstrated
+from wiw.training.recording import Collection, record_demonstration
 
 Progress = Callable[[str, int, int, int], None]
-"""Told the task, how many of its demonstrations are done, of how many, and the tables failed at."""
+"""Called with the task, how many of its demonstrations are done, of how many, and the number of tables failed at."""
 
 
 def collect(
@@ -44,30 +44,30 @@ def collect(
     progress: Progress | None = None,
     **asked: Any,
 ) -> Demonstrations:
-    """Lets experts play manipulation tasks and writes what was seen; goes on where it was stopped.
+    """Let experts perform manipulation tasks and record what the front camera sees; resume where it was interrupted.
 
     Args:
-        out: folder that is new, or was begun by the same call.
-        tasks: "all", or names of `wiw.tabletop.kinds.KINDS`.
-        workers: processes; the files are the same for any number of them.
-        progress: told whenever a file is done.
+        out: a new folder, or one that the same call began.
+        tasks: "all", or names of `wiw.tabletop.tasks.TABLETOP_TASKS`.
+        workers: number of processes; the files do not depend on it.
+        progress: called whenever a file is complete.
         **asked: episodes, seed, size, frames, format, depth, keep_failed, backend, as in
-            `wiw.training.demonstrate.Collection`.
+            `wiw.training.recording.Collection`.
 
     Raises:
-        BackendError: the renderer that is asked for does not work here.
+        BackendError: the requested renderer does not work here.
         DependencyError: pyarrow is not installed.
-        ArgumentError: something that cannot be collected, or another collection in the folder.
+        ArgumentError: an option is out of range, or the folder holds another collection.
         FileError: the folder cannot be written.
         InfrastructureError: an expert fails at one table after another, or a worker process has died.
     """
     shards.require_pyarrow()
-    collection, folder, names = Collection(**asked), Path(out), _named(tasks)
+    collection, folder, names = Collection(**asked), Path(out), _parse_tasks(tasks)
     collection = replace(collection, backend=resolve_backend(collection.backend))
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}
-    _begin(folder, config)
+    _open_folder(folder, config)
     paths = zip(*(shard_paths(folder, config, task) for task in names), strict=True)
     jobs = [  # in turn, so that what a stopped collection has is of all tasks alike
         _Job(task, shard_range(number, collection.episodes), path, collection)
@@ -75,42 +75,47 @@ def collect(
         for task, path in zip(names, each, strict=True)
     ]
     tally = _Tally(collection.episodes, names, progress)
-    before = {job: job.failed_before() for job in jobs}
+    before = {job: job.read_failed_count() for job in jobs}
     for job, failed in before.items():
         if failed is not None:
             tally.add(job, failed)
-    for job, failed in _made([job for job in jobs if before[job] is None], workers):
+    for job, failed in _run_jobs([job for job in jobs if before[job] is None], workers):
         tally.add(job, failed)
     return Demonstrations(folder)
 
 
 @dataclass(frozen=True)
 class _Job:
-    """A file to be made."""
+    """A file to be written."""
 
     task: str
     episodes: range
     path: Path
     collection: Collection
 
-    def failed_before(self) -> int | None:
-        """Tables failed at, as the file says; None where there is none, or a damaged one."""
+    def read_failed_count(self) -> int | None:
+        """Return the number of tables failed at, as the file says; None where the file is absent or damaged."""
         try:
             return int(shards.Shard(self.path).facts["failed"])
         except FileError:
             return None
 
-    def make(self) -> int:
-        """Writes the file; returns the number of tables failed at."""
-        made = [demonstrated(KINDS[self.task], episode, self.collection) for episode in self.episodes]
+    def write_file(self) -> int:
+        """Write the file; return the number of tables failed at."""
+        made = [record_demonstration(TABLETOP_TASKS[self.task], episode, self.collection) for episode in self.episodes]
         failed = sum(failed for _, failed in made)
-        facts = {"wiw": wiw.__version__, "task": self.task, "failed": failed, "camera": _camera(self.collection.size)}
+        facts = {
+            "wiw": wiw.__version__,
+            "task": self.task,
+            "failed": failed,
+            "camera": _describe_camera(self.collection.size),
+        }
         shards.write(self.path, [demonstration for demonstration, _ in made], facts)
         return failed
 
 
 class _Tally:
-    """Counts what is done, task by task."""
+    """Counts the finished demonstrations, task by task."""
 
     def __init__(self, episodes: int, tasks: Sequence[str], progress: Progress | None) -> None:
         self._episodes, self._progress = episodes, progress
@@ -123,14 +128,16 @@ class _Tally:
             self._progress(job.task, self._done[job.task], self._episodes, self._failed[job.task])
 
 
-def _named(tasks: str | Sequence[str]) -> list[str]:
-    names = list(KINDS) if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)
-    if not names or len(set(names)) < len(names) or not set(names) <= set(KINDS):
-        raise ArgumentError(f"collect: expected tasks as all, or different ones of {', '.join(KINDS)}, got {tasks}")
+def _parse_tasks(tasks: str | Sequence[str]) -> list[str]:
+    names = list(TABLETOP_TASKS) if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)
+    if not names or len(set(names)) < len(names) or not set(names) <= set(TABLETOP_TASKS):
+        raise ArgumentError(
+            f"collect: expected tasks as all, or different ones of {', '.join(TABLETOP_TASKS)}, got {tasks}"
+        )
     return names
 
 
-def _camera(size: int) -> dict[str, Any]:
+def _describe_camera(size: int) -> dict[str, Any]:
     camera = CAMERAS["front"]
     focal = size / 2 / np.tan(np.radians(camera.hfov_deg) / 2)
     return {
@@ -145,8 +152,8 @@ def _camera(size: int) -> dict[str, Any]:
 # -- the folder --------------------------------------------------------------------------------------------------------
 
 
-def _begin(folder: Path, config: Mapping[str, Any]) -> None:
-    """Makes the folder and its manifest, or sees that the one that is there asks for the same."""
+def _open_folder(folder: Path, config: Mapping[str, Any]) -> None:
+    """Create the folder with its manifest, or check that the manifest there describes the same collection."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         sweep(folder)
@@ -164,18 +171,18 @@ def _begin(folder: Path, config: Mapping[str, Any]) -> None:
 # -- workers -----------------------------------------------------------------------------------------------------------
 
 
-def _made(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, int]]:
-    """Jobs as they are done, with the tables failed at."""
+def _run_jobs(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, int]]:
+    """Yield jobs as they finish, with the number of tables failed at."""
     if workers == 1 or len(jobs) <= 1:
         for job in jobs:
-            yield job, job.make()
+            yield job, job.write_file()
         return
     context, count = get_context("spawn"), min(workers, len(jobs))
     life, ours = context.Pipe(duplex=False)
     threads = max(1, len(os.sched_getaffinity(0)) // count)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_live, initargs=(life, threads))
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker, initargs=(life, threads))
     try:
-        running = {pool.submit(job.make): job for job in jobs}
+        running = {pool.submit(job.write_file): job for job in jobs}
         for each in as_completed(running):
             yield running[each], each.result()
     except BrokenProcessPool as error:
@@ -187,8 +194,10 @@ def _made(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, int]]:
         ours.close()
 
 
-def _live(life: Connection, threads: int) -> None:
-    """A worker's beginning; it ends at once when the other end of `life` is closed, be it that its owner was killed."""
+def _start_worker(life: Connection, threads: int) -> None:
+    """Initialise a worker process; it exits as soon as the other end of `life` is closed, even if its owner was
+    killed.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     os.environ.setdefault("WIW_NUM_THREADS", str(threads))
     threading.Thread(target=lambda: (wait([life]), os._exit(1)), daemon=True).start()

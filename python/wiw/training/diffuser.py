@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains the 3D diffusion policy on demonstrations: what an expert saw, and the path that it went then."""
+"""Train the 3D diffusion policy on demonstrations: the expert's view and the path that it took next."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.policies.diffuser.diffusion import KEPT, STEPS, noised
+from wiw.policies.diffuser.diffusion import ALPHA_BARS, NOISE_LEVELS, add_noise
 from wiw.policies.diffuser.network import Network, Shape
 from wiw.policies.diffuser.paths import MIDDLE, to_vectors
-from wiw.policies.diffuser.sight import Lens, Sight
-from wiw.training.checkpoint import Checkpoint, Kept
-from wiw.training.course import taught, up_and_down
+from wiw.policies.diffuser.workspace import PinholeCamera, WorkspaceView
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer
+from wiw.training.trainer import run_training, warmup_cosine_schedule
 
 if TYPE_CHECKING:
     from wiw.datasets.demonstrations import Demonstration
 
-PARTS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "insert_peg": 6, "stack_cups": 6}
-"""Actions of an expert that together come to something: one button pushed, one thing slid or put elsewhere."""
+SUBTASK_LENGTHS: Mapping[str, int] = {"push_buttons": 3, "slide_block": 4, "insert_peg": 6, "stack_cups": 6}
+"""Number of an expert's actions that achieve one subtask: one button pushed, or one object slid or placed."""
 
 
 @dataclass(frozen=True)
-class Moments:
-    """What was seen at N moments, and the path that was gone then."""
+class Samples:
+    """N training samples: what was seen, and the path that the expert took next."""
 
-    sight: Sight
-    """Of N pictures."""
+    view: WorkspaceView
+    """The views of N frames."""
     pose: NDArray[np.float64]
-    """float64 [N, 7]: where the gripper was."""
+    """float64 [N, 7]: the gripper's pose."""
     path: NDArray[np.float64]
-    """float64 [N, L, 7]: the poses that it went to; one that comes to its end sooner stays there."""
+    """float64 [N, L, 7]: the poses that the gripper went to; a shorter path repeats its last pose."""
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -49,25 +49,25 @@ class Moments:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the network is trained."""
+    """Hyper-parameters of the training."""
 
     epochs: int = 400
     batch: int = 8
-    """Moments a step."""
+    """Samples in a batch."""
     levels: int = 8
-    """Noised paths of each moment."""
+    """Noised paths of each sample."""
     width: int = 96
     layers: int = 4
     rate: float = 1e-3
     decay: float = 0.01
     turn: float = 0.5
-    """Weight of errors of rotations beside those of places."""
+    """Weight of rotation errors beside position errors."""
     grip: float = 0.1
     """Weight of errors of the gripper's opening."""
     tilt: float = 0.1
-    """Radians that scenes are turned about the middle of the workspace, at most."""
+    """Augmentation: greatest rotation of a scene about the middle of the workspace, in radians."""
     average: float = 0.995
-    """What the averaged weights keep of themselves in a step, late in training."""
+    """Decay of the exponential moving average of the weights, late in training."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -75,33 +75,33 @@ class Recipe:
             raise ArgumentError(f"Recipe: epochs, batch, levels, width and layers must be positive, got {self}")
 
 
-def moments(demonstrations: Iterable[Demonstration], lens: Lens) -> Moments:
-    """The beginnings of all parts of demonstrations, seen through a lens.
+def extract_samples(demonstrations: Iterable[Demonstration], camera: PinholeCamera) -> Samples:
+    """Return a training sample for each subtask of the demonstrations, as a camera sees its beginning.
 
     Raises:
-        ArgumentError: there are none, some are of an unknown task, or without depth.
+        ArgumentError: there are none, or some are of an unknown task or without depth.
     """
-    found = [each for demonstration in demonstrations for each in _parts(demonstration, lens)]
+    found = [each for demonstration in demonstrations for each in _split_into_subtasks(demonstration, camera)]
     if not found:
         raise ArgumentError("diffuser: expected demonstrations to learn from, got none")
-    sights, poses, paths = zip(*found, strict=True)
-    sight = Sight(*(np.stack([getattr(each, name) for each in sights]) for name in ("image", "height", "places")))
-    return Moments(sight, np.stack(poses), np.stack(paths))
+    views, poses, paths = zip(*found, strict=True)
+    view = WorkspaceView(*(np.stack([getattr(each, name) for each in views]) for name in ("image", "height", "places")))
+    return Samples(view, np.stack(poses), np.stack(paths))
 
 
-def _parts(
-    demonstration: Demonstration, lens: Lens
-) -> Iterator[tuple[Sight, NDArray[np.float64], NDArray[np.float64]]]:
-    """What is seen where parts begin, the gripper's pose there, and the poses that it goes to.
+def _split_into_subtasks(
+    demonstration: Demonstration, camera: PinholeCamera
+) -> Iterator[tuple[WorkspaceView, NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield the view at the beginning of each subtask, the gripper's pose there, and the poses that it goes to.
 
-    A demonstration ends with its success; where that is before the hand is away, it goes straight up to where it came
-    from.
+    A demonstration ends with its success. Where that comes before the hand has withdrawn, a pose straight above is
+    added.
     """
-    if demonstration.task not in PARTS:
-        raise ArgumentError(f"diffuser: expected tasks among {', '.join(PARTS)}, got {demonstration.task}")
+    if demonstration.task not in SUBTASK_LENGTHS:
+        raise ArgumentError(f"diffuser: expected tasks among {', '.join(SUBTASK_LENGTHS)}, got {demonstration.task}")
     if demonstration.encoded_depths is None:
         raise ArgumentError("diffuser: expected demonstrations with depth, of `wiw collect manipulation --depth`")
-    parts, keys, longest = PARTS[demonstration.task], demonstration.keys, max(PARTS.values())
+    parts, keys, longest = SUBTASK_LENGTHS[demonstration.task], demonstration.keys, max(SUBTASK_LENGTHS.values())
     for first in range(0, int(keys.max()), parts):
         frame = int(np.flatnonzero(keys <= first)[-1])
         numbers = range(first + 1, min(first + parts, int(keys.max())) + 1)
@@ -110,11 +110,11 @@ def _parts(
             up = max(pose[2] for pose in poses)
             poses.append(np.concatenate([poses[-1][:2], [up], poses[-1][3:]]))
         path = np.stack(poses + [poses[-1]] * (longest - len(poses)))
-        yield lens.sight(*_picture(demonstration, frame)), demonstration.poses[frame], path
+        yield camera.view_workspace(*_decode_frame(demonstration, frame)), demonstration.poses[frame], path
 
 
-def _picture(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Image and depth of one frame, without decoding the others."""
+def _decode_frame(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Decode image and depth of one frame, without decoding the others."""
     assert demonstration.encoded_depths is not None
     images, depths = demonstration.encoded_images[frame : frame + 1], demonstration.encoded_depths[frame : frame + 1]
     alone = replace(demonstration, encoded_images=images, encoded_depths=depths)
@@ -123,87 +123,89 @@ def _picture(demonstration: Demonstration, frame: int) -> tuple[NDArray[np.uint8
 
 
 def train(
-    moments: Moments,
+    samples: Samples,
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
-    show: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
     checkpoint: Checkpoint | None = None,
 ) -> tuple[Network, Recipe]:
-    """A trained network, and the recipe that would give the same one again.
+    """Train a network; return it with the recipe that reproduces it without a time limit.
 
     Args:
-        moments: to learn from.
-        recipe: see there.
-        minutes: if given, epochs are left out so that training takes about as long, by the speed of some trial steps.
-        show: called after each step with its number, how many there are, and a running mean of the loss.
-        checkpoint: where the state of training is kept, and gone on from.
+        samples: to learn from.
+        recipe: how to train; see `Recipe`.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        checkpoint: where the state of training is saved, and from where it resumes.
     """
-    an_epoch = max(1, len(moments) // recipe.batch)
-    begin = partial(_Lesson, moments, recipe)
-    lesson, recipe = taught(begin, recipe, an_epoch, minutes, up_and_down(0.03), show, checkpoint)
-    return lesson.average.eval(), recipe
+    steps_per_epoch = max(1, len(samples) // recipe.batch)
+    begin = partial(_Trainer, samples, recipe)
+    trainer, recipe = run_training(
+        begin, recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.03), on_step, checkpoint
+    )
+    return trainer.average.eval(), recipe
 
 
-class _Lesson(Kept):
-    """A network in training, with all that its next step depends on."""
+class _Trainer(ResumableTrainer):
+    """The network in training, with everything that its next step depends on."""
 
-    parts = ("network", "average", "optimiser")
+    stateful_parts = ("network", "average", "optimiser")
 
-    def __init__(self, moments: Moments, recipe: Recipe) -> None:
+    def __init__(self, samples: Samples, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0xD1F1]) % 2**63)
-        self.moments, self.recipe = moments, recipe
-        shape = Shape(recipe.width, layers=recipe.layers, poses=moments.path.shape[1])
+        self.samples, self.recipe = samples, recipe
+        shape = Shape(recipe.width, layers=recipe.layers, poses=samples.path.shape[1])
         self.network = Network(shape)
         self.average = deepcopy(self.network)
         self.optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
-    def step(self, rate: float) -> float:
-        """Learns from one batch of moments; its loss."""
+    def train_step(self, learning_rate: float) -> float:
+        """Train on one batch of samples and return its loss."""
         for group in self.optimiser.param_groups:
-            group["lr"] = float(rate)
-        key = core.fold_key([self.recipe.seed, 0xD1F2, self.count])
-        batch = drawn(self.moments, self.recipe.batch, self.recipe.tilt, np.random.default_rng(key))
-        loss = self._loss(batch, torch.Generator().manual_seed(key % 2**63))
+            group["lr"] = float(learning_rate)
+        key = core.fold_key([self.recipe.seed, 0xD1F2, self.step_count])
+        batch = sample_batch(self.samples, self.recipe.batch, self.recipe.tilt, np.random.default_rng(key))
+        loss = self._compute_loss(batch, torch.Generator().manual_seed(key % 2**63))
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
-        self.count += 1
-        self._follow(min(self.recipe.average, self.count / (self.count + 9)))
+        self.step_count += 1
+        self._update_average(min(self.recipe.average, self.step_count / (self.step_count + 9)))
         return float(loss.detach())
 
-    def _loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
+    def _compute_loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         recipe, network = self.recipe, self.network.train()
         count = len(batch.now), recipe.levels
-        level = torch.randint(STEPS, count, generator=generator)
+        level = torch.randint(NOISE_LEVELS, count, generator=generator)
         clean = batch.path[:, None].expand(-1, recipe.levels, -1, -1)
         noise = torch.randn(*count, *clean.shape[2:-1], 9, generator=generator)
-        scene = network.look(batch.image, batch.height, batch.places, batch.now)
-        found, gripper = network.denoise(scene, noised(clean[..., :9], noise, level), level)
-        off = _errors(found - clean[..., :9], level)
+        scene = network.encode_scene(batch.image, batch.height, batch.places, batch.now)
+        found, gripper = network.denoise(scene, add_noise(clean[..., :9], noise, level), level)
+        off = _compute_huber_errors(found - clean[..., :9], level)
         grip = functional.binary_cross_entropy_with_logits(gripper, clean[..., 9])
         return off[..., :3].mean() + recipe.turn * off[..., 3:].mean() + recipe.grip * grip
 
     @torch.no_grad()
-    def _follow(self, kept: float) -> None:
+    def _update_average(self, kept: float) -> None:
         for mean, value in zip(self.average.parameters(), self.network.parameters(), strict=True):
             mean.lerp_(value, 1 - kept)
 
 
-def _errors(off: Tensor, level: Tensor) -> Tensor:
-    """Huber's, of the size of `off` [B, R, L, 9], with a threshold at the ratio of noise to signal.
+def _compute_huber_errors(off: Tensor, level: Tensor) -> Tensor:
+    """Return Huber errors of the same shape as `off` [B, R, L, 9], with the noise-to-signal ratio as threshold.
 
-    Where noise leaves open which of several paths is meant, squares ask for the mean of all, so that sampling prefers
-    none; absolute errors would ask for the middle one. Where it does not, absolute errors make for precision.
+    Where noise leaves open which of several paths is meant, squared errors ask for their mean, so that sampling prefers
+    none of them; absolute errors would ask for the median. Where noise is low, absolute errors make for precision.
     """
-    ratio = ((1 - KEPT[level]) / KEPT[level]).sqrt().clamp(0.02, 2.0)[..., None, :]
+    ratio = ((1 - ALPHA_BARS[level]) / ALPHA_BARS[level]).sqrt().clamp(0.02, 2.0)[..., None, :]
     size = off.abs()
     return torch.where(size < ratio, size * size / (2 * ratio), size - ratio / 2)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Moments as the network takes them."""
+    """Samples as the network's input."""
 
     image: Tensor
     """uint8 [B, h, w, 3]."""
@@ -217,21 +219,23 @@ class Batch:
     """[B, L, 10]."""
 
 
-def drawn(moments: Moments, count: int, tilt: float, rng: np.random.Generator) -> Batch:
-    """Any moments, turned about the middle of the workspace by up to `tilt` radians, in other light."""
-    chosen = rng.integers(0, len(moments), count)
+def sample_batch(samples: Samples, count: int, tilt: float, rng: np.random.Generator) -> Batch:
+    """Sample random rows, and augment them: rotated about the middle of the workspace by up to `tilt` radians, with
+    other brightness and tint.
+    """
+    chosen = rng.integers(0, len(samples), count)
     light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    images = (moments.sight.image[chosen] * light.astype(np.float32)).clip(0, 255).astype(np.uint8)
+    images = (samples.view.image[chosen] * light.astype(np.float32)).clip(0, 255).astype(np.uint8)
     angles = rng.uniform(-tilt, tilt, count)
     turns = Rotation.from_euler("z", angles[:, None]).as_matrix()
-    places = np.einsum("bij,bhwj->bhwi", turns, moments.sight.places[chosen] - MIDDLE) + MIDDLE
-    poses = np.concatenate([moments.pose[chosen, None], moments.path[chosen]], axis=1)
+    places = np.einsum("bij,bhwj->bhwi", turns, samples.view.places[chosen] - MIDDLE) + MIDDLE
+    poses = np.concatenate([samples.pose[chosen, None], samples.path[chosen]], axis=1)
     poses[..., :3] = np.einsum("bij,blj->bli", turns, poses[..., :3] - MIDDLE) + MIDDLE
     poses[..., 5] += angles[:, None]
     vectors = torch.from_numpy(to_vectors(poses))
     return Batch(
         torch.from_numpy(images),
-        torch.from_numpy(moments.sight.height[chosen]),
+        torch.from_numpy(samples.view.height[chosen]),
         torch.from_numpy(places.astype(np.float32)),
         vectors[:, 0],
         vectors[:, 1:],

@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is learnt from, of many scenes or plays: kept on disk one by one, so that a command that was stopped goes on."""
+"""Training data built from many scenes or plays, cached on disk file by file, so that an interrupted command
+resumes.
+"""
 
 from __future__ import annotations
 
@@ -22,108 +24,124 @@ from wiw.datasets.worlds import world
 from wiw.files import whole_file
 from wiw.perception.glimpses import Glimpses
 from wiw.scenes.store import build_digest
-from wiw.training.looks import LookRules, Looks, look_around, merged
-from wiw.training.walks import WalkRules, Walks, walk_about
-from wiw.training.walks import merged as merged_walks
+from wiw.training.glimpse_sets import GlimpseSetRules, GlimpseSets, collect_glimpse_sets, merge_glimpse_sets
+from wiw.training.walks import WalkRules, Walks, record_walks
+from wiw.training.walks import merge_walks as merged_walks
 
 Arrays = Mapping[str, NDArray[Any]]
-Bar = Callable[[Iterable[str], str, int], Iterable[str]]
-"""Shows how far an iterable of so many items has come."""
+ProgressBar = Callable[[Iterable[str], str, int], Iterable[str]]
+"""Wraps an iterable of a given number of items in a progress bar: (items, text, total)."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is gathered from each scene, or other source."""
+    """What is built from each source."""
 
     name: str
-    """In words, for bars."""
+    """Description for progress bars."""
     fields: tuple[str, ...]
-    """Of the arrays that `make` gives."""
+    """Names of the arrays that `make` returns."""
     make: Callable[[str], Arrays]
-    """Of a source by its name. Runs in other processes: a function of a module, or a `partial` of one."""
+    """Builds the arrays of a source, by the source's name. Runs in other processes: a function of a module, or a
+    `partial` of one.
+    """
     identity: tuple[Any, ...]
-    """JSON-able: all that the arrays depend on beside the source, and a version to raise when `make` changes."""
+    """JSON-able: everything that the arrays depend on except the source, and a version to raise when `make` changes."""
 
 
-LOOKS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
-WALKS = ("images", "distances", "places")
+GLIMPSE_SET_FIELDS = ("images", "boxes", "scalars", "owners", "kinds", "labels")
+WALK_FIELDS = ("images", "distances", "places")
 
 
-def gathered(
-    specs: str, categories: Sequence[str], seed: int, rules: LookRules, folder: Path, workers: int, bar: Bar
-) -> Looks:
-    """Looks of all scenes of a spec, in their order; those that `folder` does not hold are made by `workers` processes.
+def gather_glimpse_sets(
+    specs: str,
+    categories: Sequence[str],
+    seed: int,
+    rules: GlimpseSetRules,
+    folder: Path,
+    workers: int,
+    bar: ProgressBar,
+) -> GlimpseSets:
+    """Load the glimpse sets of all scenes of a spec, in order; build those that `folder` lacks in `workers` processes.
 
     Raises:
         FileError: the folder cannot be written.
         ArgumentError: the scenes show nothing of `categories`.
     """
-    make = partial(_looks, seed=seed, categories=tuple(categories), rules=rules)
-    job = Job(f"looks of {specs}", LOOKS, make, (1, list(categories), seed, asdict(rules)))
-    found = gather(_scenes(specs), job, folder, workers, bar)
+    make = partial(_build_glimpse_sets, seed=seed, categories=tuple(categories), rules=rules)
+    job = Job(f"glimpses in {specs}", GLIMPSE_SET_FIELDS, make, (1, list(categories), seed, asdict(rules)))
+    found = gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
     parts = [(Glimpses(a["images"], a["boxes"], a["scalars"]), a["owners"], a["kinds"], a["labels"]) for a in found]
-    return merged([Looks(*part) for part in parts])
+    return merge_glimpse_sets([GlimpseSets(*part) for part in parts])
 
 
-def gathered_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers: int, bar: Bar) -> Walks:
-    """Walks through all scenes of a spec, likewise.
+def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers: int, bar: ProgressBar) -> Walks:
+    """Load the walks through all scenes of a spec; build those that `folder` lacks in `workers` processes.
 
     Raises:
         FileError: the folder cannot be written.
         ArgumentError: nowhere in the scenes can one walk straight ahead.
     """
-    job = Job(f"walks of {specs}", WALKS, partial(_walks, seed=seed, rules=rules), ("walks", 1, seed, asdict(rules)))
+    job = Job(
+        f"walks in {specs}",
+        WALK_FIELDS,
+        partial(_build_walks, seed=seed, rules=rules),
+        ("walks", 1, seed, asdict(rules)),
+    )
     return merged_walks(
-        [Walks(*(a[name] for name in WALKS)) for a in gather(_scenes(specs), job, folder, workers, bar)]
+        [
+            Walks(*(a[name] for name in WALK_FIELDS))
+            for a in gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
+        ]
     )
 
 
-def _scenes(specs: str) -> dict[str, str]:
-    """Names of a spec's scenes wherever they are asked for, by their names here."""
+def _resolve_scenes(specs: str) -> dict[str, str]:
+    """Map the names of a spec's scenes to names that are valid in any working directory."""
     return {name: scenes.absolute(name) for name in scenes.resolve(specs)}
 
 
-def _looks(name: str, seed: int, categories: Sequence[str], rules: LookRules) -> Arrays:
-    looks = look_around(world(name), seed, categories, rules)
-    found = looks.glimpses
-    values = (found.images, found.boxes, found.scalars, looks.owners, looks.kinds, looks.labels)
-    return dict(zip(LOOKS, values, strict=True))
+def _build_glimpse_sets(name: str, seed: int, categories: Sequence[str], rules: GlimpseSetRules) -> Arrays:
+    sets = collect_glimpse_sets(world(name), seed, categories, rules)
+    glimpses = sets.glimpses
+    values = (glimpses.images, glimpses.boxes, glimpses.scalars, sets.owners, sets.kinds, sets.labels)
+    return dict(zip(GLIMPSE_SET_FIELDS, values, strict=True))
 
 
-def _walks(name: str, seed: int, rules: WalkRules) -> Arrays:
-    walks = walk_about(world(name), seed, rules)
-    return {name: getattr(walks, name) for name in WALKS}
+def _build_walks(name: str, seed: int, rules: WalkRules) -> Arrays:
+    walks = record_walks(world(name), seed, rules)
+    return {name: getattr(walks, name) for name in WALK_FIELDS}
 
 
-def gather(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar: Bar) -> list[Arrays]:
-    """Arrays of all sources, in their order; those that `folder` does not hold are made by `workers` processes.
+def gather_arrays(sources: Mapping[str, str], job: Job, folder: Path, workers: int, bar: ProgressBar) -> list[Arrays]:
+    """Load the arrays of all sources, in order; build those that `folder` lacks in `workers` processes.
 
     Args:
-        sources: the name that tells each from all others, by the name that `job.make` takes.
-        job: what is made of each.
-        folder: where they are kept.
-        workers: processes.
-        bar: shows how far they have come.
+        sources: maps a unique name of each source to the name that `job.make` takes.
+        job: what to build from each.
+        folder: the cache.
+        workers: number of processes.
+        bar: shows the progress.
 
     Raises:
         FileError: the folder cannot be written.
     """
-    files = {name: folder / f"{_digest(source, job)}.npz" for name, source in sources.items()}
-    found = {name: _read(file, job) for name, file in files.items()}
+    files = {name: folder / f"{_compute_digest(source, job)}.npz" for name, source in sources.items()}
+    found = {name: _read_file(file, job) for name, file in files.items()}
     missing = [name for name, arrays in found.items() if arrays is None]
-    list(bar(_made(missing, files, job, workers), job.name, len(missing)))
-    found |= {name: _read(files[name], job) for name in missing}
+    list(bar(_build_missing(missing, files, job, workers), job.name, len(missing)))
+    found |= {name: _read_file(files[name], job) for name in missing}
     return [arrays for arrays in found.values() if arrays is not None]
 
 
-def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) -> Iterable[str]:
-    """Names of scenes as they are done."""
+def _build_missing(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) -> Iterable[str]:
+    """Build the files of the given sources; yield each name when its file is complete."""
     if workers <= 1 or len(names) <= 1:
         for name in names:
-            yield _make(name, files[name], job)
+            yield _build_file(name, files[name], job)
         return
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        jobs = [pool.submit(_make, name, files[name], job) for name in names]
+        jobs = [pool.submit(_build_file, name, files[name], job) for name in names]
         try:
             for each in as_completed(jobs):
                 yield each.result()
@@ -131,15 +149,15 @@ def _made(names: Sequence[str], files: dict[str, Path], job: Job, workers: int) 
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _make(name: str, file: Path, job: Job) -> str:
+def _build_file(name: str, file: Path, job: Job) -> str:
     arrays = job.make(name)
     with whole_file(file) as draft, draft.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
     return name
 
 
-def _read(file: Path, job: Job) -> Arrays | None:
-    """None where there is no whole file."""
+def _read_file(file: Path, job: Job) -> Arrays | None:
+    """Return the arrays of a cache file; None where it is absent or incomplete."""
     try:
         with np.load(file) as values:
             return {name: values[name] for name in job.fields}
@@ -147,7 +165,7 @@ def _read(file: Path, job: Job) -> Arrays | None:
         return None
 
 
-def _digest(source: str, job: Job) -> str:
+def _compute_digest(source: str, job: Job) -> str:
     version, *rest = job.identity
     identity = [version, build_digest(), source, *rest]
     return blake2b(json.dumps(identity).encode(), digest_size=12).hexdigest()

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What armnet learns from: plays at tables, most of which go wrong in one way or another.
+"""Training data of armnet: recorded play at tables, most of it with mistakes.
 
-A play is a table of one of the tasks and nine views with eight gripper poses between them. Plans are those of experts,
-for the target that is asked for or another, and most are spoilt: all of it shifted, every pose a little off, poses left
-out, the gripper shut where it should open, poses anywhere. Who saw experts alone would imagine success of every plan.
+A play is one task's table with nine views and eight gripper poses between them. Its plan is an expert's, for the
+requested target or another, and mostly corrupted: all of it shifted, every pose slightly off, poses left out, the
+gripper inverted, poses replaced by random ones. A model that saw only experts would imagine success after every plan.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 from pathlib import Path
 
@@ -19,138 +19,143 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.datasets.demonstrations import Demonstration, Demonstrations
-from wiw.tabletop.kind import DOWN, Kind, Setup
-from wiw.tabletop.kinds import KINDS
+from wiw.tabletop.base import DOWN, TableSetup, TabletopTask
+from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE, Workbench
-from wiw.training.gather import Arrays, Bar, Job, gather
+from wiw.training.gather import Arrays, Job, ProgressBar, gather_arrays
 from wiw.world_models.armnet.body import sights
 from wiw.world_models.armnet.network import FRONT, WINDOW
 
 POSES = 8
-"""Gone to in a play."""
-SKIPPED = 5
-"""At most, before its first view."""
-CHUNK = 25
-"""Plays a file."""
+"""Poses in a play."""
+MAX_SKIPPED = 5
+"""Most poses executed before the first view."""
+PLAYS_PER_FILE = 25
+"""Plays in a cache file."""
 
 
 @dataclass(frozen=True)
 class Plays:
     """N plays, in the network's window of the front view."""
 
-    seen: NDArray[np.uint8]
+    views: NDArray[np.uint8]
     """[N, 9, h, w, 3]: the front view."""
     bare: NDArray[np.uint8]
     """[N, 9, h, w, 3]: the arm over the bare table."""
     arm: NDArray[np.bool_]
-    """[N, 9, h, w]: where it hides the table."""
+    """[N, 9, h, w]: the pixels that the arm covers."""
     poses: NDArray[np.float64]
-    """[N, 9, 7]: where the gripper has come to."""
+    """[N, 9, 7]: the poses that the gripper reached."""
 
     def __len__(self) -> int:
-        return len(self.seen)
+        return len(self.views)
 
 
-FIELDS = ("seen", "bare", "arm", "poses")
+FILE_FIELDS = ("seen", "bare", "arm", "poses")
+"""Names of the arrays of `Plays` in cache files, in the order of its fields."""
 
 
-def merged(parts: Sequence[Plays]) -> Plays:
-    """All in one."""
-    return Plays(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
+def merge_plays(parts: Sequence[Plays]) -> Plays:
+    """Concatenate plays."""
+    return Plays(*(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Plays)))
 
 
-def gathered_plays(count: int, seed: int, folder: Path, workers: int, bar: Bar) -> Plays:
-    """So many plays; those that `folder` does not hold are made by `workers` processes.
+def gather_plays(count: int, seed: int, folder: Path, workers: int, bar: ProgressBar) -> Plays:
+    """Load `count` plays; record those that `folder` lacks in `workers` processes.
 
     Raises:
         FileError: the folder cannot be written.
     """
-    job = Job(f"{count} plays", FIELDS, partial(_chunk, seed=seed), ("plays", 1, seed))
-    chunks = {str(number): f"plays {number}" for number in range(-(-count // CHUNK))}
-    found = gather(chunks, job, folder, workers, bar)
-    return Plays(*(np.concatenate([part[name] for part in found])[:count] for name in FIELDS))
+    job = Job(f"{count} plays", FILE_FIELDS, partial(_build_chunk, seed=seed), ("plays", 1, seed))
+    chunks = {str(number): f"plays {number}" for number in range(-(-count // PLAYS_PER_FILE))}
+    found = gather_arrays(chunks, job, folder, workers, bar)
+    return Plays(*(np.concatenate([part[name] for part in found])[:count] for name in FILE_FIELDS))
 
 
-def _chunk(name: str, seed: int) -> Arrays:
-    plays = played(seed, CHUNK * int(name), CHUNK)
-    return {field: getattr(plays, field) for field in FIELDS}
+def _build_chunk(name: str, seed: int) -> Arrays:
+    plays = record_plays(seed, PLAYS_PER_FILE * int(name), PLAYS_PER_FILE)
+    return dict(zip(FILE_FIELDS, (plays.views, plays.bare, plays.arm, plays.poses), strict=True))
 
 
-def played(seed: int, first: int, count: int) -> Plays:
-    """Plays number `first` and on; each is a function of the seed and its number."""
+def record_plays(seed: int, first: int, count: int) -> Plays:
+    """Record plays number `first` and following; each is a pure function of the seed and its number."""
     numbers = range(first, first + count)
-    return merged([_play(np.random.default_rng(core.fold_key([seed, 0xA12E, n])), n) for n in numbers])
+    return merge_plays([_record_play(np.random.default_rng(core.fold_key([seed, 0xA12E, n])), n) for n in numbers])
 
 
-def demonstrated(folder: Path) -> Plays:
-    """What `wiw collect` has written, as plays: views as actions end. Who has come to the end stays there.
+def read_demonstration_plays(folder: Path) -> Plays:
+    """Convert a collection of `wiw collect` to plays, with views at the end of each action.
+
+    A demonstration that ends early repeats its last view.
 
     Raises:
         DependencyError: pyarrow is not installed.
         FileError: there is no such collection, or it is damaged.
     """
-    return merged([play for each in Demonstrations(folder) for play in _parts(each)])
+    return merge_plays([play for each in Demonstrations(folder) for play in _split_demonstration(each)])
 
 
-def _parts(demonstration: Demonstration) -> list[Plays]:
+def _split_demonstration(demonstration: Demonstration) -> list[Plays]:
     ends = np.flatnonzero(demonstration.ended)
     frames = [0, *ends.tolist()]
-    told = np.concatenate([demonstration.poses[:1], demonstration.actions[ends]])
+    commanded = np.concatenate([demonstration.poses[:1], demonstration.actions[ends]])
     parts = []
     for first in range(0, len(ends), POSES):
         which = np.minimum(np.arange(first, first + POSES + 1), len(ends))
-        views = [demonstration.images[frames[at]] for at in which]
-        seen = [cv2.resize(view, FRONT[::-1], interpolation=cv2.INTER_AREA)[WINDOW] for view in views]
-        parts.append(_plays(np.stack(seen), told[which]))
+        images = [demonstration.images[frames[at]] for at in which]
+        views = [cv2.resize(image, FRONT[::-1], interpolation=cv2.INTER_AREA)[WINDOW] for image in images]
+        parts.append(_build_play(np.stack(views), commanded[which]))
     return parts
 
 
-def _play(rng: np.random.Generator, number: int) -> Plays:
-    kind = list(KINDS.values())[number % len(KINDS)]
-    setup = kind.setup(int(rng.integers(2**31)), int(rng.integers(kind.variations)))
-    bench, plan = setup.bench(), list[NDArray[np.float64]]()
+def _record_play(rng: np.random.Generator, number: int) -> Plays:
+    task = list(TABLETOP_TASKS.values())[number % len(TABLETOP_TASKS)]
+    setup = task.create_setup(int(rng.integers(2**31)), int(rng.integers(task.variations)))
+    bench, plan = setup.build_workbench(), list[NDArray[np.float64]]()
 
-    def going() -> NDArray[np.float64]:
+    def execute_next() -> NDArray[np.float64]:
         while not plan:
-            plan.extend(spoilt(_expert(kind, setup, bench, rng), rng))
+            plan.extend(corrupt_plan(_plan_as_expert(task, setup, bench, rng), rng))
         pose = plan.pop(0)
-        bench.go(pose)
+        bench.move_to(pose)
         return pose
 
-    for _ in range(int(rng.integers(SKIPPED + 1))):
-        going()
-    told, seen = [bench.pose], [_view(bench)]
+    for _ in range(int(rng.integers(MAX_SKIPPED + 1))):
+        execute_next()
+    commanded, views = [bench.pose], [_render_window(bench)]
     for _ in range(POSES):
-        told.append(going())
-        seen.append(_view(bench))
-    return _plays(np.stack(seen), np.stack(told))
+        commanded.append(execute_next())
+        views.append(_render_window(bench))
+    return _build_play(np.stack(views), np.stack(commanded))
 
 
-def _plays(seen: NDArray[np.uint8], told: NDArray[np.float64]) -> Plays:
-    """One play, with the arm alone at the same poses."""
-    arms = list(sights(told, FRONT))
+def _build_play(views: NDArray[np.uint8], commanded: NDArray[np.float64]) -> Plays:
+    """Return one play, with renderings of the arm alone at the same poses."""
+    arms = list(sights(commanded, FRONT))
     return Plays(
-        seen[None],
+        views[None],
         np.stack([arm.color[WINDOW] for arm in arms])[None],
         np.stack([arm.arm[WINDOW] for arm in arms])[None],
         np.stack([arm.pose for arm in arms])[None],
     )
 
 
-def _view(bench: Workbench) -> NDArray[np.uint8]:
-    view: NDArray[np.uint8] = bench.picture("front", FRONT)["color"][WINDOW]
+def _render_window(bench: Workbench) -> NDArray[np.uint8]:
+    view: NDArray[np.uint8] = bench.render_view("front", FRONT)["color"][WINDOW]
     return view
 
 
-def _expert(kind: Kind, setup: Setup, bench: Workbench, rng: np.random.Generator) -> NDArray[np.float64]:
-    """What an expert would do now, for the target that is asked for or, as often, another."""
-    others = kind.alternatives(setup.objects, setup.target)
+def _plan_as_expert(
+    task: TabletopTask, setup: TableSetup, bench: Workbench, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Return an expert's plan from the present state, for the requested target or, as often, for another."""
+    others = task.list_alternatives(setup.objects, setup.target)
     target = others[rng.integers(len(others))] if rng.random() < 0.5 else setup.target
-    return kind.expert(bench.places(setup.objects), target, bench.pose)
+    return task.plan_expert(bench.get_poses(setup.objects), target, bench.pose)
 
 
-def spoilt(plan: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """A plan [K, 7] made wrong in one of six ways, or, three times in ten, left alone."""
+def corrupt_plan(plan: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
+    """Corrupt a plan [K, 7] in one of six ways, or, three times in ten, return it unchanged."""
     plan = plan.copy()
     way = rng.choice(7, p=(0.3, 0.15, 0.2, 0.1, 0.08, 0.07, 0.1))
     if way == 1:
@@ -166,12 +171,12 @@ def spoilt(plan: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.fl
     elif way == 5:
         plan = rng.permutation(plan)
     elif way == 6:
-        plan[rng.random(len(plan)) < 0.5] = _anywhere(rng)
+        plan[rng.random(len(plan)) < 0.5] = _sample_pose(rng)
     plan[:, 2] = np.maximum(plan[:, 2], TABLE + 0.002)
     return plan
 
 
-def _anywhere(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A pose in reach, with the hand pointing down."""
+def _sample_pose(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Sample a pose within reach, with the hand pointing down."""
     x, y, height = rng.uniform((0.0, -0.28, 0.01), (0.34, 0.28, 0.3))
     return np.array([x, y, TABLE + height, DOWN[0], DOWN[1], rng.uniform(-0.5, 0.5), float(rng.integers(2))])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains warpnet on walks, and measures it on ways that it never saw."""
+"""Train warpnet on walks, and evaluate it on held-out walks."""
 
 from __future__ import annotations
 
@@ -17,38 +17,38 @@ from wiw._core import core
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.reproject import pose, warp
-from wiw.training.course import taught, up_and_down
-from wiw.training.walks import Walks, straight_ways
+from wiw.training.trainer import run_training, warmup_cosine_schedule
+from wiw.training.walks import Walks, find_straight_paths
 from wiw.world_models.warpnet.model import WarpNet, to_network
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
 
 STRIDE = 0.2
 """Metres of a step ahead."""
-STEPS = (1, 3, 5, 8)
-"""Ahead, that the model is measured after."""
+EVALUATED_STEPS = (1, 3, 5, 8)
+"""Numbers of steps ahead at which the model is evaluated."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the network is trained."""
+    """Hyper-parameters of the training."""
 
     epochs: int = 6
-    """How often each panorama is walked away from, on average."""
+    """How often each panorama is used as a source, on average."""
     batch: int = 4
     widths: tuple[int, int, int] = (32, 64, 128)
-    """Channels of the U-Nets."""
+    """Channels of the U-Nets' levels."""
     rate: float = 1.5e-3
     decay: float = 0.01
     warped: float = 0.5
-    """Weight of what geometry alone gets wrong, beside what is wrong in the end."""
+    """Weight of the warped image's errors beside those of the final image."""
     distance: float = 0.3
-    """Weight of errors of log-distance."""
+    """Weight of errors of the log-distance."""
     edges: float = 1.0
     """Weight of errors of the differences between neighbouring pixels."""
     paint: float = 0.02
-    """Price of what is painted rather than warped: painting is soft."""
+    """Penalty on painted rather than warped pixels: paint is blurred."""
     bfloat16: bool = True
-    """Products in half the bits: 1.5 times faster on CPUs that can (AVX512-BF16), slower on others."""
+    """Compute products in bfloat16: 1.5 times faster on CPUs with AVX512-BF16, slower on others."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -60,23 +60,25 @@ def train(
     walks: Walks,
     recipe: Recipe = Recipe(),
     minutes: float | None = None,
-    show: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
 ) -> tuple[Network, Recipe]:
-    """A trained network, and the recipe that would give the same one again.
+    """Train a network; return it with the recipe that reproduces it without a time limit.
 
     Args:
         walks: to learn from.
-        recipe: see there.
-        minutes: if given, epochs are left out so that training takes about as long, by the speed of some trial steps.
-        show: called after each step with its number, how many there are, and a running mean of the loss.
+        recipe: how to train; see `Recipe`.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
     """
-    an_epoch = max(1, walks.places.size // recipe.batch)
-    lesson, recipe = taught(lambda: _Lesson(walks, recipe), recipe, an_epoch, minutes, up_and_down(0.05), show)
-    return lesson.network.eval(), recipe
+    steps_per_epoch = max(1, walks.places.size // recipe.batch)
+    trainer, recipe = run_training(
+        lambda: _Trainer(walks, recipe), recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
+    )
+    return trainer.network.eval(), recipe
 
 
-class _Lesson:
-    """A network in training, with all that its next step depends on."""
+class _Trainer:
+    """The network in training, with everything that its next step depends on."""
 
     def __init__(self, walks: Walks, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C11]) % 2**63)
@@ -85,14 +87,14 @@ class _Lesson:
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C12]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
-    def step(self, rate: float) -> float:
-        """Learns from one batch of pairs; its loss."""
+    def train_step(self, learning_rate: float) -> float:
+        """Train on one batch of pairs and return its loss."""
         for group in self._optimiser.param_groups:
-            group["lr"] = rate
-        pairs = drawn(self.walks, self.recipe.batch, self._rng)
+            group["lr"] = learning_rate
+        pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
             found = self.network.train()(pairs.source, pairs.ahead)
-        loss = _loss(found, pairs, self.recipe)
+        loss = _compute_loss(found, pairs, self.recipe)
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -102,7 +104,7 @@ class _Lesson:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Panoramas, and what is seen from `ahead` metres further ahead."""
+    """Panoramas, and the views `ahead` metres further ahead."""
 
     source: Tensor
     """[B, 3, H, W] in [-1, 1]."""
@@ -113,33 +115,36 @@ class Pairs:
     """[B, 1, H, W] of the target."""
 
 
-def drawn(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
-    """Any two panoramas of a way, in either direction, half of them mirrored, in other light."""
+def sample_pairs(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
+    """Sample pairs of panoramas of a walk, in either direction, half of them mirrored, with other brightness and
+    tint.
+    """
     stops = walks.places.shape[1]
-    ways = rng.integers(0, len(walks), count)
+    paths = rng.integers(0, len(walks), count)
     first = rng.integers(0, stops, count)
     second = (first + rng.integers(1, stops, count)) % stops
-    ahead = walks.places[ways, second] - walks.places[ways, first]
+    ahead = walks.places[paths, second] - walks.places[paths, first]
     back, mirrored = ahead < 0, rng.random(count) < 0.5
     light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     gain = torch.from_numpy(light.astype(np.float32)).permute(0, 3, 1, 2)
     source, target = (
-        (to_network(_seen(walks.images[ways, stop], back, mirrored)) + 1) * gain - 1 for stop in (first, second)
+        (to_network(_augment_panoramas(walks.images[paths, stop], back, mirrored)) + 1) * gain - 1
+        for stop in (first, second)
     )
-    metres = _seen(walks.distances[ways, second], back, mirrored).astype(np.float32)
+    metres = _augment_panoramas(walks.distances[paths, second], back, mirrored).astype(np.float32)
     log_distance = np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST))
     return Pairs(source, torch.from_numpy(np.abs(ahead)), target, torch.from_numpy(log_distance)[:, None])
 
 
-def _seen(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrored: NDArray[np.bool_]) -> NDArray[Any]:
-    """Panoramas [B, H, W, ...] by who goes the way back, or in a mirror."""
+def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrored: NDArray[np.bool_]) -> NDArray[Any]:
+    """Turn panoramas [B, H, W, ...] backwards or mirror them, as each row's flags say."""
     made = panoramas.copy()
     made[back] = np.roll(made[back], made.shape[2] // 2, axis=2)
     made[mirrored] = made[mirrored, :, ::-1]
     return made
 
 
-def _loss(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
+def _compute_loss(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
     height = pairs.target.shape[2]
     weights = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))[:, None]
 
@@ -162,28 +167,38 @@ def _loss(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
 # -- measuring ---------------------------------------------------------------------------------------------------------
 
 
-def measured(
+def evaluate(
     model: WarpNet,
     specs: str,
     seed: int,
-    ways: int = 3,
+    paths: int = 3,
     bar: Callable[[Sequence[str], str, int], Iterable[str]] = lambda items, text, total: items,
 ) -> dict[str, Any]:
-    """PSNR in dB and SSIM of `copy`, this model and `warp` by the number of steps straight ahead.
+    """Measure PSNR in dB and SSIM of `copy`, this model and `warp` by the number of steps straight ahead.
 
-    {"ways": N, "psnr": {"copy": {"1": dB, ...}, "warpnet": ..., "warp": ...}, "ssim": likewise}. Means over up to
-    `ways` places of each scene with 1.6 m free ahead, whole panoramas, weighted by latitude.
+    Returns:
+        {"ways": N, "psnr": {"copy": {"1": dB, ...}, "warpnet": ..., "warp": ...}, "ssim": likewise}. Means over up to
+        `paths` places of each scene with 1.6 m free ahead, over whole panoramas, weighted by latitude.
 
     Raises:
         ArgumentError: there is no such place in the scenes.
     """
     names = scenes.resolve(specs)
-    rows = [row for name in bar(names, f"measuring on {specs}", len(names)) for row in _scene(model, name, seed, ways)]
+    rows = [
+        row
+        for name in bar(names, f"measuring on {specs}", len(names))
+        for row in _evaluate_scene(model, name, seed, paths)
+    ]
     if not rows:
-        raise ArgumentError(f"{specs}: nowhere are {STEPS[-1] * STRIDE:.1f} m free ahead; name others (--val)")
+        raise ArgumentError(
+            f"{specs}: nowhere are {EVALUATED_STEPS[-1] * STRIDE:.1f} m free ahead; name others (--val)"
+        )
     means = {
         measure: {
-            name: {str(steps): round(float(np.mean([row[measure, name, steps] for row in rows])), 4) for steps in STEPS}
+            name: {
+                str(steps): round(float(np.mean([row[measure, name, steps] for row in rows])), 4)
+                for steps in EVALUATED_STEPS
+            }
             for name in ("copy", "warpnet", "warp")
         }
         for measure in ("psnr", "ssim")
@@ -191,17 +206,17 @@ def measured(
     return {"ways": len(rows), **means}
 
 
-def _scene(model: WarpNet, name: str, seed: int, ways: int) -> list[dict[tuple[str, str, int], float]]:
-    """Both measures by model and steps, for each way of a scene."""
+def _evaluate_scene(model: WarpNet, name: str, seed: int, paths: int) -> list[dict[tuple[str, str, int], float]]:
+    """Return both measures by model and steps, for each path of a scene."""
     here = world(name)
-    length = STEPS[-1] * STRIDE
+    length = EVALUATED_STEPS[-1] * STRIDE
     rows = []
-    for way in straight_ways(here, ways, core.fold_key([seed, 0x4C13]), length, length):
-        poses = way.poses(here, np.array([0, *STEPS]) * STRIDE)
+    for path in find_straight_paths(here, paths, core.fold_key([seed, 0x4C13]), length, length):
+        poses = path.camera_poses(here, np.array([0, *EVALUATED_STEPS]) * STRIDE)
         color = here.renderer.panorama(poses, outputs=("color",))["color"]
         depth = here.renderer.panorama(poses[:1], outputs=("depth",))["depth"]
         row = {}
-        for steps, target in zip(STEPS, color[1:], strict=True):
+        for steps, target in zip(EVALUATED_STEPS, color[1:], strict=True):
             shown = {
                 "copy": color[0],
                 "warpnet": model.imagine_move(color[0], steps * STRIDE, 0.0),

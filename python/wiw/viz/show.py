@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.report.cuts import BAND, FRONT, part
-from wiw.report.plans import glyphs
+from wiw.report.plans import glyphs, numbers, of_primitives
 from wiw.report.stage import signs
-from wiw.runs.rows import kept_frames
+from wiw.runs.rows import select_frames
 from wiw.tabletop.workbench import SHUT
 from wiw.types import ArmObservation, Decision, Observation, Rollout
 
@@ -78,7 +78,7 @@ def _told(decision: Decision, index: int) -> str:
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
         return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
-    return " ".join(glyphs(actions))
+    return " ".join(glyphs(actions)) if of_primitives(actions) else numbers(actions)
 
 
 def _candidate(figure: Figure, place: Any, decision: Decision, index: int, scores: NDArray[np.float64]) -> None:
@@ -99,7 +99,7 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
 
 
 def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) -> None:
-    kept = kept_frames(len(rollout.frames))
+    kept = select_frames(len(rollout.frames))
     cells = place.subgridspec(1, len(kept), wspace=0.02)
     for column, k in enumerate(kept):
         axes = figure.add_subplot(cells[0, column])

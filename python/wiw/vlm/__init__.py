@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Vision-language models behind one interface: what is asked, what came back, and who is asked.
+"""Vision-language models behind one interface: requests, replies, and the clients that connect to models.
 
 client = wiw.vlm.connect("http://localhost:8000/v1", model="Qwen/Qwen2.5-VL-72B-Instruct-AWQ")
 (reply,) = client.ask([Request((user("What is in the red box?", image),), choices=("chair", "table"))])
@@ -12,17 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.vlm.base import Client, Message, Problem, Reply, Request, user
+from wiw.vlm.base import Client
+from wiw.vlm.messages import Message, Problem, Reply, Request, user
 
 __all__ = ["Client", "Message", "Problem", "Reply", "Request", "connect", "user"]
 
 
 def connect(spec: Any, **options: Any) -> Client:
-    """The client behind an address.
+    """Create the client for an address.
 
     Args:
         spec: "http://host:port/v1" (any OpenAI-compatible server), "transformers:PATH" (a local model), "replay:RUN"
-            (answers that a run has recorded), "mock" (draws), or a client, which is returned as it is.
+            (answers recorded by a run), "mock" (random answers), or a client, which is returned as it is.
         options: of that client's class, such as `model`, `cache`, `prices`, `top_logprobs`.
 
     Raises:

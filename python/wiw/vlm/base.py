@@ -1,179 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Questions to a vision-language model and what came of them; every client answers through `Client.ask`."""
+"""Clients of vision-language models; every one answers through `Client.ask`."""
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
+from wiw.vlm.cache import ReplyCache
+from wiw.vlm.conversation import Conversation
+from wiw.vlm.messages import Call, Completion, Reply, Request
 from wiw.vlm.prices import Prices
 
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-
-    from wiw.vlm.cache import ReplyCache
-
 FORMAT_VERSION = 1
-"""Of questions as they are put; part of their names, so that what was kept under another wording is not taken."""
-Kind = Literal["empty", "refusal", "truncated", "malformed", "schema", "huge", "no_option"]
-Part = str | NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class Message:
-    """One turn of a conversation; its parts are text and images uint8 [H, W, 3]."""
-
-    role: Literal["system", "user", "assistant"]
-    content: tuple[Part, ...]
-
-
-def user(*content: Part) -> Message:
-    """What the user says."""
-    return Message("user", content)
-
-
-@dataclass(frozen=True)
-class Request:
-    """One question: multiple choice where it has choices, JSON where it has a schema, free text else.
-
-    Raises:
-        ArgumentError: choices and a schema, fewer than two choices, or the same twice.
-    """
-
-    messages: tuple[Message, ...]
-    choices: tuple[str, ...] = ()
-    schema: type[BaseModel] | None = None
-    temperature: float = 0.0
-    seed: int = 0
-    max_tokens: int = 1024
-    """Of an answer that is no choice."""
-    tries: int = 3
-    """Times that it is put before an unusable answer is taken for the outcome."""
-
-    def __post_init__(self) -> None:
-        if self.choices and self.schema is not None:
-            raise ArgumentError("vlm: a request has choices or a schema, not both")
-        if len(self.choices) == 1 or len(set(self.choices)) != len(self.choices):
-            raise ArgumentError(f"vlm: expected at least two different choices, got {self.choices}")
-        if self.tries < 1:
-            raise ArgumentError(f"vlm: expected tries of at least 1, got {self.tries}")
-
-
-@dataclass(frozen=True)
-class Call:
-    """One completion as it is asked of a model; `Client.name_of` names it by its content."""
-
-    messages: tuple[Message, ...]
-    temperature: float
-    seed: int
-    max_tokens: int
-    labels: tuple[str, ...] = ()
-    """What the first token should be one of."""
-    logprobs: int = 0
-    """Likeliest first tokens to list with their log-probabilities."""
-    schema: Mapping[str, Any] | None = None
-    """JSON schema that the answer should fit."""
-
-
-@dataclass(frozen=True)
-class Completion:
-    """What a model gave."""
-
-    text: str
-    finish: str = "stop"
-    """"stop", "length", "refusal", "huge", or the server's own word."""
-    logprobs: tuple[tuple[str, float], ...] | None = None
-    """Likeliest first tokens; None where the server tells none."""
-    prompt_tokens: int = 0
-    completion_tokens: int = 0
-    retries: int = 0
-    """Times that it was asked for in vain."""
-
-    def to_json(self) -> dict[str, Any]:
-        """For caches and records; `from_json` is the way back."""
-        return {
-            "text": self.text,
-            "finish": self.finish,
-            "logprobs": None if self.logprobs is None else [list(pair) for pair in self.logprobs],
-            "prompt_tokens": self.prompt_tokens,
-            "completion_tokens": self.completion_tokens,
-        }
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> Completion:
-        """A completion that was written down."""
-        pairs = values["logprobs"]
-        logprobs = None if pairs is None else tuple((str(token), float(value)) for token, value in pairs)
-        tokens = int(values["prompt_tokens"]), int(values["completion_tokens"])
-        return cls(str(values["text"]), str(values["finish"]), logprobs, *tokens)
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Why an answer cannot be used."""
-
-    kind: Kind
-    detail: str
-    raw: str
-    """What the model said, cut off."""
-
-    def __str__(self) -> str:
-        return f"{self.kind}: {self.detail}"
-
-
-@dataclass(frozen=True)
-class Said:
-    """One completion of a conversation, for the record."""
-
-    call: str
-    """Name of what was asked."""
-    completion: Completion
-    used: bool
-
-
-@dataclass(frozen=True)
-class Reply:
-    """What came of a request: a usable answer, or a `problem`."""
-
-    text: str = ""
-    value: Any = None
-    """The validated object, where the request has a schema."""
-    probabilities: NDArray[np.float64] | None = None
-    """float64 [choices], sum 1, where the request has choices."""
-    mass: float | None = None
-    """Probability that the model gave to the choices before they were made to sum to 1; the share of votes that were
-    for one of them."""
-    by: str = ""
-    """"logprobs", or "votes" where the server tells no log-probabilities."""
-    repaired: bool = False
-    """Whether slips of JSON's syntax were mended."""
-    problem: Problem | None = None
-    said: tuple[Said, ...] = field(default=(), repr=False)
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether most of the probability went to something else than the choices."""
-        return self.mass is not None and self.mass < 0.5
+"""Version of the question format; part of a question's name, so that answers to another wording are not reused."""
 
 
 class Client(ABC):
-    """A model that is asked a batch of requests at a time.
+    """A model that answers batches of requests.
 
     Args:
-        cache: keeps what was answered, so that no question is paid for twice; None keeps nothing.
+        cache: stores answers, so that no question is paid for twice; None stores nothing.
         prices: US dollars per million tokens; a model that is not in the table has an unknown price.
-        top_logprobs: first tokens that the server lists at most; as many choices are asked at once, more in rounds.
-            0 for a server that refuses to list any: choices are voted on.
-        votes: samples that are counted where a server tells no log-probabilities.
+        top_logprobs: most first tokens that the server lists; as many choices are asked at once, more in rounds. 0 for
+            a server that refuses to list any: choices are voted on.
+        votes: samples to count where a server returns no log-probabilities.
     """
 
     def __init__(
@@ -196,33 +53,31 @@ class Client(ABC):
     @property
     @abstractmethod
     def model(self) -> str:
-        """The name under which the model is asked for."""
+        """The name under which the model is requested."""
 
     @property
     def manner(self) -> str:
-        """What answers depend on beside the model's name and the call; those that are kept are named by it, too."""
+        """What answers depend on beside the model's name and the call; part of the names of cached answers."""
         return ""
 
     @abstractmethod
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
-        """One completion a call, in their order.
+        """Return one completion per call, in order.
 
         Raises:
-            VlmError: the model cannot be reached, or did not answer in spite of retries.
+            VlmError: the model cannot be reached, or did not answer after retries.
         """
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity: what answers depend on beside the questions."""
+        """Return a JSON-able identity: what answers depend on beside the questions."""
         return {"model": self.model, "top_logprobs": self.top_logprobs, "votes": self.votes}
 
     def ask(self, requests: Sequence[Request]) -> list[Reply]:
-        """Puts all requests at once, and again what has to be put again, until each has its reply.
+        """Ask all requests at once, and repeat those that need it, until each has its reply.
 
         Raises:
             VlmError: see `complete`; nothing is answered then. An unusable answer is no error: it is in the reply.
         """
-        from wiw.vlm.conversation import Conversation
-
         talks = [Conversation(request, self.top_logprobs, self.votes) for request in requests]
         try:
             while waiting := [talk for talk in talks if talk.calls]:
@@ -230,13 +85,13 @@ class Client(ABC):
                 names = [self.name_of(call) for call in calls]
                 answers = iter(zip(names, self._complete(calls, names), strict=True))
                 for talk in waiting:
-                    talk.hear([next(answers) for _ in talk.calls])
+                    talk.receive([next(answers) for _ in talk.calls])
         finally:
             self._keep([talk.reply for talk in talks])
         return [talk.reply for talk in talks]
 
     def name_of(self, call: Call) -> str:
-        """Digest of the model and of everything in a call; images by their pixels."""
+        """Return a digest of the model and of everything in a call; images by their pixels."""
         digest = blake2b(digest_size=16)
         head = [FORMAT_VERSION, self.model, call.temperature, call.seed, call.max_tokens, call.labels, call.logprobs]
         digest.update(json.dumps([*head, call.schema], sort_keys=True).encode())
@@ -264,12 +119,12 @@ class Client(ABC):
         tokens = completion.prompt_tokens, completion.completion_tokens
         self.spent.update(vlm_calls=1, vlm_retries=completion.retries, vlm_tokens=sum(tokens))
         self.spent.update(vlm_input_tokens=tokens[0], vlm_output_tokens=tokens[1])
-        usd = self.prices.of(self.model, *tokens)
+        usd = self.prices.compute_cost(self.model, *tokens)
         if usd is not None:
             self.spent["vlm_usd"] += usd  # type: ignore[assignment]  # money comes in fractions
 
     def _keep(self, replies: Sequence[Reply]) -> None:
-        """Keeps what was of use; what was not is asked for anew the next time."""
+        """Cache the answers that were used; unusable ones are requested again next time."""
         if self.cache is not None:
             said = [each for reply in replies for each in reply.said if each.used]
             self.cache.put({self._kept_as(each.call): each.completion for each in said})

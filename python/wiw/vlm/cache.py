@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers on disk, so that the same question is put to a model, and paid for, once.
+"""Answers on disk, so that no question to a model is asked, and paid for, twice.
 
-One SQLite file in WAL mode, which any number of processes may share, as any number of threads may a `ReplyCache`.
-Answers are named by all that they depend on (`Client.name_of`, `Client.manner`). When it outgrows its budget, what was
-not used for longest goes first.
+One SQLite file in WAL mode, which any number of processes may share, and a `ReplyCache` any number of threads. Answers
+are named by everything that they depend on (`Client.name_of`, `Client.manner`). When the file outgrows its budget,
+the least recently used answers are deleted first.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
-from wiw.vlm.base import Completion
+from wiw.vlm.messages import Completion
 
 _log = logging.getLogger("wiw.vlm")
 BUDGET_GB = 1.0
-"""Most gigabytes of answers unless the user says otherwise; an answer takes about a kilobyte."""
+"""Default limit of the cache in gigabytes; an answer takes about a kilobyte."""
 _SCHEMA = "CREATE TABLE IF NOT EXISTS reply (name TEXT PRIMARY KEY, data TEXT NOT NULL, used REAL NOT NULL)"
 
 
 def default_folder() -> Path:
-    """Where answers are kept: `$WIW_CACHE/replies`, or `~/.cache/wiw/replies`. Deleting it is always safe."""
+    """Return the default folder: `$WIW_CACHE/replies`, or `~/.cache/wiw/replies`. It can be deleted at any time."""
     root = os.environ.get("WIW_CACHE")
     return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "replies"
 
 
-def reply_cache(where: str | Path) -> ReplyCache | None:
-    """The cache of a folder; "auto" for the default one, "off" for none."""
+def open_reply_cache(where: str | Path) -> ReplyCache | None:
+    """Open the cache in a folder; "auto" for the default one, "off" for none."""
     return None if str(where) == "off" else ReplyCache(default_folder() if str(where) == "auto" else where)
 
 
 class ReplyCache:
-    """A folder of answers. Where it cannot be read or written a warning says so, and models are asked.
+    """A folder of answers. Where it cannot be read or written, it logs a warning, and models are asked.
 
     Args:
-        folder: where; made when the first answer is kept.
-        budget_gb: most gigabytes that answers may take.
+        folder: where; created when the first answer is stored.
+        budget_gb: limit in gigabytes.
     """
 
     def __init__(self, folder: str | Path, budget_gb: float = BUDGET_GB) -> None:
@@ -59,7 +59,7 @@ class ReplyCache:
         return ReplyCache, (self.folder, self.budget_gb)
 
     def get(self, name: str) -> Completion | None:
-        """The answer of that name; None where there is none."""
+        """Return the answer of that name; None where there is none."""
         if self._broken or not (self.folder / "replies.sqlite").exists():
             return None
         try:
@@ -76,7 +76,7 @@ class ReplyCache:
         return None
 
     def put(self, answers: Mapping[str, Completion]) -> None:
-        """Keeps answers by name."""
+        """Store answers by name."""
         if self._broken or not answers:
             return
         try:
@@ -98,7 +98,7 @@ class ReplyCache:
         return self._connection
 
     def _trim(self, connection: sqlite3.Connection) -> None:
-        """Makes the answers a tenth smaller than their budget where they have outgrown it."""
+        """Reduce the cache to nine tenths of its budget where it has outgrown it."""
         budget = self.budget_gb * 2**30
         total = connection.execute("SELECT total(length(data)) FROM reply").fetchone()[0]
         if total <= budget:

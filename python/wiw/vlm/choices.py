@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multiple choice: options are labelled with letters, and the probability of the first token is the belief."""
+"""Multiple choice: options are labelled with letters, and the probabilities of the first token are the answer."""
 
 from __future__ import annotations
 
@@ -11,49 +11,52 @@ from string import ascii_uppercase
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.vlm.base import Message
+from wiw.vlm.messages import Message
 
-AROUND = " \t\r\n\u2581\u0120\u010a().:*\"'`[]"
-"""What tokenizers and models put around a letter; the special ones are sentencepiece's and byte-level BPE's spaces."""
+LETTER_CONTEXT = " \t\r\n\u2581\u0120\u010a().:*\"'`[]"
+"""Characters that tokenizers and models put around a letter; the special ones are the spaces of sentencepiece and
+byte-level BPE.
+"""
 _VOTE = re.compile(
     r"\W*(?:(?:the\s+)?(?:correct\s+)?(?:answer|option)(?:\s+is)?\s*:?\s*)?[(\[*\"'`]*([A-Z])\s*(?:$|[.):,;*\]\n])",
     re.IGNORECASE,
 )
-"""A letter that stands by itself; "A chair" and "I'm sorry" begin with words."""
+"""Matches a letter that stands by itself; "A chair" and "I'm sorry" begin with words."""
 _VOTE_LENGTH = 64
-"""Characters in which a vote is looked for."""
+"""Characters searched for a vote."""
 
 
-def labels_of(count: int) -> tuple[str, ...]:
-    """The first letters."""
+def get_labels(count: int) -> tuple[str, ...]:
+    """Return the first letters."""
     return tuple(ascii_uppercase[:count])
 
 
-def asked(messages: Sequence[Message], options: Sequence[str]) -> tuple[Message, ...]:
-    """The messages with the options, each behind its letter, at the end of the last one."""
-    lines = [f"{label}. {option}" for label, option in zip(labels_of(len(options)), options, strict=True)]
+def append_options(messages: Sequence[Message], options: Sequence[str]) -> tuple[Message, ...]:
+    """Append the options, each after its letter, to the last message."""
+    lines = [f"{label}. {option}" for label, option in zip(get_labels(len(options)), options, strict=True)]
     text = "\n".join(["", "Options:", *lines, "Answer with the letter of one option and nothing else."])
     last = messages[-1]
     return (*messages[:-1], Message(last.role, (*last.content, text)))
 
 
-def chunks(count: int, most: int) -> list[list[int]]:
-    """Indices of options in as few groups of at most `most` as there can be, nearly equal in size."""
+def split_options(count: int, most: int) -> list[list[int]]:
+    """Split the indices of options into as few groups of at most `most` as possible, nearly equal in size."""
     groups = math.ceil(count / most)
     return [part.tolist() for part in np.array_split(np.arange(count), groups)]
 
 
-def from_logprobs(
+def read_logprobs(
     listed: Sequence[tuple[str, float]], labels: Sequence[str]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """Probabilities of the labels and the mass that the model gave them; None where none of them is listed.
+    """Return the labels' probabilities and the mass that the model gave them; None where none of them is listed.
 
-    Variants of a label ("A", " A", "(A") are one. A label that is not listed counts as much as it may at most: as the
-    least likely token that is listed, or as what all of these leave over.
+    Variants of a label ("A", " A", "(A") are one. A label that is not listed gets the most that it can have: as much as
+    the least likely listed token, or as what all of these leave over.
     """
     listed = [(token, min(value, 0.0)) for token, value in listed if not math.isnan(value)]
     found = [
-        [value for token, value in listed if token.strip(AROUND) == label and value > -math.inf] for label in labels
+        [value for token, value in listed if token.strip(LETTER_CONTEXT) == label and value > -math.inf]
+        for label in labels
     ]
     if not any(found):
         return None
@@ -65,30 +68,32 @@ def from_logprobs(
     return weights / weights.sum(), min(mass, 1.0)
 
 
-def from_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np.float64], float] | None:
-    """Shares of the samples that begin with each label, and the share that begins with any; None where none does."""
-    votes = [vote for vote in (vote_of(text, labels) for text in texts) if vote is not None]
+def count_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np.float64], float] | None:
+    """Return the shares of the samples that begin with each label, and with any; None where none does."""
+    votes = [vote for vote in (parse_vote(text, labels) for text in texts) if vote is not None]
     if not votes:
         return None
     return np.bincount(votes, minlength=len(labels)) / len(votes), len(votes) / len(texts)
 
 
-def vote_of(text: str, labels: Sequence[str]) -> int | None:
-    """The label that a written answer begins with, e.g. "B", "(b) chair", "The answer is B."; None for other text."""
+def parse_vote(text: str, labels: Sequence[str]) -> int | None:
+    """Return the label that a written answer begins with, e.g. "B", "(b) chair", "The answer is B."; None for other
+    text.
+    """
     match = _VOTE.match(text[:_VOTE_LENGTH])
     letter = match.group(1).upper() if match else ""
     return labels.index(letter) if letter in labels else None
 
 
-def united(
+def combine_groups(
     groups: Sequence[Sequence[int]],
     first: Sequence[NDArray[np.float64]],
     finalists: Sequence[int],
     final: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """One distribution over all options from groups that were asked apart and from a final among their best.
+    """Combine groups that were asked separately, and a final among their best, into one distribution over all options.
 
-    A finalist weighs what the final gives it; the others of a group keep their odds against its finalists.
+    A finalist has the weight of the final; the others of a group keep their odds relative to its finalists.
     """
     weights = np.zeros(sum(map(len, groups)))
     weights[list(finalists)] = final

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From one request to its reply: what to ask next, until the answer can be used or the tries are over."""
+"""The course of one request: what to ask next, until the answer is usable or the tries are used up."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.vlm import choices, structured
-from wiw.vlm.base import Call, Completion, Problem, Reply, Request, Said
+from wiw.vlm.messages import Call, Completion, Problem, Reply, Request, Said
 
-AGAIN = 0.7
-"""Least temperature at which a question is put again: at 0 the same answer would come."""
+RETRY_TEMPERATURE = 0.7
+"""Least temperature of a repeated question: at 0 the same answer would come."""
 VOTE_TOKENS = 8
 Talk = Generator[list[Call], list[Completion], Reply]
 
 
 class Conversation:
-    """One request on its way; the client completes `calls` and tells by `hear`, until there are none."""
+    """One request in progress; the client completes `calls` and passes them to `receive`, until there are none."""
 
     def __init__(self, request: Request, top_logprobs: int, votes: int) -> None:
-        self._talk = _chosen(request, top_logprobs, votes) if request.choices else _written(request)
+        self._talk = _ask_for_choice(request, top_logprobs, votes) if request.choices else _ask_for_text(request)
         self._said: list[tuple[str, Completion]] = []
         self.calls: list[Call] = next(self._talk)
         self.reply = Reply()
 
-    def hear(self, answers: Sequence[tuple[str, Completion]]) -> None:
-        """Takes in (name, completion) of each of the calls."""
+    def receive(self, answers: Sequence[tuple[str, Completion]]) -> None:
+        """Take (name, completion) for each of the calls."""
         self._said += answers
         try:
             self.calls = self._talk.send([completion for _, completion in answers])
@@ -45,42 +45,42 @@ class Conversation:
             self.calls, self.reply = [], replace(reply, said=said)
 
 
-def _written(request: Request) -> Talk:
-    """Free text, or JSON."""
+def _ask_for_text(request: Request) -> Talk:
+    """Ask for free text, or JSON."""
     found: Reply | None = None
     for attempt in range(request.tries):
-        (completion,) = yield [_call(request, attempt)]
-        found = _judged(request, completion)
+        (completion,) = yield [_make_call(request, attempt)]
+        found = _read_reply(request, completion)
         if found.problem is None:
             return found
     assert found is not None
     return found
 
 
-def _judged(request: Request, completion: Completion) -> Reply:
+def _read_reply(request: Request, completion: Completion) -> Reply:
     if request.schema is None:
-        return Reply(completion.text, problem=structured.unfit(completion))
-    outcome = structured.parsed(completion, request.schema)
+        return Reply(completion.text, problem=structured.find_problem(completion))
+    outcome = structured.parse_object(completion, request.schema)
     if isinstance(outcome, Problem):
         return Reply(completion.text, problem=outcome)
     value, repaired = outcome
     return Reply(completion.text, value, repaired=repaired)
 
 
-def _call(request: Request, attempt: int) -> Call:
-    temperature = request.temperature if attempt == 0 else max(request.temperature, AGAIN)
+def _make_call(request: Request, attempt: int) -> Call:
+    temperature = request.temperature if attempt == 0 else max(request.temperature, RETRY_TEMPERATURE)
     schema = None if request.schema is None else request.schema.model_json_schema()
-    return Call(request.messages, temperature, _seed(request.seed, attempt), request.max_tokens, schema=schema)
+    return Call(request.messages, temperature, _derive_seed(request.seed, attempt), request.max_tokens, schema=schema)
 
 
-def _seed(seed: int, attempt: int) -> int:
-    """32 bits, so that every server takes them."""
+def _derive_seed(seed: int, attempt: int) -> int:
+    """Derive a seed of at most 31 bits, so that every server accepts it."""
     return int.from_bytes(blake2b(f"{seed} {attempt}".encode(), digest_size=4).digest(), "little") >> 1
 
 
-def _chosen(request: Request, listed: int, votes: int) -> Talk:
-    """Multiple choice: text and mass of the last round, where the best choices meet; "votes" if any round took them."""
-    found = yield from _elected(request, range(len(request.choices)), listed, votes)
+def _ask_for_choice(request: Request, listed: int, votes: int) -> Talk:
+    """Ask a multiple-choice question; text and mass are the last round's; "votes" if any round used them."""
+    found = yield from _ask_in_rounds(request, range(len(request.choices)), listed, votes)
     if isinstance(found, Reply):
         return found
     probabilities, rounds = found
@@ -88,74 +88,76 @@ def _chosen(request: Request, listed: int, votes: int) -> Talk:
     return Reply(rounds[-1].text, probabilities=probabilities, mass=rounds[-1].mass, by=by)
 
 
-def _elected(
+def _ask_in_rounds(
     request: Request, options: Sequence[int], listed: int, votes: int
 ) -> Generator[list[Call], list[Completion], tuple[NDArray[np.float64], list[Any]] | Reply]:
-    """Probabilities of some of the choices, and all that was asked for them; or an unusable reply.
+    """Return the probabilities of some of the choices, and all replies on the way; or an unusable reply.
 
-    More of them than a server lists tokens are asked about in groups, and the best of each group in a final.
+    More choices than a server lists tokens are asked about in groups, and the best of each group in a final.
     """
     most = listed or len(ascii_uppercase)
-    groups = choices.chunks(len(options), most)
-    first = yield from _ballots(request, [[options[i] for i in group] for group in groups], listed, votes)
+    groups = choices.split_options(len(options), most)
+    first = yield from _ask_groups(request, [[options[i] for i in group] for group in groups], listed, votes)
     if isinstance(first, Reply):
         return first
     if len(groups) == 1:
         return first[0].probabilities, first
     best = [np.argsort(-reply.probabilities, kind="stable")[: max(1, most // len(groups))] for reply in first]
     finalists = sorted(group[i] for group, order in zip(groups, best, strict=True) for i in order)
-    final = yield from _elected(request, [options[i] for i in finalists], listed, votes)
+    final = yield from _ask_in_rounds(request, [options[i] for i in finalists], listed, votes)
     if isinstance(final, Reply):
         return final
-    together = choices.united(groups, [reply.probabilities for reply in first], finalists, final[0])
+    together = choices.combine_groups(groups, [reply.probabilities for reply in first], finalists, final[0])
     return together, [*first, *final[1]]
 
 
-def _ballots(
+def _ask_groups(
     request: Request, groups: Sequence[Sequence[int]], listed: int, votes: int
 ) -> Generator[list[Call], list[Completion], list[Any] | Reply]:
-    """What a model chooses in each group of options, or the unusable reply of the first group that has one."""
+    """Return the model's choice in each group of options, or the unusable reply of the first group that has one."""
     options = [[request.choices[i] for i in group] for group in groups]
-    messages = [choices.asked(request.messages, names) for names in options]
-    labels = [choices.labels_of(len(names)) for names in options]
-    seed = _seed(request.seed, 0)
+    messages = [choices.append_options(request.messages, names) for names in options]
+    labels = [choices.get_labels(len(names)) for names in options]
+    seed = _derive_seed(request.seed, 0)
     calls = [Call(said, 0.0, seed, 1, own, listed) for said, own in zip(messages, labels, strict=True)]
     found: list[Any] = [None for _ in calls]
     if listed:
         completions = yield calls
         found = [
-            _counted(choices.from_logprobs(_listed(completion), own), completion, "logprobs")
+            _make_reply(choices.read_logprobs(_list_logprobs(completion), own), completion, "logprobs")
             for completion, own in zip(completions, labels, strict=True)
         ]
     open_ = [place for place, reply in enumerate(found) if reply is None]
     samples = [
-        replace(calls[place], temperature=1.0, seed=_seed(request.seed, 1 + vote), max_tokens=VOTE_TOKENS, logprobs=0)
+        replace(
+            calls[place], temperature=1.0, seed=_derive_seed(request.seed, 1 + vote), max_tokens=VOTE_TOKENS, logprobs=0
+        )
         for place in open_
         for vote in range(votes)
     ]
     said = iter((yield samples) if samples else [])
     for place in open_:
         texts = [next(said) for _ in range(votes)]
-        counted = choices.from_votes([_text(each) for each in texts], labels[place])
-        found[place] = _counted(counted, texts[0], "votes")
+        counted = choices.count_votes([_read_vote(each) for each in texts], labels[place])
+        found[place] = _make_reply(counted, texts[0], "votes")
         if found[place] is None:
-            refused = structured.unfit(texts[0])
+            refused = structured.find_problem(texts[0])
             detail = f"none of {votes} answers begins with one of the {len(labels[place])} letters"
-            return Reply(texts[0].text, problem=refused or structured.problem("no_option", detail, texts[0]))
+            return Reply(texts[0].text, problem=refused or structured.make_problem("no_option", detail, texts[0]))
     return found
 
 
-def _listed(completion: Completion) -> tuple[tuple[str, float], ...]:
-    """What counts as listed tokens: none of an answer that was withheld."""
+def _list_logprobs(completion: Completion) -> tuple[tuple[str, float], ...]:
+    """Return the listed tokens: none of an answer that was withheld."""
     return () if completion.finish in structured.REFUSED else completion.logprobs or ()
 
 
-def _text(completion: Completion) -> str:
-    """What counts as a vote."""
-    return "" if structured.unfit(completion) else completion.text
+def _read_vote(completion: Completion) -> str:
+    """Return the text that counts as a vote."""
+    return "" if structured.find_problem(completion) else completion.text
 
 
-def _counted(outcome: tuple[NDArray[np.float64], float] | None, completion: Completion, by: str) -> Reply | None:
+def _make_reply(outcome: tuple[NDArray[np.float64], float] | None, completion: Completion, by: str) -> Reply | None:
     if outcome is None:
         return None
     probabilities, mass = outcome

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images as data URIs, the form that OpenAI-compatible servers take them in."""
+"""Images as data URIs, the form that OpenAI-compatible servers accept."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ JPEG_QUALITY = 95
 
 
 def to_data_uri(image: NDArray[np.uint8], kind: ImageFormat = "png") -> str:
-    """An image uint8 [H, W, 3] as "data:image/png;base64,...".
+    """Encode an image uint8 [H, W, 3] as "data:image/png;base64,...".
 
     Raises:
         ArgumentError: another shape or type.
@@ -31,7 +31,7 @@ def to_data_uri(image: NDArray[np.uint8], kind: ImageFormat = "png") -> str:
 
 
 def from_data_uri(uri: str) -> NDArray[np.uint8]:
-    """The image uint8 [H, W, 3] in a data URI.
+    """Decode the image uint8 [H, W, 3] in a data URI.
 
     Raises:
         ArgumentError: something else, or an image that cannot be read.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A model that draws its answers, for tests and for trying things out: well-formed, and blind."""
+"""A mock model for tests and first trials: well-formed answers, without looking at the images."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from wiw.vlm.base import Call, Client, Completion
-from wiw.vlm.instances import instance
+from wiw.vlm.base import Client
+from wiw.vlm.instances import generate_instance
+from wiw.vlm.messages import Call, Completion
 
 Script = Callable[[Call], "str | Mapping[str, float] | Completion"]
 WORDS = ("a", "door", "is", "ahead", "on", "the", "left", "right", "and", "clear")
 
 
 class MockClient(Client):
-    """Answers by a script, or by draws from the question's name and seed: the same question has the same answer.
+    """Answers by a script, or randomly by the question's name and seed: the same question has the same answer.
 
     Args:
-        script: what a call is answered with: text, a probability for each first token, or a whole completion.
+        script: returns the answer to a call: text, a probability for each first token, or a whole completion.
         model: its name.
         options: see `Client`.
     """
@@ -27,7 +28,7 @@ class MockClient(Client):
     def __init__(self, script: Script | None = None, model: str = "mock", **options: Any) -> None:
         super().__init__(**options)
         self.script, self._model = script, model
-        self.asked: list[Call] = []
+        self.calls: list[Call] = []
         """All calls so far."""
 
     @property
@@ -36,9 +37,9 @@ class MockClient(Client):
         return self._model
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
-        """What the script says, or a draw."""
-        self.asked += calls
-        return [completion_of(self._draw(call) if self.script is None else self.script(call), call) for call in calls]
+        """Return the script's answers, or random ones."""
+        self.calls += calls
+        return [to_completion(self._draw(call) if self.script is None else self.script(call), call) for call in calls]
 
     def _draw(self, call: Call) -> str | dict[str, float]:
         random = np.random.default_rng(int(self.name_of(call), 16))
@@ -46,12 +47,12 @@ class MockClient(Client):
             labels = call.labels or ("A", "B")  # what is asked about letters without naming them has two at least
             return dict(zip(labels, random.dirichlet(np.ones(len(labels))).tolist(), strict=True))
         if call.schema is not None:
-            return instance(call.schema, lambda _, options: int(random.integers(len(options))))
+            return generate_instance(call.schema, lambda _, options: int(random.integers(len(options))))
         return " ".join(WORDS[k] for k in random.integers(len(WORDS), size=6))
 
 
-def completion_of(said: str | Mapping[str, float] | Completion, call: Call) -> Completion:
-    """A script's word as a completion, with its tokens counted roughly: four characters, or a 28 x 28 patch, each."""
+def to_completion(said: str | Mapping[str, float] | Completion, call: Call) -> Completion:
+    """Convert a script's answer to a completion; tokens are estimated: four characters, or a 28 x 28 patch, each."""
     if isinstance(said, Completion):
         return said
     parts = [part for message in call.messages for part in message.content]

@@ -16,8 +16,9 @@ from threading import Thread
 from typing import Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, VlmError
-from wiw.vlm.base import Call, Client, Completion, Message
+from wiw.vlm.base import Client
 from wiw.vlm.images import ImageFormat, to_data_uri
+from wiw.vlm.messages import Call, Completion, Message
 
 Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")
@@ -28,6 +29,10 @@ MOST_OF_AN_ERROR = 1 << 16
 LONGEST_WAIT = 60.0
 """Seconds that are waited before a request is sent again, however long the server asks for."""
 REFUSED_LOGPROBS = "; top_logprobs= says how many first tokens the server lists, 0 has choices voted on instead"
+NOBODY_THERE = (
+    ": no server answers there; start one (docs/vlm.md), name another with --vlm URL, or give --vlm mock to go through "
+    "the motions without a model"
+)
 _PASSING = (408, 409, 425, 429)
 """Client errors that may pass; so may all of the server's, 500 and above."""
 
@@ -212,6 +217,7 @@ class OpenAIClient(Client):
             if not passing or retries.count + 1 >= self.attempts:
                 times = f"{retries.count + 1} tries" if retries.count else "1 try"
                 hint = REFUSED_LOGPROBS if kind == "refused" and "logprob" in said else ""
+                hint = NOBODY_THERE if said.startswith("APIConnectionError") else hint
                 raise VlmError(f"{self.base_url}: {said} ({times}){hint}", kind)
             time.sleep(min(LONGEST_WAIT, retries.pause() if wait is None else wait))
             retries.count += 1

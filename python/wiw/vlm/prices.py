@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tokens cost, as far as the user says."""
+"""Prices of tokens, as far as the user states them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ class Prices:
 
     table: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
-    def of(self, model: str, read: int, written: int) -> float | None:
-        """US dollars; None where the price is not known."""
+    def compute_cost(self, model: str, read: int, written: int) -> float | None:
+        """Return the cost in US dollars; None where the price is unknown."""
         price = self.table.get(model)
         return None if price is None else (price[0] * read + price[1] * written) / 1e6
 
     @classmethod
     def load(cls, path: str | Path) -> Prices:
-        """From a YAML file of lines `model: [read, written]`.
+        """Read a YAML file of lines `model: [read, written]`.
 
         Raises:
             FileError: it cannot be read, or holds something else.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers that a run has recorded, given again to the same questions."""
+"""Replay of answers that a run has recorded."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import FileError, VlmError
-from wiw.vlm.base import Call, Client, Completion
+from wiw.vlm.base import Client
+from wiw.vlm.messages import Call, Completion
 
 
 class ReplayClient(Client):
-    """Stands in for the model of a run: what was asked then has its answer, and nothing else has.
+    """Stands in for the model of a run: questions asked then get their recorded answer, and others an error.
 
     Args:
         run: the run's folder, or its run.sqlite.
-        model: the model that was asked; None means the only one that the run has recorded.
-        options: see `Client`; those of other clients are taken, and change nothing.
+        model: the recorded model; None means the only one in the run.
+        options: see `Client`; those of other clients are accepted and ignored.
 
     Raises:
-        FileError: no run there, or one that has recorded no answers, or those of several models and none is named.
+        FileError: no run there, or one without recorded answers, or with several models and none is named.
     """
 
     def __init__(self, run: str | Path, model: str | None = None, **options: Any) -> None:
@@ -31,21 +32,21 @@ class ReplayClient(Client):
         super().__init__(**{name: value for name, value in options.items() if name in known})
         path = Path(run).expanduser()
         self.path = path if path.suffix == ".sqlite" else path / "run.sqlite"
-        self._answers, models = _recorded(self.path, model)
+        self._answers, models = _read_answers(self.path, model)
         if not models or (model is None and len(models) > 1):
             raise FileError(f"{self.path}: expected answers of one model, got {', '.join(sorted(models)) or 'none'}")
         self._model = model or models.pop()
 
     @property
     def model(self) -> str:
-        """The model whose answers these are."""
+        """The model that gave these answers."""
         return self._model
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
-        """The recorded answers.
+        """Return the recorded answers.
 
         Raises:
-            VlmError: a question that the run has not put.
+            VlmError: a question that the run did not ask.
         """
         names = [self.name_of(call) for call in calls]
         for name, call in zip(names, calls, strict=True):
@@ -55,7 +56,7 @@ class ReplayClient(Client):
         return [self._answers[name] for name in names]
 
 
-def _recorded(path: Path, model: str | None) -> tuple[dict[str, Completion], set[str]]:
+def _read_answers(path: Path, model: str | None) -> tuple[dict[str, Completion], set[str]]:
     if not path.is_file():
         raise FileError(f"no run at {path}: expected a folder with run.sqlite in it")
     answers: dict[str, Completion] = {}

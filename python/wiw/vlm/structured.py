@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON answers: found in what a model wrote, mended where only the syntax slipped, and held to a schema."""
+"""JSON answers: extracted from a model's text, repaired where only the syntax is wrong, and validated by a schema."""
 
 from __future__ import annotations
 
@@ -8,64 +8,66 @@ import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from wiw.vlm.base import Completion, Kind, Problem
+from wiw.vlm.messages import Completion, Kind, Problem
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-MOST = 1 << 16
-"""Characters of an answer; longer ones are not looked into."""
-RAW = 500
-"""Characters of an unusable answer that are kept."""
+MAX_CHARACTERS = 1 << 16
+"""Longer answers are rejected unread."""
+KEPT_CHARACTERS = 500
+"""Characters of an unusable answer that are recorded."""
 REFUSED = ("refusal", "content_filter")
 """Ends of an answer that the model or its server withheld."""
 _SYNTAX = re.compile(r"""\\["'\\/bfnrt]|[\s"'`,:;\[\]{}\u2018\u2019\u201c\u201d]""")
 _REFUSALS = ("i'm sorry", "i am sorry", "i can't", "i cannot", "sorry,", "i'm unable", "i am unable", "as an ai")
 
 
-def problem(kind: Kind, detail: str, completion: Completion) -> Problem:
-    """Why a completion cannot be used."""
-    return Problem(kind, detail, completion.text[:RAW])
+def make_problem(kind: Kind, detail: str, completion: Completion) -> Problem:
+    """Describe why a completion cannot be used."""
+    return Problem(kind, detail, completion.text[:KEPT_CHARACTERS])
 
 
-def unfit(completion: Completion) -> Problem | None:
-    """What is wrong with a completion whatever was asked for; None where it may be looked into."""
-    if completion.finish == "huge" or len(completion.text) > MOST:
-        return problem("huge", f"more than {MOST} characters", completion)
+def find_problem(completion: Completion) -> Problem | None:
+    """Return what makes a completion unusable for any request; None where it may be parsed."""
+    if completion.finish == "huge" or len(completion.text) > MAX_CHARACTERS:
+        return make_problem("huge", f"more than {MAX_CHARACTERS} characters", completion)
     if completion.finish in REFUSED:
-        return problem("refusal", f"the model refused ({completion.finish})", completion)
+        return make_problem("refusal", f"the model refused ({completion.finish})", completion)
     if not completion.text.strip():
-        return problem("empty", "no text", completion)
+        return make_problem("empty", "no text", completion)
     return None
 
 
-def parsed(completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
-    """The object that a completion holds and whether its syntax had to be mended, or why there is none."""
+def parse_object(completion: Completion, schema: type[BaseModel]) -> tuple[Any, bool] | Problem:
+    """Return the object in a completion and whether its syntax was repaired, or why there is none."""
     from pydantic import ValidationError
 
-    found = unfit(completion)
+    found = find_problem(completion)
     if found is not None:
         return found
-    text, whole = json_object(completion.text)
+    text, whole = find_json_object(completion.text)
     if not text:
         refused = completion.text.strip().lower().replace("\u2019", "'").startswith(_REFUSALS)
         kind: Kind = "refusal" if refused else "malformed"
-        return problem(kind, "no JSON object", completion)
+        return make_problem(kind, "no JSON object", completion)
     if not whole:
-        return problem("truncated", f"the JSON object does not end (finish: {completion.finish})", completion)
+        return make_problem("truncated", f"the JSON object does not end (finish: {completion.finish})", completion)
     try:
-        values, repaired = _loaded(text)
+        values, repaired = _load_json(text)
         return schema.model_validate(values), repaired
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"]) or "the object"
-        return problem("schema", f"{place}: {first['msg']}", completion)
+        return make_problem("schema", f"{place}: {first['msg']}", completion)
     except (ValueError, RecursionError) as error:
-        return problem("malformed", str(error)[:200] or type(error).__name__, completion)
+        return make_problem("malformed", str(error)[:200] or type(error).__name__, completion)
 
 
-def json_object(text: str) -> tuple[str, bool]:
-    """The first {...} in a text, and whether it ends; braces in strings do not count. Empty where there is none."""
+def find_json_object(text: str) -> tuple[str, bool]:
+    """Return the first {...} in a text, and whether it is complete; braces in strings do not count. Empty where there
+    is none.
+    """
     begin = text.find("{")
     if begin < 0:
         return "", False
@@ -89,10 +91,10 @@ def json_object(text: str) -> tuple[str, bool]:
     return text[begin:], False
 
 
-def _loaded(text: str) -> tuple[Any, bool]:
-    """The object, and whether slips of its syntax were mended: quotes, commas and the like, never anything it says.
+def _load_json(text: str) -> tuple[Any, bool]:
+    """Parse the object; report whether its syntax was repaired: quotes, commas and the like, never its content.
 
-    Raises ValueError where it cannot be read so.
+    Raises ValueError where that is impossible.
     """
     try:
         return json.loads(text), False
@@ -100,24 +102,24 @@ def _loaded(text: str) -> tuple[Any, bool]:
         from json_repair import repair_json
 
         mended = repair_json(text, return_objects=True)
-        if not isinstance(mended, dict) or _said(text) != _said("".join(_leaves(mended))):
+        if not isinstance(mended, dict) or _strip_syntax(text) != _strip_syntax("".join(_iterate_leaves(mended))):
             raise error
         return mended, True
 
 
-def _said(text: str) -> str:
-    """A text without JSON's syntax."""
+def _strip_syntax(text: str) -> str:
+    """Return a text without JSON's syntax."""
     return _SYNTAX.sub("", text)
 
 
-def _leaves(value: Any) -> Iterator[str]:
-    """Keys and values in their order, as text."""
+def _iterate_leaves(value: Any) -> Iterator[str]:
+    """Yield keys and values in order, as text."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield str(name)
-            yield from _leaves(inner)
+            yield from _iterate_leaves(inner)
     elif isinstance(value, list):
         for inner in value:
-            yield from _leaves(inner)
+            yield from _iterate_leaves(inner)
     else:
         yield value if isinstance(value, str) else json.dumps(value)

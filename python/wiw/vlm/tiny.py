@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A vision-language model with random weights that is made in a second: it says nonsense through the real classes."""
+"""A vision-language model with random weights, built in a second: nonsense through the real classes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from wiw.errors import DependencyError
 
-NEEDED = "a local vision-language model needs torch and transformers: pip install 'wiw[torch,vlm]'"
+MISSING_PACKAGES = "a local vision-language model needs torch and transformers: pip install 'wiw[torch,vlm]'"
 TEMPLATE = (
     "{% for message in messages %}{{ message['role'] }}: {% for part in message['content'] %}"
     "{% if part['type'] == 'image' %}<image>{% else %}{{ part['text'] }}{% endif %}{% endfor %}\n{% endfor %}"
@@ -17,7 +17,7 @@ WORDS = ("the", "chair", "table", "door", "forward", "left", "right", "turn", "t
 
 
 def make_tiny(folder: str | Path, seed: int = 0) -> Path:
-    """Writes a LLaVA of 30 thousand random parameters with its processor, as `from_pretrained` takes it.
+    """Write a LLaVA of 30 thousand random parameters with its processor, as `from_pretrained` expects.
 
     Images become 49 tokens each; the tokenizer knows printable ASCII and a few words.
 
@@ -29,7 +29,7 @@ def make_tiny(folder: str | Path, seed: int = 0) -> Path:
         import transformers as hf
         from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
     except ImportError as error:
-        raise DependencyError(f"{NEEDED}: {error}") from None
+        raise DependencyError(f"{MISSING_PACKAGES}: {error}") from None
     pieces = ["<unk>", "<s>", "</s>", "<pad>", "\u2581", *(chr(code) for code in range(33, 127)), "\n"]
     pieces += [f"\u2581{word}" for word in WORDS] + [f"\u2581{letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"]
     tokenizer = hf.LlamaTokenizerFast(vocab={piece: i for i, piece in enumerate(pieces)}, merges=[])

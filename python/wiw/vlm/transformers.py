@@ -11,20 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import DependencyError, WeightsError
-from wiw.vlm.base import Call, Client, Completion, Message
-from wiw.vlm.choices import AROUND
-from wiw.vlm.instances import instance
-from wiw.vlm.tiny import NEEDED
+from wiw.vlm.base import Client
+from wiw.vlm.choices import LETTER_CONTEXT
+from wiw.vlm.instances import generate_instance
+from wiw.vlm.messages import Call, Completion, Message
+from wiw.vlm.tiny import MISSING_PACKAGES
 
-LISTED = 256
-"""Likeliest first tokens that are looked at."""
+MAX_FIRST_TOKENS = 256
+"""Number of likeliest first tokens that are considered."""
 
 
 class TransformersClient(Client):
-    """Asks a local image-text-to-text model; requests one after the other.
+    """Queries a local image-text-to-text model, one request after the other.
 
-    Multiple choice reads the scores of the first token. Objects that fit a schema are made by letting the model choose
-    between the schema's ways to go on, so that they are always well-formed.
+    Multiple choice reads the scores of the first token. Objects that match a schema are built by letting the model
+    choose between the schema's continuations, so that they are always well-formed.
 
     Args:
         path: a folder or hub name that `AutoModelForImageTextToText.from_pretrained` takes.
@@ -46,7 +47,7 @@ class TransformersClient(Client):
             import torch
             import transformers as hf
         except ImportError as error:
-            raise DependencyError(f"{NEEDED}: {error}") from None
+            raise DependencyError(f"{MISSING_PACKAGES}: {error}") from None
         self.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         try:
             self._processor = hf.AutoProcessor.from_pretrained(self.path)
@@ -59,7 +60,7 @@ class TransformersClient(Client):
         self._network = network.to(self.device).eval()
 
     def __reduce__(self) -> Any:
-        return _remade, (self.path, self._given)
+        return _recreate_client, (self.path, self._given)
 
     @property
     def model(self) -> str:
@@ -68,7 +69,7 @@ class TransformersClient(Client):
 
     @cached_property
     def manner(self) -> str:
-        """Weights, by content, and where they compute: folders of one name may hold different ones."""
+        """Digest of the weights, and the device: folders of one name may hold different weights."""
         import torch
 
         digest = blake2b(str(getattr(self._processor, "chat_template", "")).encode(), digest_size=16)
@@ -78,22 +79,24 @@ class TransformersClient(Client):
         return f"{digest.hexdigest()} {torch.device(self.device).type}"
 
     def complete(self, calls: Sequence[Call]) -> list[Completion]:
-        """One after the other."""
-        return [self._one(call) for call in calls]
+        """Complete the calls one after the other."""
+        return [self._complete_one(call) for call in calls]
 
-    def _one(self, call: Call) -> Completion:
-        inputs = self._inputs(call.messages)
+    def _complete_one(self, call: Call) -> Completion:
+        inputs = self._prepare_inputs(call.messages)
         read = int(inputs["input_ids"].shape[1])
         if call.logprobs:
             listed = self._first_tokens(inputs)
-            told = [
-                pair for rank, pair in enumerate(listed) if rank < call.logprobs or pair[0].strip(AROUND) in call.labels
+            tokens_listed = [
+                pair
+                for rank, pair in enumerate(listed)
+                if rank < call.logprobs or pair[0].strip(LETTER_CONTEXT) in call.labels
             ]
-            return Completion(listed[0][0], "length", tuple(told), read, 1)
+            return Completion(listed[0][0], "length", tuple(tokens_listed), read, 1)
         if call.schema is not None:
-            text = self._instance(call)
-            return Completion(text, "stop", None, read, self._length(text))
-        tokens = self._written(inputs, call)
+            text = self._generate_object(call)
+            return Completion(text, "stop", None, read, self._count_tokens(text))
+        tokens = self._generate_tokens(inputs, call)
         text = self._tokenizer.decode(tokens, skip_special_tokens=True)
         finish = "stop" if len(tokens) and tokens[-1] == self._tokenizer.eos_token_id else "length"
         return Completion(text, finish, None, read, len(tokens))
@@ -102,11 +105,11 @@ class TransformersClient(Client):
     def _tokenizer(self) -> Any:
         return self._processor.tokenizer
 
-    def _length(self, text: str) -> int:
+    def _count_tokens(self, text: str) -> int:
         return len(self._tokenizer(text, add_special_tokens=False)["input_ids"])
 
-    def _inputs(self, messages: Sequence[Message], begun: str = "") -> Any:
-        """Tensors of a conversation, with the answer begun."""
+    def _prepare_inputs(self, messages: Sequence[Message], begun: str = "") -> Any:
+        """Return the tensors of a conversation whose answer begins with `begun`."""
         from PIL import Image
 
         turns, images = [], []
@@ -129,12 +132,12 @@ class TransformersClient(Client):
 
         with torch.inference_mode():
             scores = torch.log_softmax(self._network(**inputs).logits[0, -1].float(), dim=-1)
-        values, ids = scores.topk(min(LISTED, len(scores)))
+        values, ids = scores.topk(min(MAX_FIRST_TOKENS, len(scores)))
         return [
             (self._tokenizer.decode([token]), value) for token, value in zip(ids.tolist(), values.tolist(), strict=True)
         ]
 
-    def _written(self, inputs: Any, call: Call) -> list[int]:
+    def _generate_tokens(self, inputs: Any, call: Call) -> list[int]:
         import torch
 
         sampling = (
@@ -145,8 +148,8 @@ class TransformersClient(Client):
             whole = self._network.generate(**inputs, max_new_tokens=call.max_tokens, **sampling)
         return list(whole[0, inputs["input_ids"].shape[1] :].tolist())
 
-    def _instance(self, call: Call) -> str:
-        """An object that fits the schema; each choice is drawn by how probable the model finds the ways to go on."""
+    def _generate_object(self, call: Call) -> str:
+        """Generate an object that matches the schema; each choice is sampled by the model's probabilities."""
         import torch
 
         assert call.schema is not None
@@ -155,41 +158,41 @@ class TransformersClient(Client):
         def choose(before: str, options: Sequence[str]) -> int:
             if len(options) == 1:
                 return 0
-            scores = self._chances(call.messages, before, options)
+            scores = self._compute_logprobs(call.messages, before, options)
             if call.temperature == 0:
                 return int(scores.argmax())
             return int(torch.multinomial(torch.softmax(scores / call.temperature, -1), 1, generator=random))
 
-        return instance(call.schema, choose)
+        return generate_instance(call.schema, choose)
 
-    def _chances(self, messages: Sequence[Message], before: str, options: Sequence[str]) -> Any:
-        """Log-probability of each text after `before`, where the model writes one of them."""
+    def _compute_logprobs(self, messages: Sequence[Message], before: str, options: Sequence[str]) -> Any:
+        """Return the log-probability of each text after `before`, given that the model writes one of them."""
         import torch
 
-        ways = [self._inputs(messages, before + option) for option in options]
+        ways = [self._prepare_inputs(messages, before + option) for option in options]
         tokens = [way["input_ids"][0].tolist() for way in ways]
         begin = sum(1 for _ in takewhile(lambda column: len(set(column)) == 1, zip(*tokens, strict=False)))
-        chances, told = [], None
+        chances, logprobs = [], None
         for way, own in zip(ways, tokens, strict=True):
             goes_on = sum(each[: begin + 1] == own[: begin + 1] for each in tokens) > 1  # as another does
-            if told is None or goes_on:
+            if logprobs is None or goes_on:
                 with torch.inference_mode():
-                    told = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
-            chances.append(_chance(told if goes_on else told[:1], own, tokens, begin))
+                    logprobs = self._network(**way).logits[0, begin - 1 :].float().log_softmax(-1).cpu()
+            chances.append(_compute_logprob(logprobs if goes_on else logprobs[:1], own, tokens, begin))
         return torch.tensor(chances)
 
 
-def _chance(told: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:
-    """Of one of several texts: at each token among those with which any that began alike goes on, or has ended.
+def _compute_logprob(logprobs: Any, own: list[int], tokens: Sequence[list[int]], begin: int) -> float:
+    """Return the log-probability of one of several texts, token by token, among the texts that share its beginning.
 
     Args:
-        told: log-probabilities [len(own) - begin + 1, V] of the tokens behind the first `begin`.
+        logprobs: log-probabilities [len(own) - begin + 1, V] of the tokens after the first `begin`.
         own: the text's tokens.
-        tokens: those of all texts.
-        begin: how many the texts begin with alike.
+        tokens: the tokens of all texts.
+        begin: number of first tokens that all texts share.
     """
     chance = 0.0
-    for place, following in enumerate(told, start=begin):
+    for place, following in enumerate(logprobs, start=begin):
         alike = [each for each in tokens if each[:place] == own[:place]]
         ways = following[sorted({each[place] for each in alike if len(each) > place})].logsumexp(0)
         if place == len(own):
@@ -201,5 +204,5 @@ def _chance(told: Any, own: list[int], tokens: Sequence[list[int]], begin: int) 
     return chance
 
 
-def _remade(path: str, options: dict[str, Any]) -> TransformersClient:
+def _recreate_client(path: str, options: dict[str, Any]) -> TransformersClient:
     return TransformersClient(path, **options)

@@ -13,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import RemoteError
-from wiw.types import Conditioning, Control
+from wiw.types import Conditioning, Control, History
 from wiw.wire.arrays import pack_array, unpack_array
 from wiw.wire.messages import Reader, read_fields, text, unpack_map, whole
 
-SEEN = ("image", "depth", "semantic", "history")
+SEEN = ("image", "depth", "semantic")
+PAST = ("images", "poses", "actions", "lengths")
 PLAN = ("actions", "trajectory", "viewpoints", "ids")
 
 
@@ -28,15 +29,19 @@ class Row:
     image: NDArray[np.uint8]
     depth: NDArray[np.float32] | None
     semantic: NDArray[np.uint32] | None
-    history: NDArray[np.uint8] | None
+    history: History | None
+    """Of one row."""
     control: Control
     seed: int
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        """What the rows of a batch have in common: the number of actions, and the ids' shape and kind."""
-        ids = self.control.ids
-        return len(self.control.actions), *(() if ids is None else (ids.shape, ids.dtype.str))
+        """What the rows of a batch have in common: the number of actions, the shapes of ids and of the history's poses,
+        and the ids' kind.
+        """
+        ids, past = self.control.ids, self.history
+        kinds = () if ids is None else (ids.shape, ids.dtype.str)
+        return len(self.control.actions), *kinds, *(() if past is None else past.poses.shape[1:])
 
 
 def pack_row(observations: Conditioning, row: int, control: Control, seed: int) -> bytes:
@@ -45,8 +50,14 @@ def pack_row(observations: Conditioning, row: int, control: Control, seed: int) 
     arrays = {name: None if values is None else values[row] for name, values in seen.items()}
     arrays |= {name: getattr(control, name) for name in PLAN}
     packed = {name: None if array is None else pack_array(np.asarray(array)) for name, array in arrays.items()}
+    packed["history"] = None if observations.history is None else _pack_history(observations.history.rows([row]))
     plain = {"text": control.text, "length": control.length, "shared": control.shared, "seed": int(seed)}
     return bytes(msgpack.packb({**packed, **plain}))
+
+
+def _pack_history(history: History) -> dict[str, Any]:
+    """A map of the arrays of one row, without the padding of actions that others in the batch brought about."""
+    return {**{name: pack_array(getattr(history, name)[0]) for name in PAST}, "count": int(history.count[0])}
 
 
 def row_id(row: bytes) -> bytes:
@@ -71,7 +82,8 @@ def unpack_row(data: bytes) -> Row:
         raise RemoteError(f"row.ids: expected one for each of {count} actions", "message")
     if not control.shared <= control.length <= count:
         raise RemoteError(f"row: expected shared <= length <= {count} actions", "message")
-    return Row(control=control, seed=values["seed"], **{name: values[name] for name in SEEN})
+    seen = {name: values[name] for name in SEEN}
+    return Row(control=control, seed=values["seed"], history=values["history"], **seen)
 
 
 def stack(rows: Sequence[Row]) -> tuple[Conditioning, list[Control], NDArray[np.uint64]]:
@@ -83,7 +95,9 @@ def stack(rows: Sequence[Row]) -> tuple[Conditioning, list[Control], NDArray[np.
         semantic=None
         if first.semantic is None
         else np.stack([row.semantic for row in rows if row.semantic is not None]),
-        history=None if first.history is None else [row.history for row in rows if row.history is not None],
+        history=None
+        if first.history is None
+        else History.concatenate([row.history for row in rows if row.history is not None]),
     )
     return observations, [row.control for row in rows], np.array([row.seed for row in rows], np.uint64)
 
@@ -106,15 +120,54 @@ def _ids(name: str, value: Any) -> NDArray[Any]:
     return array
 
 
+def _history(name: str, value: Any) -> History:
+    if not isinstance(value, dict):
+        raise RemoteError(f"{name}: expected a map, got {type(value).__name__}", "message")
+    values = read_fields(name, value, _HISTORY_READERS)
+    images, poses, actions, lengths, count = (values[part] for part in (*PAST, "count"))
+    most, gripper = len(images), actions.ndim == 3
+    expected = {
+        "poses": (poses.shape, (most, 7 if gripper else 3)),
+        "actions": (actions.shape, (most - 1, *actions.shape[1:2], *((7,) if gripper else ()))),
+        "lengths": (lengths.shape, (most - 1,)),
+    }
+    for part, (shape, wanted) in expected.items():
+        if shape != wanted:
+            raise RemoteError(f"{name}.{part}: expected {wanted} for {most} images, got {shape}", "message")
+    room = actions.shape[1]
+    if room < 1 or not ((lengths >= 0) & (lengths <= room)).all():
+        raise RemoteError(f"{name}.lengths: expected 0 to {room} actions, and room for at least one", "message")
+    if not np.isfinite(poses).all() or (gripper and not np.isfinite(actions).all()):
+        raise RemoteError(f"{name}: expected finite poses", "message")
+    if not 1 <= count <= most:
+        raise RemoteError(f"{name}.count: expected 1 to {most} frames, got {count}", "message")
+    one = np.array([count], np.int64)
+    return History(images[None], poses[None], actions[None], lengths[None], one)  # views; `stack` copies them
+
+
+def _past_actions(name: str, value: Any) -> NDArray[Any]:
+    array = unpack_array(name, value)
+    if (array.dtype.str, array.ndim) not in (("|i1", 2), ("<f8", 3)):
+        raise RemoteError(f"{name}: expected int8 ids or float64 poses, got {array.dtype} {array.shape}", "message")
+    return array
+
+
 def _maybe(reader: Reader) -> Reader:
     return lambda name, value: None if value is None else reader(name, value)
 
 
+_HISTORY_READERS: Mapping[str, Reader] = {
+    "images": _array("|u1", 4),
+    "poses": _array("<f8", 2),
+    "actions": _past_actions,
+    "lengths": _array("<i8", 1),
+    "count": whole,
+}
 _READERS: Mapping[str, Reader] = {
     "image": _array("|u1", 3),
     "depth": _maybe(_array("<f4", 2)),
     "semantic": _maybe(_array("<u4", 2)),
-    "history": _maybe(_array("|u1", 4)),
+    "history": _maybe(_history),
     "actions": _array("|i1", 1),
     "trajectory": _array("<f8", 2),
     "viewpoints": _array("<f8", 3),

@@ -22,11 +22,14 @@ from numpy.typing import NDArray
 
 from wiw.action import TextTemplate
 from wiw.errors import ArgumentError, ContractError
-from wiw.types import Conditioning, Control, ControlKind, Space, View
+from wiw.registry import PLAN_SPACES
+from wiw.types import PRIMITIVES, Conditioning, Control, ControlKind, View
 from wiw.world_models.pictures import check_pictures, sample
 
 CONTROLS = ("image", "text", "trajectory", "viewpoint", "action")
 NEEDS = ("depth", "semantic", "history", "simulator")
+HISTORY = 4
+"""Frames of a history where a model does not say how many."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Accepts:
     """A world model's declaration, read by the loop; made by `wiw.accepts(...)`, which checks it."""
 
     control: ControlKind
-    space: Space
+    space: str
     view: View
     size: tuple[int, int]
     frames: int
@@ -45,6 +48,8 @@ class Accepts:
     null_first: bool
     template: TextTemplate | None
     cacheable: bool = False
+    history: int = 0
+    """Frames of `Conditioning.history`, the observation included; 0 where the model needs none."""
 
 
 def accepts(
@@ -53,7 +58,7 @@ def accepts(
     size: tuple[int, int] | None = None,
     frames: int = 0,
     *,
-    space: Space = "discrete",
+    space: str = PRIMITIVES,
     needs: Sequence[str] = (),
     causal: bool = False,
     best_batch: int = 8,
@@ -61,6 +66,7 @@ def accepts(
     null_first: bool = False,
     template: TextTemplate | None = None,
     cacheable: bool = False,
+    history: int | None = None,
 ) -> Accepts:
     """Declares what a world model takes and gives (paper, section "Unified Action API").
 
@@ -70,8 +76,10 @@ def accepts(
         size: (height, width) of its input and output; default 480x480 or 576x1024. A perspective view of any shape is
             90 degrees wide and has square pixels: what a wide one does not reach of an agent's view is black there.
         frames: length of a rollout with frame 0; 0 means any. Shorter plans are padded, longer ones chunked.
-        space: "discrete" primitives or "pose7" poses; an agent says so where it cannot give them.
-        needs: any of "depth", "semantic", "history", likewise; "simulator" is for `oracle` alone.
+        space: what the actions are that it follows, a name of `wiw.loop.plan_space`: "discrete" primitives, or "pose7"
+            poses of a gripper. An agent that plans in others refuses the model.
+        needs: any of "depth", "semantic", "history" (the latest observations, `wiw.types.History`); "simulator" is for
+            `oracle` alone.
         causal: frame k depends on controls 1..k only, so shared prefixes are imagined once.
         best_batch: rows per call at which the model is most efficient.
         vocabulary: primitive id to the model's own id or vector, for control "action"; default: primitive ids.
@@ -80,14 +88,15 @@ def accepts(
         cacheable: keep rollouts on disk by default and never ask twice; needs a `version`. Say so for a model that
             takes long and whose answer is a function of what it is handed: not for one that draws without the seeds,
             nor for a server that may change.
+        history: frames of the history with needs=("history",), the observation included; None means 4.
 
     Raises:
-        ArgumentError: a value is not one of the above.
+        ArgumentError: a value is not one of the above, or a history is given that is not needed.
     """
     size = size or ((480, 480) if view == "perspective" else (576, 1024))
     _check("control", control, CONTROLS)
     _check("view", view, ("perspective", "panorama"))
-    _check("space", space, ("discrete", "pose7"))
+    _check("space", space, PLAN_SPACES.names())
     for need in needs:
         _check("needs", need, NEEDS)
     if len(size) != 2 or min(size) < 1:
@@ -98,6 +107,7 @@ def accepts(
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
     if template is not None and not isinstance(template, TextTemplate):
         raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
+    history = _checked_history(history, needs)
     size = (int(size[0]), int(size[1]))
     return Accepts(
         control,
@@ -112,7 +122,23 @@ def accepts(
         null_first,
         template,
         cacheable,
+        history,
     )
+
+
+def _checked_history(history: int | None, needs: Sequence[str]) -> int:
+    if "history" not in needs:
+        if history:
+            raise ArgumentError(f"accepts: history={history} without needs=('history',); declare both, or neither")
+        return 0
+    if history is None:
+        return HISTORY
+    if isinstance(history, bool) or not isinstance(history, int | np.integer) or history < 1:
+        raise ArgumentError(
+            f"accepts: history counts the observation too: with needs=('history',), expected a whole number of at "
+            f"least 1, got {history!r}"
+        )
+    return int(history)
 
 
 def _check(name: str, value: str, allowed: Sequence[str]) -> None:
@@ -188,9 +214,15 @@ class WorldModel(ABC):
         """
         raise NotImplementedError
 
-    def for_space(self, space: Space) -> WorldModel:
-        """The model for plans of primitives or of poses, where it is asked with both. Default: itself."""
+    @property
+    def unwrapped(self) -> WorldModel:
+        """The model itself, behind everything that wraps it."""
         return self
+
+    @property
+    def spent(self) -> Mapping[str, float]:
+        """What the model has used up so far, for the cost ledger (`Decision.spent`)."""
+        return {} if self.credits is None else {"credits": self.credits}
 
     @classmethod  # noqa: B027 - most models have nothing to say
     def require(cls, task: Mapping[str, Any]) -> None:
@@ -291,10 +323,17 @@ def _is_plain(value: Any) -> bool:
     return value is None or type(value) in (bool, int, float, str) or isinstance(value, Path)
 
 
-def checked_rollout(
+def ask(
     model: WorldModel, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
 ) -> NDArray[np.uint8]:
-    """`model.rollout` with its answer held to the contract.
+    """Return a model's frames, held to the contract: by what wraps the model, or else here."""
+    return (check_rollout if model is model.unwrapped else type(model).rollout)(model, observations, controls, seeds)
+
+
+def check_rollout(
+    model: WorldModel, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
+) -> NDArray[np.uint8]:
+    """Ask a model and hold its answer to the contract.
 
     Raises:
         ContractError: wrong type, dtype, shape or number of frames, or NaN, named with what was expected; frames that
@@ -306,11 +345,11 @@ def checked_rollout(
     if not isinstance(frames, np.ndarray) or frames.dtype != np.uint8 or frames.shape != expected:
         kind, came = _breach(frames, expected)
         raise ContractError(
-            f"{type(model).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
+            f"{type(model.unwrapped).__name__}.rollout: expected uint8 {expected} (batch, actions + 1, height, "
             f"width, 3), got {came}",
             kind,
         )
-    check_pictures(type(model).__name__, observed, frames, controls)
+    check_pictures(type(model.unwrapped).__name__, observed, frames, controls)
     return frames
 
 

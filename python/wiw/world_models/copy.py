@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Conditioning, Control, Space
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -17,10 +17,6 @@ class Copy(WorldModel):
 
     accepts = accepts(control="image", view="panorama", causal=True, best_batch=64)
     version = "1"
-
-    def for_space(self, space: Space) -> WorldModel:
-        """Return the copy of the front view where plans are poses."""
-        return self if space == "discrete" else CopyFront()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -35,3 +31,8 @@ class CopyFront(Copy):
     """Repeat the front view of a manipulator's fixed camera."""
 
     accepts = accepts(control="image", view="perspective", causal=True, best_batch=64)
+
+
+def make_copy(space: str = PRIMITIVES) -> Copy:
+    """Return the floor, which predicts that every future frame equals the observation."""
+    return CopyFront() if space == GRIPPER_POSES else Copy()

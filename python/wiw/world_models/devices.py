@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from wiw.errors import DependencyError
-from wiw.networks import device, memory_guard
+from wiw.networks import memory_guard
+from wiw.networks import resolve_device as device
 from wiw.world_models.base import Requirements
 
 __all__ = ["device", "memory_guard", "require"]

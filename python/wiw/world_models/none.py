@@ -3,5 +3,5 @@
 
 
 def none() -> None:
-    """`wiw.world_model("none")` is None, which `wiw.Agent` takes as "act without imagining"."""
+    """Act without a world model: the same loop with imagination left out. Return None."""
     return

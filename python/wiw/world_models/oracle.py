@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.types import Conditioning, Control, Space
+from wiw.types import GRIPPER_POSES, PRIMITIVES, Conditioning, Control
 from wiw.world_models.base import WorldModel, accepts
 
 
@@ -20,10 +20,6 @@ class Oracle(WorldModel):
     """
 
     accepts = accepts(control="action", view="panorama", needs=("simulator",), causal=True, best_batch=64)
-
-    def for_space(self, space: Space) -> WorldModel:
-        """Return the oracle of a manipulator's world where plans are poses."""
-        return self if space == "discrete" else ArmOracle()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -51,7 +47,7 @@ class Oracle(WorldModel):
 class ArmOracle(Oracle):
     """Send a fork of the physics to each pose of a plan, one after another, and return what it truly sees."""
 
-    accepts = accepts(control="action", space="pose7", view="perspective", needs=("simulator",), best_batch=64)
+    accepts = accepts(control="action", space=GRIPPER_POSES, view="perspective", needs=("simulator",), best_batch=64)
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
@@ -63,5 +59,13 @@ class ArmOracle(Oracle):
         frames[:, 0] = image
         for row, (simulator, control) in enumerate(zip(observations.simulators, controls, strict=True)):
             assert control.ids is not None
-            frames[row, 1:] = simulator.fork().fronts_after(control.ids[1:], image.shape[1:3])
+            frames[row, 1:] = simulator.fork().render_fronts_after(control.ids[1:], image.shape[1:3])
         return frames
+
+
+def make_oracle(space: str = PRIMITIVES) -> Oracle:
+    """Carry each plan out in a fork of the simulator: the ceiling.
+
+    Return the model for plans of a space.
+    """
+    return ArmOracle() if space == GRIPPER_POSES else Oracle()

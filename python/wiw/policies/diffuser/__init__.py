@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 3D diffusion policy: paths of the gripper out of noise, given the front view with its depth.
+"""The 3D diffusion policy: gripper paths by denoising, given the front view with its depth.
 
 Paper, appendix "Policies in Embodied Tasks".
 """
@@ -16,30 +16,30 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError, DependencyError
-from wiw.networks import one_thread
+from wiw.networks import single_thread
 from wiw.policies.base import Policy, Situation
-from wiw.policies.diffuser.paths import dense, moving, thinned, to_poses, to_vectors
-from wiw.policies.diffuser.sight import Lens
+from wiw.policies.diffuser.paths import densify_path, drop_repeated_poses, thin_path, to_poses, to_vectors
+from wiw.policies.diffuser.workspace import PinholeCamera
 from wiw.tabletop.workbench import CAMERAS
-from wiw.types import Proposal, Space
+from wiw.types import GRIPPER_POSES, Proposal
 
 if TYPE_CHECKING:
     from wiw.policies.diffuser.network import Network
 
 
-LENGTH = 50
+PATH_LENGTH = 50
 """L, poses of a path (paper, appendix "Robotic Manipulation")."""
 
 
 class Diffuser(Policy):
-    """Proposes paths of 50 poses that might be meant; it reads no words, so that what is asked for is chosen by others.
+    """Proposes plausible paths of 50 poses; it reads no instruction, so the reviser must choose the requested one.
 
-    Each path starts from noise of its own and comes to something: a button pushed, the block slid, a thing put
-    elsewhere. Where fewer poses are asked for, a path is thinned to those that its shape needs.
+    Each path starts from its own noise and achieves one subtask: a button pushed, the block slid, an object placed.
+    Where fewer poses are requested, a path is thinned to those that its shape needs.
 
     Args:
         weights: a file of `wiw train diffuser`.
-        steps: in which noise is taken away, up to 100.
+        steps: number of denoising steps, up to 100.
 
     Raises:
         ArgumentError: no steps, or too many.
@@ -47,7 +47,7 @@ class Diffuser(Policy):
         WeightsError: no such file, damaged, or of another version.
     """
 
-    space: Space = "pose7"
+    space = GRIPPER_POSES
     needs = ("depth",)
     default_revision = "scripted"
 
@@ -62,45 +62,50 @@ class Diffuser(Policy):
         self._digest = blake2b(Path(weights).expanduser().read_bytes(), digest_size=8).hexdigest()
 
     @classmethod
-    def of(cls, network: Network, steps: int = 20) -> Diffuser:
-        """The policy of a network at hand, such as one in training."""
+    def from_network(cls, network: Network, steps: int = 20) -> Diffuser:
+        """Create the policy from a network in memory, such as one in training."""
         policy = cls.__new__(cls)
         policy.steps, policy._network, policy.card, policy._digest = steps, network.eval(), {}, ""
         return policy
 
     def describe(self) -> dict[str, Any]:
-        """With a digest of the weights."""
+        """Return a JSON-able identity, with a digest of the weights."""
         return {"policy": type(self).__name__, "weights": self._digest, "steps": self.steps}
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """As many paths as candidates; one where no world model is asked about them, which takes the first."""
-        return [self._plans(each, candidates if each.imagines else 1, horizon) for each in situations]
+        """Return as many paths as candidates; only one where no world model will imagine them."""
+        return [self._build_plans(each, candidates if each.imagines else 1, horizon) for each in situations]
 
-    def _plans(self, situation: Situation, count: int, horizon: int) -> list[Proposal]:
+    def _build_plans(self, situation: Situation, count: int, horizon: int) -> list[Proposal]:
         pose = situation.observation.pose
-        stops = self._stops(situation, [_seed(situation, number) for number in range(count)])
-        return [Proposal(thinned(pose, dense(pose, moving(pose, each), LENGTH), horizon)) for each in stops]
+        stops = self._sample_poses(situation, [_derive_seed(situation, number) for number in range(count)])
+        return [
+            Proposal(thin_path(pose, densify_path(pose, drop_repeated_poses(pose, each), PATH_LENGTH), horizon))
+            for each in stops
+        ]
 
-    def _stops(self, situation: Situation, seeds: Sequence[int]) -> NDArray[np.float64]:
-        """float64 [R, K, 7]: poses to go to one after another, for each seed."""
+    def _sample_poses(self, situation: Situation, seeds: Sequence[int]) -> NDArray[np.float64]:
+        """Sample successive poses for each seed, float64 [R, K, 7]."""
         import torch
 
-        from wiw.policies.diffuser.diffusion import sampled
+        from wiw.policies.diffuser.diffusion import sample_ddim
 
         observation, pose, network = situation.observation, situation.observation.pose, self._network
-        sight = Lens.of(CAMERAS["front"], observation.depth.shape).sight(observation.front, observation.depth)
+        view = PinholeCamera.from_camera(CAMERAS["front"], observation.depth.shape).view_workspace(
+            observation.front, observation.depth
+        )
         drawn = [torch.randn(network.shape.poses, 9, generator=torch.Generator().manual_seed(seed)) for seed in seeds]
-        with one_thread(), torch.inference_mode():
-            seen = sight.image, sight.height, sight.places, to_vectors(pose)
-            image, height, places, now = (torch.from_numpy(each)[None] for each in seen)
-            scene = network.look(image, height, places, now)
+        with single_thread(), torch.inference_mode():
+            inputs = view.image, view.height, view.places, to_vectors(pose)
+            image, height, places, now = (torch.from_numpy(each)[None] for each in inputs)
+            scene = network.encode_scene(image, height, places, now)
             noise = torch.stack(drawn)[None]
-            clean, open_ = sampled(lambda noised, level: network.denoise(scene, noised, level), noise, self.steps)
+            clean, open_ = sample_ddim(lambda noised, level: network.denoise(scene, noised, level), noise, self.steps)
             return to_poses(torch.cat([clean, open_[..., None]], dim=-1)[0].numpy())
 
 
 def require_torch() -> None:
-    """Raises a DependencyError that says how to install torch and safetensors, unless they are."""
+    """Raise a DependencyError that says how to install torch and safetensors, unless they are installed."""
     try:
         import safetensors  # noqa: F401
         import torch  # noqa: F401
@@ -108,6 +113,6 @@ def require_torch() -> None:
         raise DependencyError(f"diffuser needs torch and safetensors ({error}): pip install 'wiw[torch]'") from error
 
 
-def _seed(situation: Situation, number: int) -> int:
+def _derive_seed(situation: Situation, number: int) -> int:
     key = situation.key
     return int(core.fold_key([key.seed, key.episode, key.decision, number, 0xD1FF])) % 2**63

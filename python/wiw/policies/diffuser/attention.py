@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Attention between things in space that knows only where they are from each other.
+"""Attention between points in space that depends on their relative positions only.
 
-Queries and keys are turned by angles in proportion to where they are (rotary position embeddings, one third of a head's
-channels for each axis), so that their products depend on differences of places alone. Each head also reports how far
-off, and in which direction, the place lies that it attends to, so that what is found can be pointed at.
+Queries and keys are rotated by angles in proportion to their positions (rotary position embeddings, one third of a
+head's channels for each axis), so that their products depend on position differences alone. Each head also returns the
+mean offset to the points it attends to, so that the network can point at what it finds.
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-LONGEST, SHORTEST = 2.4, 0.06
-"""Metres in which the slowest and the fastest channels turn once."""
-UNIT = 0.25
-"""Metres in which distances are reported."""
+LONGEST_WAVE, SHORTEST_WAVE = 2.4, 0.06
+"""Metres in which the slowest and the fastest channels complete one rotation."""
+OFFSET_UNIT = 0.25
+"""Unit of the returned offsets in metres."""
 
 
-def turned(values: Tensor, places: Tensor) -> Tensor:
-    """Channels [B, N, H, 6 F] turned in pairs by where they are: places [B, N, 3] in metres."""
+def rotate_channels(values: Tensor, places: Tensor) -> Tensor:
+    """Rotate channels [B, N, H, 6 F] in pairs according to positions [B, N, 3] in metres."""
     count = values.shape[-1] // 6
-    waves = torch.logspace(0, 1, count, base=SHORTEST / LONGEST) * LONGEST
+    waves = torch.logspace(0, 1, count, base=SHORTEST_WAVE / LONGEST_WAVE) * LONGEST_WAVE
     angles = (places[..., None] * (2 * torch.pi / waves)).flatten(-2)[:, :, None]  # [B, N, 1, 3 F]
     one, other = values.chunk(2, dim=-1)
     cosine, sine = angles.cos(), angles.sin()
@@ -28,7 +28,7 @@ def turned(values: Tensor, places: Tensor) -> Tensor:
 
 
 class RelativeAttention(nn.Module):
-    """Of queries [B, N, width] at places [B, N, 3] to a context [B, M, width] at places of its own.
+    """Attention of queries [B, N, width] at positions [B, N, 3] to a context [B, M, width] with its own positions.
 
     Args:
         width: channels, a multiple of 6 `heads`.
@@ -44,10 +44,10 @@ class RelativeAttention(nn.Module):
     def forward(
         self, queries: Tensor, places: Tensor, context: Tensor, context_places: Tensor, hidden: Tensor | None = None
     ) -> Tensor:
-        """[B, N, width]; what is `hidden`, bool [B, M], of the context is not attended to."""
+        """Return [B, N, width]; context tokens that are `hidden`, bool [B, M], are ignored."""
         shape = (-1, self.heads, queries.shape[-1] // self.heads)
-        query = turned(self.query(queries).unflatten(-1, shape[1:]), places)
-        key = turned(self.key(context).unflatten(-1, shape[1:]), context_places)
+        query = rotate_channels(self.query(queries).unflatten(-1, shape[1:]), places)
+        key = rotate_channels(self.key(context).unflatten(-1, shape[1:]), context_places)
         value = self.value(context).unflatten(-1, shape[1:])
         likeness = torch.einsum("bnhc,bmhc->bhnm", query, key) / shape[2] ** 0.5
         if hidden is not None:
@@ -55,4 +55,4 @@ class RelativeAttention(nn.Module):
         weights = likeness.softmax(dim=-1)
         read = torch.einsum("bhnm,bmhc->bnhc", weights, value)
         off = torch.einsum("bhnm,bmx->bnhx", weights, context_places) - places[:, :, None]
-        return self.out(torch.cat([read, off / UNIT], dim=-1).flatten(-2))
+        return self.out(torch.cat([read, off / OFFSET_UNIT], dim=-1).flatten(-2))

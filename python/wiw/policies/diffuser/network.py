@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network: what a noised path of the gripper would be without the noise, given what is seen.
+"""The network: predicts the clean path from a noised one, given the scene.
 
-After "3D Diffuser Actor" (Ke, Gkanatsios, Fragkiadaki 2024): features of the picture become tokens at their places in
-the world, the noised poses of a path are tokens at theirs, and attention relates them by relative places alone.
+After "3D Diffuser Actor" (Ke, Gkanatsios, Fragkiadaki 2024): image features become tokens at their 3D positions, the
+noised poses of a path are tokens at theirs, and attention relates them by relative positions alone.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from torch.nn import functional
 
 from wiw.errors import ArgumentError
 from wiw.policies.diffuser.attention import RelativeAttention
-from wiw.policies.diffuser.diffusion import STEPS
+from wiw.policies.diffuser.diffusion import NOISE_LEVELS
 from wiw.policies.diffuser.paths import MIDDLE, SCALE
-from wiw.policies.diffuser.sight import CELL
+from wiw.policies.diffuser.workspace import CELL
 
 
 @dataclass(frozen=True)
 class Shape:
-    """How large the network is.
+    """Size of the network.
 
     Raises:
-        ArgumentError: a width that heads do not divide into sixfolds, or something below 1.
+        ArgumentError: a number below 1, or a width that is no multiple of 6 heads.
     """
 
     width: int = 96
     heads: int = 4
     layers: int = 4
-    """Of the denoiser."""
+    """Layers of the denoiser."""
     tokens: int = 640
-    """Of the scene, at most."""
+    """Most tokens of a scene."""
     poses: int = 6
-    """That a path leads to."""
+    """Poses of a path."""
 
     def __post_init__(self) -> None:
         if min(self.width, self.heads, self.layers, self.tokens, self.poses) < 1 or self.width % (6 * self.heads):
@@ -43,21 +43,23 @@ class Shape:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What paths are told: tokens [B, N, width] at places [B, N, 3], the hand's last; `hidden` [B, N] are padding."""
+class EncodedScene:
+    """The condition of denoising: tokens [B, N, width] at positions [B, N, 3], the hand's last; `hidden` [B, N] are
+    padding.
+    """
 
     tokens: Tensor
     places: Tensor
     hidden: Tensor
     hand: Tensor
-    """[B, width]: how the gripper is turned, and whether it is open."""
+    """[B, width]: the gripper's rotation and opening."""
 
 
 class Network(nn.Module):
-    """Looks once, then denoises any number of paths.
+    """Encodes a scene once, then denoises any number of paths. Attribute names are keys of the weight file.
 
     Args:
-        shape: see there.
+        shape: size of the network.
     """
 
     def __init__(self, shape: Shape = Shape()) -> None:
@@ -80,37 +82,41 @@ class Network(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.last = nn.Linear(width, 10)
 
-    def look(self, image: Tensor, height: Tensor, places: Tensor, now: Tensor) -> Scene:
-        """What there is to know of a picture.
+    def encode_scene(self, image: Tensor, height: Tensor, places: Tensor, now: Tensor) -> EncodedScene:
+        """Encode an image and the gripper's pose.
 
         Args:
             image: uint8 [B, h, w, 3].
-            height: [B, h, w], of its pixels, as `Sight` has it.
+            height: [B, h, w], heights of its pixels, as in `WorkspaceView`.
             places: [B, h / CELL, w / CELL, 3], likewise.
             now: [B, 10], the gripper's present vector.
         """
         seen = torch.cat([image / 127.5 - 1, height[..., None].float()], dim=-1).permute(0, 3, 1, 2)
         features = self.eye(seen).flatten(2).transpose(1, 2)
-        tokens, places, hidden = _nearby(features, places.flatten(1, 2), self.shape.tokens)
+        tokens, places, hidden = _select_workspace_tokens(features, places.flatten(1, 2), self.shape.tokens)
         hand = self.hand(now[:, 3:])
         tokens = torch.cat([tokens, hand[:, None]], dim=1)
-        places = torch.cat([places, metres(now[:, None, :3])], dim=1)
-        return Scene(tokens, places, functional.pad(hidden, (0, 1), value=False), hand)
+        places = torch.cat([places, to_metres(now[:, None, :3])], dim=1)
+        return EncodedScene(tokens, places, functional.pad(hidden, (0, 1), value=False), hand)
 
-    def denoise(self, scene: Scene, noised: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
-        """Clean vectors [B, R, L, 9] and the gripper's logits [B, R, L] of R paths a scene, of levels [B, R]."""
-        told = self.level(_waves(level)) + scene.hand[:, None]
+    def denoise(self, scene: EncodedScene, noised: Tensor, level: Tensor) -> tuple[Tensor, Tensor]:
+        """Return clean vectors [B, R, L, 9] and the gripper's logits [B, R, L] of R paths per scene at levels [B,
+        R].
+        """
+        condition = self.level(_embed_level(level)) + scene.hand[:, None]
         tokens = self.start(noised[..., 3:]) + self.order
-        places = metres(noised[..., :3])
+        places = to_metres(noised[..., :3])
         for layer in self.layers:
-            tokens = layer(tokens, places, scene, told=told)
+            tokens = layer(tokens, places, scene, condition=condition)
         found = self.last(self.norm(tokens))
         clean = torch.cat([noised[..., :3] + found[..., :3], found[..., 3:9]], dim=-1)
         return clean, found[..., 9]
 
 
 class Layer(nn.Module):
-    """Attention to the scene, to the other poses of the path, and a thought of one's own."""
+    """Attention to the scene and to the other poses of the path, and a feed-forward network. `told` modulates the
+    norms.
+    """
 
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -119,9 +125,11 @@ class Layer(nn.Module):
         self.norms = nn.ModuleList(nn.LayerNorm(width, elementwise_affine=False) for _ in range(3))
         self.told = nn.Linear(width, 6 * width)
 
-    def forward(self, tokens: Tensor, places: Tensor, scene: Scene, told: Tensor) -> Tensor:
-        """Tokens [B, R, L, width] of R paths a scene, which are `told` [B, R, width] of the noise and the hand."""
-        scales = self.told(told)[..., None, :].chunk(6, dim=-1)
+    def forward(self, tokens: Tensor, places: Tensor, scene: EncodedScene, condition: Tensor) -> Tensor:
+        """Update tokens [B, R, L, width] of R paths per scene; `condition` [B, R, width] encodes noise level and
+        hand.
+        """
+        scales = self.told(condition)[..., None, :].chunk(6, dim=-1)
 
         def normal(which: int) -> Tensor:
             return self.norms[which](tokens) * (1 + scales[2 * which]) + scales[2 * which + 1]
@@ -134,7 +142,7 @@ class Layer(nn.Module):
 
 
 class Block(nn.Module):
-    """Two 3x3 convolutions beside a way around them."""
+    """Two 3x3 convolutions with a residual connection."""
 
     def __init__(self, width: int, dilation: int = 1) -> None:
         super().__init__()
@@ -148,17 +156,17 @@ class Block(nn.Module):
         )
 
     def forward(self, image: Tensor) -> Tensor:
-        """[B, width, H, W]."""
+        """Return [B, width, H, W]."""
         return image + self.inner(image)
 
 
-def metres(vectors: Tensor) -> Tensor:
-    """Places in the world of vectors' first three numbers."""
+def to_metres(vectors: Tensor) -> Tensor:
+    """Return the positions in metres of vectors' first three numbers."""
     return vectors * SCALE + torch.as_tensor(MIDDLE, dtype=vectors.dtype)
 
 
-def _nearby(features: Tensor, places: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Tokens in the workspace, padded to the same number in each scene: features, places, and which are padding."""
+def _select_workspace_tokens(features: Tensor, places: Tensor, most: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the tokens in the workspace, padded to equal number: features, positions, and which are padding."""
     outside = places[..., 2] < 0
     count = min(most, max(1, int((~outside).sum(dim=1).max())))
     order = outside.to(torch.uint8).argsort(dim=1, stable=True)[:, :count, None]
@@ -167,8 +175,8 @@ def _nearby(features: Tensor, places: Tensor, most: int) -> tuple[Tensor, Tensor
     return features.gather(1, order.expand(-1, -1, features.shape[2])), places, hidden
 
 
-def _waves(level: Tensor) -> Tensor:
-    """[..., 32]: a level of noise as sines and cosines."""
+def _embed_level(level: Tensor) -> Tensor:
+    """Embed a noise level as sines and cosines, [..., 32]."""
     rates = torch.logspace(0, 2, 16)
-    angles = level[..., None] / STEPS * rates
+    angles = level[..., None] / NOISE_LEVELS * rates
     return torch.cat([angles.sin(), angles.cos()], dim=-1)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths of a gripper: made dense from the poses that matter, thinned to them again, and as vectors that are diffused.
+"""Gripper paths: interpolated between key poses, thinned to key poses again, and as vectors for diffusion.
 
 A path is float64 [L, 7]: x, y, z, roll, pitch, yaw, gripper. A vector is x, y, z in units of `SCALE` from `MIDDLE`,
-then the first two columns of the rotation, then the gripper: its rotations have no seam and no gimbal.
+then the first two columns of the rotation, then the gripper: its rotations have no seam and no gimbal lock.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from wiw.tabletop.workbench import SHUT, TABLE
 MIDDLE = np.array([0.15, 0.0, TABLE + 0.15])
 SCALE = 0.25
 """Metres."""
-RADIAN = 0.1
-"""Metres that a turn by a radian counts as, where a path's shape is measured."""
-STILL = 0.015
-"""Metres; a way that is shorter leads nowhere."""
+METRES_PER_RADIAN = 0.1
+"""Metres that a rotation by one radian counts as, where a path's shape is measured."""
+MIN_MOVE = 0.015
+"""Metres; a shorter move counts as none."""
 
 Path = NDArray[np.float64]
 
 
-def dense(start: NDArray[np.float64], poses: Path, length: int) -> Path:
-    """The straight ways from a pose [7] to one after another of `poses` [K, 7], at `length` places, as many a way.
+def densify_path(start: NDArray[np.float64], poses: Path, length: int) -> Path:
+    """Interpolate linearly from a pose [7] through `poses` [K, 7], at `length` points, equally many per move.
 
-    The gripper is as it was until a pose is reached.
+    The gripper changes only when a pose is reached.
     """
     stops = np.concatenate([start[None], poses])
     ends = np.rint(length * np.arange(len(stops)) / len(poses))
     at = np.arange(1, length + 1)
     path = np.empty((length, 7))
     path[:, :3] = np.stack([np.interp(at, ends, stops[:, axis]) for axis in range(3)], axis=1)
-    path[:, 3:6] = Slerp(ends, _rotations(stops))(at).as_euler("xyz")
+    path[:, 3:6] = Slerp(ends, _to_rotations(stops))(at).as_euler("xyz")
     path[:, 6] = np.where(stops[:, 6] < SHUT, 0.0, 1.0)[np.searchsorted(ends, at, side="right") - 1]
     return path
 
 
-def moving(start: NDArray[np.float64], poses: Path) -> Path:
-    """Those of `poses` [K, 7] that are no repetition of the one before, at least one."""
+def drop_repeated_poses(start: NDArray[np.float64], poses: Path) -> Path:
+    """Drop those of `poses` [K, 7] that repeat the one before; keep at least one."""
     stops = np.concatenate([start[None], poses])
-    rotations = _rotations(stops)
-    turns = RADIAN * (rotations[1:] * rotations[:-1].inv()).magnitude()
-    moves = np.linalg.norm(np.diff(stops[:, :3], axis=0), axis=1) + turns > STILL
+    rotations = _to_rotations(stops)
+    turns = METRES_PER_RADIAN * (rotations[1:] * rotations[:-1].inv()).magnitude()
+    moves = np.linalg.norm(np.diff(stops[:, :3], axis=0), axis=1) + turns > MIN_MOVE
     grips = np.diff(stops[:, 6] < SHUT)
     return poses[moves | grips] if (moves | grips).any() else poses[:1]
 
 
-def thinned(start: NDArray[np.float64], path: Path, most: int) -> Path:
-    """So many poses of a path [L, 7] that lead along it, or all of them where there are fewer.
+def thin_path(start: NDArray[np.float64], path: Path, most: int) -> Path:
+    """Choose `most` poses of a path [L, 7] that keep its shape, or all of them where there are fewer.
 
-    These are its last, those where the gripper opens or shuts, then one by one those where the straight ways between
-    them leave the path furthest.
+    These are its last pose, those where the gripper opens or closes, and then, one by one, those where straight moves
+    deviate most from the path.
     """
     if len(path) <= most:
         return path
@@ -66,13 +66,15 @@ def thinned(start: NDArray[np.float64], path: Path, most: int) -> Path:
         if len(kept) <= most and change not in kept:
             kept.append(int(change))
     while len(kept) <= most:
-        kept.append(int(np.argmax(_off(stops, sorted(kept)))))
+        kept.append(int(np.argmax(_measure_deviation(stops, sorted(kept)))))
     return stops[sorted(kept)[1:]]
 
 
-def _off(stops: Path, kept: list[int]) -> NDArray[np.float64]:
-    """[L + 1]: metres that each pose is off the straight ways between those kept; -1 of these."""
-    places, rotations, off = stops[:, :3], _rotations(stops), np.full(len(stops), -1.0)
+def _measure_deviation(stops: Path, kept: list[int]) -> NDArray[np.float64]:
+    """Return the metres by which each pose deviates from straight moves between the kept ones, [L + 1]; -1 for
+    these.
+    """
+    places, rotations, off = stops[:, :3], _to_rotations(stops), np.full(len(stops), -1.0)
     for first, last in pairwise(kept):
         between = np.arange(first + 1, last)
         way = places[last] - places[first]
@@ -80,20 +82,20 @@ def _off(stops: Path, kept: list[int]) -> NDArray[np.float64]:
         turn = (rotations[last] * rotations[first].inv()).as_rotvec()
         missing = Rotation.from_rotvec(along[:, None] * turn) * rotations[first] * rotations[between].inv()
         aside = places[between] - places[first] - along[:, None] * way
-        off[between] = np.linalg.norm(aside, axis=1) + RADIAN * missing.magnitude()
+        off[between] = np.linalg.norm(aside, axis=1) + METRES_PER_RADIAN * missing.magnitude()
     return off
 
 
 def to_vectors(poses: Path) -> NDArray[np.float32]:
-    """float32 [..., 10] of poses [..., 7]."""
+    """Convert poses [..., 7] to vectors float32 [..., 10]."""
     flat = poses.reshape(-1, 7)
-    columns = _rotations(flat).as_matrix()[:, :, :2].transpose(0, 2, 1).reshape(-1, 6)
+    columns = _to_rotations(flat).as_matrix()[:, :, :2].transpose(0, 2, 1).reshape(-1, 6)
     vectors = np.concatenate([(flat[:, :3] - MIDDLE) / SCALE, columns, flat[:, 6:]], axis=1)
     return vectors.reshape(*poses.shape[:-1], 10).astype(np.float32)
 
 
 def to_poses(vectors: NDArray[np.float32]) -> Path:
-    """The other way round; columns that are not quite a rotation's are made so, the gripper is opened or shut."""
+    """Convert vectors to poses; orthonormalise the rotations, and open or close the gripper."""
     flat = vectors.reshape(-1, 10).astype(np.float64)
     first = flat[:, 3:6] / np.linalg.norm(flat[:, 3:6], axis=1, keepdims=True)
     second = flat[:, 6:9] - (first * flat[:, 6:9]).sum(axis=1, keepdims=True) * first
@@ -103,5 +105,5 @@ def to_poses(vectors: NDArray[np.float32]) -> Path:
     return np.concatenate([MIDDLE + SCALE * flat[:, :3], angles, gripper], axis=1).reshape(*vectors.shape[:-1], 7)
 
 
-def _rotations(poses: Path) -> Rotation:
+def _to_rotations(poses: Path) -> Rotation:
     return Rotation.from_euler("xyz", poses[:, 3:6])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network's file."""
+"""The diffuser's weight file."""
 
 from __future__ import annotations
 

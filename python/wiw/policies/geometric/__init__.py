@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where was the goal image taken? Features, depth and a pose solver answer it outright when the goal is in view."""
+"""Locating the goal camera by features, depth and a pose solver, which works when the goal is in view."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 from wiw import panorama
 from wiw.policies.base import Situation
 from wiw.policies.matcher import HEADINGS, Matcher, Memory, appearance
-from wiw.policies.matcher.exploration import CELL, FAR, HALF, cells, distance_field
+from wiw.policies.matcher.exploration import CELL, FAR_DISTANCE, HALF, compute_distance_field, to_cells
 from wiw.types import Goal, Key, Observation
 
 VIEW = 320
-"""Pixels of the square views that features are taken from; HFOV 90."""
+"""Side in pixels of the square views that features are extracted from; HFOV 90."""
 YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
 RATIO = 0.8
 """Lowe's ratio test."""
 INLIERS = 14
-"""Matches that must agree on a pose before it is believed."""
+"""Least number of inliers for a pose to be accepted."""
 REACH = 8.0
-"""Metres beyond which a solved pose is not believed."""
+"""Metres beyond which a solved pose is rejected."""
 PULL = 3.0
-"""Weight of one metre nearer to the solved place, in the units of the matcher's prior."""
+"""Weight of one metre closer to the solved place, in units of the matcher's prior."""
 
 
 @dataclass
 class GeometricMemory(Memory):
-    """The matcher's memory and the solved place of the goal."""
+    """The matcher's memory, and the solved place of the goal."""
 
     keypoints: NDArray[np.float32] | None = None
     descriptors: NDArray[np.float32] | None = None
@@ -43,23 +43,23 @@ class GeometricMemory(Memory):
 
 
 class Geometric(Matcher):
-    """The matcher, drawn to where SIFT matches, true depth and PnP with RANSAC place the goal camera.
+    """The matcher, attracted to the goal camera's position by SIFT matches, true depth and PnP with RANSAC.
 
-    A classical reference beside learnt imagination: it needs depth and texture, and nothing to be imagined.
+    A classical baseline beside learned imagination: it needs depth and texture, but no imagination.
     """
 
     def begin(self, goal: Goal, key: Key) -> GeometricMemory:
-        """Features of the goal image and an empty map."""
+        """Extract features of the goal image; start with an empty map."""
         assert goal.image is not None
-        points, descriptors = _features(cv2.resize(goal.image, (VIEW, VIEW), interpolation=cv2.INTER_AREA))
-        return GeometricMemory(appearance.goal_template(goal.image), keypoints=points, descriptors=descriptors)
+        points, descriptors = _extract_features(cv2.resize(goal.image, (VIEW, VIEW), interpolation=cv2.INTER_AREA))
+        return GeometricMemory(appearance.build_goal_template(goal.image), keypoints=points, descriptors=descriptors)
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """As the matcher; besides, solves for the goal camera and keeps the best supported answer."""
+        """Observe as the matcher; besides, solve for the goal camera, and keep the answer with most inliers."""
         super().observe(situations)
         for situation in situations:
             memory: GeometricMemory = situation.memory
-            solved = goal_place(situation.observation, memory)
+            solved = locate_goal(situation.observation, memory)
             if solved is not None and solved[1] >= memory.support:
                 memory.place, memory.support = solved
 
@@ -73,47 +73,49 @@ class Geometric(Matcher):
         azimuth = odometry[2] + np.arange(HEADINGS) * 2 * np.pi / HEADINGS
         stride = np.minimum(runs, 0.6)[:, None]
         ends = odometry[:2] + stride * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
-        distance = _distance_to(memory, memory.place)
-        gain = memory.map.at(distance, odometry[None, :2])[0] - memory.map.at(distance, ends)
+        distance = _measure_distances(memory, memory.place)
+        gain = memory.map.sample_grid(distance, odometry[None, :2])[0] - memory.map.sample_grid(distance, ends)
         return prior + PULL * np.clip(gain, -1, 1), runs
 
 
-def _distance_to(memory: GeometricMemory, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Metres to the place through known free cells; straight-line metres where no way is known."""
-    free = memory.map.free()
-    free[cells(memory.map.trail[-1][:1], memory.map.trail[-1][1:])] = True
+def _measure_distances(memory: GeometricMemory, place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the metres to the place through free cells; straight-line metres where no path is known."""
+    free = memory.map.find_free_cells()
+    free[to_cells(memory.map.trail[-1][:1], memory.map.trail[-1][1:])] = True
     source = np.zeros_like(free)
-    row, column = cells(place[:1], place[1:])
+    row, column = to_cells(place[:1], place[1:])
     source[row, column] = True
     free |= source
-    walked = distance_field(free, source)
+    walked = compute_distance_field(free, source)
     centres = (np.arange(2 * HALF) - HALF + 0.5) * CELL
     straight = np.hypot(centres[:, None] - place[0], centres[None] - place[1])
-    return np.where(walked < FAR, walked, straight + 1.0)
+    return np.where(walked < FAR_DISTANCE, walked, straight + 1.0)
 
 
-def goal_place(observation: Observation, memory: GeometricMemory) -> tuple[NDArray[np.float64], int] | None:
-    """Place of the goal camera (x, y in the start frame) and its number of inliers, from one observation."""
+def locate_goal(observation: Observation, memory: GeometricMemory) -> tuple[NDArray[np.float64], int] | None:
+    """Solve for the goal camera's position (x, y in the start frame), by one observation; return it with its inlier
+    count.
+    """
     if memory.descriptors is None or len(memory.descriptors) < INLIERS or observation.depth is None:
         return None
     points, pixels = [], []
     for yaw in YAWS_DEG:
         view = panorama.to_perspective(observation.panorama, 90.0, (VIEW, VIEW), yaw_deg=yaw)
-        found, descriptors = _features(view)
+        found, descriptors = _extract_features(view)
         if descriptors is None or len(descriptors) < 2:
             continue
-        for mine, theirs in _matches(descriptors, memory.descriptors):
-            point = _lift(found[mine], yaw, observation.depth)
+        for mine, theirs in _match_descriptors(descriptors, memory.descriptors):
+            point = _unproject_pixel(found[mine], yaw, observation.depth)
             if point is not None:
                 points.append(point)
                 pixels.append(memory.keypoints[theirs])  # type: ignore[index]
-    return _solve(np.array(points), np.array(pixels), observation.odometry) if len(points) >= INLIERS else None
+    return _solve_pose(np.array(points), np.array(pixels), observation.odometry) if len(points) >= INLIERS else None
 
 
-def _solve(
+def _solve_pose(
     points: NDArray[np.float64], pixels: NDArray[np.float32], odometry: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], int] | None:
-    """PnP with RANSAC in OpenCV's camera frame (x right, y down, z ahead); the agent's camera is the origin."""
+    """Solve PnP with RANSAC in OpenCV's camera frame (x right, y down, z ahead); the agent's camera is the origin."""
     focal = VIEW / 2
     intrinsics = np.array([[focal, 0, VIEW / 2 - 0.5], [0, focal, VIEW / 2 - 0.5], [0, 0, 1]])
     cv2.setRNGSeed(0)
@@ -140,8 +142,10 @@ def _solve(
     return place, len(inliers)
 
 
-def _lift(pixel: NDArray[np.float32], yaw_deg: float, depth: NDArray[np.float32]) -> NDArray[np.float64] | None:
-    """The point seen at a view's pixel, in the frame of the front camera; None where nothing was hit."""
+def _unproject_pixel(
+    pixel: NDArray[np.float32], yaw_deg: float, depth: NDArray[np.float32]
+) -> NDArray[np.float64] | None:
+    """Return the 3D point at a view's pixel, in the frame of the front camera; None where nothing was hit."""
     x, y = (pixel[0] + 0.5) / (VIEW / 2) - 1, (pixel[1] + 0.5) / (VIEW / 2) - 1
     yaw = np.radians(yaw_deg)
     ray = np.array([x * np.cos(yaw) - np.sin(yaw), y, x * np.sin(yaw) + np.cos(yaw)])
@@ -158,8 +162,8 @@ def _sift() -> cv2.SIFT:
     return cv2.SIFT_create(600)  # type: ignore[attr-defined]
 
 
-def _features(view: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """Pixels float32 [N, 2] and root-SIFT descriptors [N, 128] (Arandjelovic and Zisserman, CVPR 2012)."""
+def _extract_features(view: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return pixels float32 [N, 2] and root-SIFT descriptors [N, 128] (Arandjelovic and Zisserman, CVPR 2012)."""
     keypoints, descriptors = _sift().detectAndCompute(cv2.cvtColor(view, cv2.COLOR_RGB2GRAY), None)
     if descriptors is None:
         return np.zeros((0, 2), np.float32), None
@@ -167,7 +171,7 @@ def _features(view: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.float
     return np.array([k.pt for k in keypoints], np.float32), descriptors.astype(np.float32)
 
 
-def _matches(mine: NDArray[np.float32], theirs: NDArray[np.float32]) -> list[tuple[int, int]]:
-    """Pairs of indices that pass the ratio test."""
+def _match_descriptors(mine: NDArray[np.float32], theirs: NDArray[np.float32]) -> list[tuple[int, int]]:
+    """Return pairs of indices that pass the ratio test."""
     pairs = cv2.BFMatcher(cv2.NORM_L2).knnMatch(mine, theirs, k=2)
     return [(p[0].queryIdx, p[0].trainIdx) for p in pairs if len(p) == 2 and p[0].distance < RATIO * p[1].distance]

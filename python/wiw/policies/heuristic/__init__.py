@@ -27,22 +27,25 @@ class Heuristic(Policy):
         self.max_turns = max_turns
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Independent draws, keyed by (seed, episode, decision, candidate); the first is what the base policy does."""
+        """Return independent random plans, keyed by (seed, episode, decision, candidate); the first is the base
+        policy's.
+        """
         return [
-            [self._plan(situation, candidate, horizon) for candidate in range(candidates)] for situation in situations
+            [self._make_plan(situation, candidate, horizon) for candidate in range(candidates)]
+            for situation in situations
         ]
 
-    def _plan(self, situation: Situation, candidate: int, horizon: int) -> Proposal:
+    def _make_plan(self, situation: Situation, candidate: int, horizon: int) -> Proposal:
         key = situation.key
         draws = core.uniform(core.fold_key([key.seed, key.episode, key.decision, candidate]), horizon)
         history = list(situation.executed)
         for draw in draws:
-            allowed = self.allowed(history)
+            allowed = self.list_allowed(history)
             history.append(allowed[int(draw * len(allowed))])
         return Proposal(np.array(history[len(situation.executed) :], np.int8))
 
-    def allowed(self, history: Sequence[int]) -> list[int]:
-        """Primitives that may follow `history`."""
+    def list_allowed(self, history: Sequence[int]) -> list[int]:
+        """Return the primitives that may follow `history`."""
         last = history[-1] if history else None
         undoing = None if last is None else INVERSE.get(last)
         turns = 0

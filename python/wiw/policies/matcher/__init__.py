@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A policy without a VLM: straight runs in diverse headings, judged by colour, edges and a map of the unexplored."""
+"""A policy without a VLM: straight runs in diverse headings, scored by colour, edges and a map of unexplored space."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from wiw import panorama
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.errors import ArgumentError
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.matcher import appearance
 from wiw.policies.matcher.exploration import ExplorationMap
@@ -21,7 +22,7 @@ HEADINGS = 16
 TURN = 2 * np.pi / HEADINGS
 STEP = 0.2
 SAME_PLACE = 0.15
-"""Metres within which a place that was imagined before tells about this one."""
+"""Metres within which a place imagined before informs about this one."""
 
 
 @dataclass(frozen=True)
@@ -29,35 +30,35 @@ class MatcherOptions:
     """Weights, tuned on apartments of the train and val splits."""
 
     histogram: float = 2.0
-    """Of the overlap between the goal's colours and those seen in a heading."""
+    """Weight of the overlap between the goal's colours and those seen in a heading."""
     frontier: float = 1.0
-    """Per metre gained towards the place most worth exploring."""
+    """Weight per metre gained towards the frontier most worth exploring."""
     likeness: float = 4.0
-    """What makes a frontier worth it: how much the views towards it look like the goal,"""
+    """A frontier's worth: this times how much the views towards it look like the goal,"""
     travel: float = 0.1
-    """less this for each metre of the way there."""
+    """less this for each metre to it."""
     novelty: float = 0.3
-    """Per metre (at most one) from where the agent has been."""
+    """Weight per metre (at most one) of distance from the agent's trail."""
     turn: float = 0.04
     """Cost of one turn."""
     imagined: float = 1.5
-    """Of the best imagined similarity less the present one."""
+    """Weight of the best imagined similarity less the present one."""
     near: float = 4.0
-    """How much more it weighs when the goal is near."""
+    """How much more that weighs when the goal is near."""
     calm: float = 0.8
     """Share of the exploration terms that fades when the goal is near."""
     gate: float = 2.5
-    """Similarity at which the goal counts as near with probability one half."""
+    """Similarity at which the goal is near with probability one half."""
     gate_width: float = 0.15
     spread: int = 3
     """Least difference between headings of imagined plans, in turns, when the goal is near."""
     reach: float = 1.0
-    """Metres ahead at which a heading is judged."""
+    """Metres ahead at which a heading is evaluated."""
 
 
 @dataclass
 class Memory:
-    """What the matcher knows of one episode."""
+    """The memory of one episode."""
 
     goal: appearance.GoalTemplate
     map: ExplorationMap = field(default_factory=ExplorationMap)
@@ -65,66 +66,72 @@ class Memory:
     """Similarity of the present place at each heading column."""
     gate: float = 0.0
     histogram: NDArray[np.float32] = field(default_factory=lambda: np.zeros(HEADINGS, np.float32))
-    imagined: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
-    """Position in the start frame and similarity of every place that was imagined."""
-    recalled: dict[bytes, float] = field(default_factory=dict)
-    """Of each plan proposed last, the similarity gained over the present one by what was imagined of it before."""
-    planned: NDArray[np.int8] | None = None
-    """The plan that was chosen last; where it did not lead anywhere, something unseen is in the way."""
+    imagined_places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
+    """Position in the start frame and similarity of every imagined place."""
+    recalled_gains: dict[bytes, float] = field(default_factory=dict)
+    """By plan proposed last: the gain in similarity that earlier imagination promised for it."""
+    last_plan: NDArray[np.int8] | None = None
+    """The plan chosen last; if it did not move the agent, something unseen is in the way."""
     places: list[tuple[NDArray[np.float64], float]] = field(default_factory=list)
-    """Odometry and similarity of every place the agent has really seen."""
+    """Odometry and similarity of every place the agent has really visited."""
 
     @property
     def similarity(self) -> float:
-        """Of the present place, best over headings."""
+        """Similarity of the present place, best over headings."""
         return float(self.profile.max())
 
 
 class Matcher(Policy):
-    """Explores where nothing matches, climbs the similarity to the goal image where something does.
+    """Explores where nothing matches, and climbs the similarity to the goal image where something does.
 
     Without a world model it takes the best of all 16 headings by what it really sees; with one, the best plans are
-    imagined and the similarity of the imagined places decides between them.
+    imagined, and the similarity of the imagined places decides between them.
     """
 
     needs = ("depth",)
     frames = FrameSpec("panorama", appearance.PANORAMA)
 
     def __init__(self, **options: Any) -> None:
+        known = [field.name for field in fields(MatcherOptions)]
+        for name, value in options.items():
+            if name not in known:
+                raise ArgumentError(f"policy matcher: unknown option '{name}'; there are {', '.join(known)}")
+            if isinstance(value, bool) or not isinstance(value, int | float):
+                raise ArgumentError(f"policy matcher: expected a number for {name}, got {value!r}")
         self.options = MatcherOptions(**options)
 
     def describe(self) -> dict[str, Any]:
-        """Name and weights."""
+        """Return name and weights."""
         return {"policy": type(self).__name__, **asdict(self.options)}
 
     def begin(self, goal: Goal, key: Key) -> Memory:
-        """Features of the goal image and an empty map."""
+        """Extract features of the goal image; start with an empty map."""
         assert goal.image is not None
-        return Memory(appearance.goal_template(goal.image))
+        return Memory(appearance.build_goal_template(goal.image))
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Extends each map and measures how much the present place looks like the goal's."""
-        bands = _bands(situations)
+        """Extend each map, and measure the similarity of the present place to the goal."""
+        bands = _extract_bands(situations)
         for i, situation in enumerate(situations):
             memory: Memory = situation.memory
-            likeness = self._look(memory, bands.place(i))
+            likeness = self._measure_place(memory, bands.take(i))
             observation = situation.observation
             assert observation.depth is not None
-            if memory.planned is not None and FORWARD in memory.planned[:2]:
-                memory.map.note_blocked(observation.odometry)
+            if memory.last_plan is not None and FORWARD in memory.last_plan[:2]:
+                memory.map.mark_blocked(observation.odometry)
             memory.map.update(observation.depth[1::2, 4::8], observation.odometry, likeness)
             memory.places.append((observation.odometry, memory.similarity))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """The best headings by what is really seen, as straight runs; spread out once the goal is near."""
-        return [self._propose(situation, candidates, horizon) for situation in situations]
+        """Return the best headings by what is really seen, as straight runs; spread out once the goal is near."""
+        return [self._propose_one(situation, candidates, horizon) for situation in situations]
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """As `propose`, from imagined places: by what is imagined there, on the map of what was really seen."""
-        bands = _bands(situations)
+        """Propose from imagined places, by what is imagined there and the map of what was really seen."""
+        bands = _extract_bands(situations)
         there = [replace(s, memory=replace(s.memory)) for s in situations]
         for i, situation in enumerate(there):
-            self._look(situation.memory, bands.place(i))
+            self._measure_place(situation.memory, bands.take(i))
         return self.propose(there, candidates, horizon)
 
     def score(
@@ -133,9 +140,9 @@ class Matcher(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """Prior plus the gain in similarity that the imagined places promise, where it differs from what is recalled.
+        """Return the prior plus the imagined gain in similarity, where it differs from the recalled one.
 
-        The imagined places are remembered, so that a heading keeps its promise while others are imagined.
+        Imagined places are remembered, so that a heading keeps its promise while others are imagined.
         """
         scores = []
         for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
@@ -143,50 +150,52 @@ class Matcher(Policy):
             odometry = situation.observation.odometry
             surprises = []
             for plan, future in zip(plans, futures, strict=True):
-                gain = imagined_gain(memory, odometry, plan, future)
-                surprises.append(0.0 if gain is None else gain - memory.recalled.get(plan.actions.tobytes(), 0.0))
+                gain = measure_imagined_gain(memory, odometry, plan, future)
+                surprises.append(0.0 if gain is None else gain - memory.recalled_gains.get(plan.actions.tobytes(), 0.0))
             scores.append(np.array([plan.prior for plan in plans]) + self._weight(memory) * np.array(surprises))
         return scores
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[np.int8], int | None]:
-        """The best plan, remembered to notice whether it leads anywhere."""
-        situation.memory.planned, chosen = super().revise(situation, proposals, scores)
-        return situation.memory.planned, chosen
+        """Return the best plan; remember it, to notice whether it moves the agent."""
+        situation.memory.last_plan, chosen = super().revise(situation, proposals, scores)
+        return situation.memory.last_plan, chosen
 
-    def _look(self, memory: Memory, band: appearance.Band) -> NDArray[np.float32]:
-        """Measures a place against the goal; float32 [128], the likeness of each column's view."""
+    def _measure_place(self, memory: Memory, band: appearance.Band) -> NDArray[np.float32]:
+        """Measure a place against the goal; return the similarity of each column's view, float32 [128]."""
         likeness = appearance.histogram_similarity(band, memory.goal)[0]
         memory.profile = appearance.similarity(band, memory.goal)[0]
         memory.gate = 1 / (1 + np.exp(-(memory.similarity - self.options.gate) / self.options.gate_width))
-        memory.histogram = at_headings(likeness)
+        memory.histogram = sample_headings(likeness)
         return likeness
 
     def _weight(self, memory: Memory) -> float:
         return self.options.imagined * (1 + self.options.near * memory.gate)
 
-    def _propose(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
+    def _propose_one(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         memory: Memory = situation.memory
         odometry = situation.observation.odometry
         priors, runs = self._judge_headings(memory, odometry)
-        recalled = recall(memory, odometry, runs)
+        recalled = recall_gains(memory, odometry, runs)
         priors = priors + self._weight(memory) * recalled
         order = [int(k) for k in np.argsort(-priors, kind="stable")]
-        plans = {k: straight_run(k, horizon, int(runs[k] / STEP)) for k in order}
+        plans = {k: plan_straight_run(k, horizon, int(runs[k] / STEP)) for k in order}
         apart = self.options.spread if memory.gate > 0.5 else 1
-        chosen = diverse(order, plans, apart, candidates)
-        memory.recalled = {plans[k].tobytes(): float(recalled[k]) for k in chosen}
+        chosen = choose_diverse(order, plans, apart, candidates)
+        memory.recalled_gains = {plans[k].tobytes(): float(recalled[k]) for k in chosen}
         return [Proposal(plans[k], prior=float(priors[k])) for k in chosen]
 
     def _judge_headings(
         self, memory: Memory, odometry: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Prior of each heading and the metres that are free ahead; heading k is k left turns away."""
+        """Return the prior of each heading and the free metres ahead; heading k is k left turns away."""
         options = self.options
         distance = memory.map.distance_to_target(options.likeness, options.travel)
         runs, ends = memory.map.look_ahead(odometry, HEADINGS, options.reach)
-        progress = np.clip(memory.map.at(distance, odometry[None, :2])[0] - memory.map.at(distance, ends), -1.5, 1.5)
+        progress = np.clip(
+            memory.map.sample_grid(distance, odometry[None, :2])[0] - memory.map.sample_grid(distance, ends), -1.5, 1.5
+        )
         novelty = np.minimum(memory.map.distance_to_trail(ends), 1.0)
         turns = np.array([circular_distance(k, 0) for k in range(HEADINGS)])
         calm = 1 - options.calm * memory.gate
@@ -198,33 +207,33 @@ class Matcher(Policy):
         return prior - 2.0 * (runs < STEP), runs
 
 
-def _bands(situations: Sequence[Situation]) -> appearance.Band:
+def _extract_bands(situations: Sequence[Situation]) -> appearance.Band:
     panoramas = np.stack([situation.observation.panorama for situation in situations])
-    return appearance.describe(panorama.resize(panoramas, appearance.PANORAMA))
+    return appearance.extract_features(panorama.resize(panoramas, appearance.PANORAMA))
 
 
-def at_headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[16] values at the headings k = 0, 1, ... left turns from a [128] row over panorama columns."""
+def sample_headings(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the values [16] at headings k = 0, 1, ... left turns from a row [128] over panorama columns."""
     width = len(columns)
     centres = (width // 2 - np.arange(HEADINGS) * width // HEADINGS) % width
     return columns[centres]
 
 
 def circular_distance(a: int, b: int) -> int:
-    """Turns between two headings."""
+    """Return the number of turns between two headings."""
     difference = abs(a - b) % HEADINGS
     return min(difference, HEADINGS - difference)
 
 
-def straight_run(heading: int, horizon: int, free_steps: int) -> NDArray[np.int8]:
-    """Turns towards `heading` (left turns, 0..15), then forward; at least one primitive, at most `horizon`."""
+def plan_straight_run(heading: int, horizon: int, free_steps: int) -> NDArray[np.int8]:
+    """Turn towards `heading` (left turns, 0..15), then step forward; at least one primitive, at most `horizon`."""
     turns = heading if heading <= HEADINGS // 2 else heading - HEADINGS
     plan = [TURN_LEFT if turns > 0 else TURN_RIGHT] * abs(turns) + [FORWARD] * max(free_steps, 1)
     return np.array(plan[:horizon], np.int8)
 
 
-def diverse(order: list[int], plans: dict[int, NDArray[np.int8]], apart: int, count: int) -> list[int]:
-    """The first `count` headings of `order` that are `apart` turns from each other, then any; no plan twice."""
+def choose_diverse(order: list[int], plans: dict[int, NDArray[np.int8]], apart: int, count: int) -> list[int]:
+    """Choose the first `count` headings of `order` that are `apart` turns from each other, then any; no plan twice."""
     chosen: list[int] = []
     for least in (apart, 1):
         for k in order:
@@ -236,12 +245,12 @@ def diverse(order: list[int], plans: dict[int, NDArray[np.int8]], apart: int, co
     return chosen
 
 
-def recall(memory: Memory, odometry: NDArray[np.float64], runs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """float64 [16]: best similarity that was imagined along each heading's run, over the present one; 0 if unknown."""
+def recall_gains(memory: Memory, odometry: NDArray[np.float64], runs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the best gain in similarity imagined along each heading's run, float64 [16]; 0 if unknown."""
     gains = np.zeros(HEADINGS)
-    if not memory.imagined:
+    if not memory.imagined_places:
         return gains
-    points, values = np.stack([p for p, _ in memory.imagined]), np.array([v for _, v in memory.imagined])
+    points, values = np.stack([p for p, _ in memory.imagined_places]), np.array([v for _, v in memory.imagined_places])
     for k in range(HEADINGS):
         azimuth = odometry[2] + k * TURN
         steps = np.arange(STEP, max(runs[k], STEP) + 1e-9, STEP)[:, None]
@@ -254,29 +263,31 @@ def recall(memory: Memory, odometry: NDArray[np.float64], runs: NDArray[np.float
     return gains
 
 
-def imagined_gain(memory: Memory, odometry: NDArray[np.float64], plan: Proposal, rollout: Rollout) -> float | None:
-    """How much better the best place of the plan looks than the present one; None where no new place was imagined.
+def measure_imagined_gain(
+    memory: Memory, odometry: NDArray[np.float64], plan: Proposal, rollout: Rollout
+) -> float | None:
+    """Return the gain in similarity at the plan's best imagined place; None where no new place was imagined.
 
     Panoramas are compared over all headings; the front views of a perspective model only with what is seen now in the
-    direction that the plan ends in. The places are remembered.
+    direction in which the plan ends. The places are remembered.
     """
-    positions = positions_after(odometry, plan.actions)
+    positions = predict_positions(odometry, plan.actions)
     new = ~rollout.real & (np.linalg.norm(positions - odometry[:2], axis=1) > 0)
     if not new.any():
         return None
     if rollout.view == "panorama":
-        values = appearance.similarity(appearance.describe(rollout.frames[new]), memory.goal).max(1)
+        values = appearance.similarity(appearance.extract_features(rollout.frames[new]), memory.goal).max(1)
     else:
         bands = np.stack([appearance.project_front(frame)[0] for frame in rollout.frames[new]])
-        ahead = appearance.similarity(appearance.describe(bands), memory.goal)[:, appearance.COLUMNS // 2]
+        ahead = appearance.similarity(appearance.extract_features(bands), memory.goal)[:, appearance.COLUMNS // 2]
         turns = int((plan.actions == TURN_LEFT).sum() - (plan.actions == TURN_RIGHT).sum())
-        values = memory.similarity + ahead - at_headings(memory.profile)[turns % HEADINGS]
-    memory.imagined += [(p, float(v)) for p, v in zip(positions[new], values, strict=True)]
+        values = memory.similarity + ahead - sample_headings(memory.profile)[turns % HEADINGS]
+    memory.imagined_places += [(p, float(v)) for p, v in zip(positions[new], values, strict=True)]
     return float(values.max()) - memory.similarity
 
 
-def positions_after(odometry: NDArray[np.float64], actions: NDArray[np.int8]) -> NDArray[np.float64]:
-    """float64 [K, 2]: where each of the primitives ends if none is refused, in the frame of `odometry`."""
+def predict_positions(odometry: NDArray[np.float64], actions: NDArray[np.int8]) -> NDArray[np.float64]:
+    """Return where each primitive ends if none is refused, in the frame of `odometry`: float64 [K, 2]."""
     forward, left = to_trajectory(actions)[:, :2].T
     x, y, azimuth = odometry
     cos, sin = np.cos(azimuth), np.sin(azimuth)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much a place looks like that of the goal image: colour histograms and normalised correlation, all headings.
+"""Similarity of a place to the goal image: colour histograms and normalised correlation, over all headings.
 
 A panorama is reduced to a band of 32 x 128 pixels, latitudes within 45 degrees, 2.8 degrees a column; the goal's
 90-degree view covers 32 of those columns. The similarity of a place is the best over all 128 headings, so that turning
-on the spot gains nothing: what counts is where one stands.
+on the spot gains nothing: only the position counts.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ ROWS = slice(16, 48)
 COLUMNS = 128
 WINDOW = 32
 BINS = (5, 16, 16)
-"""Of L, a, b."""
+"""Histogram bins of L, a, b."""
 LAYERS = 2
-"""The band's upper and lower half have histograms of their own: what is on the floor is not what is on the wall."""
+"""The band's upper and lower half have separate histograms: the floor is not the wall."""
 HISTOGRAM_WEIGHT = 2.0
 
 
@@ -37,8 +37,8 @@ class Band:
     bins: NDArray[np.intp]
     """[N, 32, W]: each pixel's histogram bin, by layer and Lab."""
 
-    def place(self, index: int) -> Band:
-        """One of the N places."""
+    def take(self, index: int) -> Band:
+        """Return one of the N places."""
         one = slice(index, index + 1)
         return Band(self.colors[one], self.edges[one], self.bins[one])
 
@@ -50,32 +50,32 @@ class GoalTemplate:
     colors: NDArray[np.float32]
     edges: NDArray[np.float32]
     bins: NDArray[np.intp]
-    """[all bins]: number of each bin among the goal's own, or one more than the last for bins it lacks."""
+    """[all bins]: index of each bin among the goal's own, or one past the last for bins it lacks."""
     shares: NDArray[np.float32]
     """[goal's own bins]: share of the goal's pixels; sums to one."""
     mask: NDArray[np.float32]
 
 
-def goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
-    """Features of a goal view uint8 [S, S, 3] with HFOV 90."""
+def build_goal_template(image: NDArray[np.uint8]) -> GoalTemplate:
+    """Extract features of a goal view uint8 [S, S, 3] with HFOV 90."""
     band, mask = project_front(image)
-    features = describe(band[None])
+    features = extract_features(band[None])
     window = slice(COLUMNS // 2 - WINDOW // 2, COLUMNS // 2 + WINDOW // 2)
     weights = mask[:, window].astype(np.float32)
     own, counts = np.unique(features.bins[0][:, window][weights > 0], return_counts=True)
     numbers = np.full(LAYERS * int(np.prod(BINS)), len(own), np.intp)
     numbers[own] = np.arange(len(own))
     return GoalTemplate(
-        colors=_normalised(features.colors[0][..., window], weights),
-        edges=_normalised(features.edges[0][..., window], weights),
+        colors=_normalise(features.colors[0][..., window], weights),
+        edges=_normalise(features.edges[0][..., window], weights),
         bins=numbers,
         shares=(counts / counts.sum()).astype(np.float32),
         mask=weights,
     )
 
 
-def describe(panoramas: NDArray[np.uint8]) -> Band:
-    """Features of panoramas uint8 [N, 64, 128, 3]."""
+def extract_features(panoramas: NDArray[np.uint8]) -> Band:
+    """Extract features of panoramas uint8 [N, 64, 128, 3]."""
     bands = panoramas[:, ROWS]
     labs = [_lab(band) for band in bands]
     return Band(
@@ -86,7 +86,7 @@ def describe(panoramas: NDArray[np.uint8]) -> Band:
 
 
 def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
-    """float32 [N, 128]: 2 x histogram overlap + colour correlation + edge correlation, for each heading column.
+    """Return float32 [N, 128]: 2 x histogram overlap + colour correlation + edge correlation, for each heading column.
 
     Column c is the centre of the compared window; the highest possible value is 4.
     """
@@ -97,9 +97,9 @@ def similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
 
 
 def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32]:
-    """float32 [N, 128]: Bhattacharyya coefficient of the goal's and each window's histogram over layers and Lab.
+    """Return the Bhattacharyya coefficient of the goal's and each window's histogram: float32 [N, 128].
 
-    Only bins that the goal has count, so only those are summed.
+    Only bins that the goal has contribute, so only those are summed.
     """
     numbers, own = goal.bins[places.bins], len(goal.shares)
     count, rows, width = numbers.shape
@@ -112,7 +112,7 @@ def histogram_similarity(places: Band, goal: GoalTemplate) -> NDArray[np.float32
 
 
 def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """A 90-degree view uint8 [S, S, 3] as a panorama uint8 [64, 128, 3], and the band's mask [32, 128].
+    """Project a 90-degree view uint8 [S, S, 3] to a panorama uint8 [64, 128, 3]; also return the band's mask [32, 128].
 
     Its border is continued outside, so that blurring finds no edge there.
     """
@@ -125,7 +125,7 @@ def project_front(image: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[
 
 @cache
 def _front_map() -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Where each panorama pixel looks up a 64 x 64 view of 90 degrees, and whether it is inside."""
+    """Return where each panorama pixel looks up a 64 x 64 view of 90 degrees, and whether it is inside."""
     height, width = PANORAMA
     longitude = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
     latitude = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
@@ -144,12 +144,12 @@ def _lab(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _color_map(lab: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[3, 32, W]: Lab, blurred so that a place a step away still correlates."""
+    """Return Lab [3, 32, W], blurred so that a place a step away still correlates."""
     return _blur(lab, 2.0).transpose(2, 0, 1)
 
 
 def _edge_map(lab: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[4, 32, W]: strength of lightness edges in four orientations, blurred."""
+    """Return the strength of lightness edges in four orientations, blurred: [4, 32, W]."""
     light = cv2.copyMakeBorder(lab[..., 0], 1, 1, 1, 1, cv2.BORDER_WRAP)
     dx, dy = cv2.Sobel(light, cv2.CV_32F, 1, 0)[1:-1, 1:-1], cv2.Sobel(light, cv2.CV_32F, 0, 1)[1:-1, 1:-1]
     dy[[0, -1]] = 0  # the wrap that is right for columns is wrong for rows
@@ -168,15 +168,15 @@ def _blur(image: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
 
 
 def _bins(lab: NDArray[np.float32]) -> NDArray[np.intp]:
-    """[H, W]: index of each pixel's bin; chroma within 40 covers what rooms show."""
+    """Return the index of each pixel's bin, [H, W]; chroma within 40 covers what rooms show."""
     scaled = np.stack([lab[..., 0] / 100, lab[..., 1] / 80 + 0.5, lab[..., 2] / 80 + 0.5], -1)
     cells = np.clip((scaled * BINS).astype(np.intp), 0, np.array(BINS) - 1)
     layer = np.arange(len(lab))[:, None] * LAYERS // len(lab)
     return layer * int(np.prod(BINS)) + np.ravel_multi_index(tuple(np.moveaxis(cells, -1, 0)), BINS)
 
 
-def _normalised(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Zero mean within the mask per channel, unit norm over all channels."""
+def _normalise(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Normalise to zero mean within the mask per channel, and unit norm over all channels."""
     centred = (values - (values * mask).sum((-2, -1), keepdims=True) / mask.sum()) * mask
     return (centred / max(float(np.linalg.norm(centred)), 1e-6)).astype(np.float32)
 
@@ -184,7 +184,7 @@ def _normalised(values: NDArray[np.float32], mask: NDArray[np.float32]) -> NDArr
 def _correlation(
     places: NDArray[np.float32], goal: NDArray[np.float32], mask: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """[N, 128]: normalised correlation of the goal with the window centred at each column, by FFT over columns.
+    """Return the normalised correlation of the goal with the window centred at each column, by FFT: [N, 128].
 
     With w the goal's mask of n pixels and f a channel: sum (f - mean) g = sum f g because g has zero mean, and the
     window's energy is sum over channels of sum w f^2 - (sum w f)^2 / n.

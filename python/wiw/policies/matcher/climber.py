@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The matcher with a memory: it climbs the similarity of the places it has really seen."""
+"""The matcher with a memory of similarities: it climbs their slope over the places it has really visited."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 from wiw.policies.matcher import HEADINGS, Matcher, Memory
 
 NEIGHBOURHOOD = 1.5
-"""Metres within which remembered places tell about the slope here."""
+"""Metres within which remembered places inform about the slope here."""
 RIDGE = 0.3
-"""Keeps the slope small where few places are remembered."""
+"""Ridge penalty, which keeps the slope small where few places are remembered."""
 
 
 class Climber(Matcher):
-    """A base policy that gets from its own past what a world model gets from imagination: which way the match improves.
+    """Estimates from real observations what a world model would imagine: in which direction the match improves.
 
-    Its score without a world model is the fair figure to beat for one who asks whether imagination was needed at all.
+    Its score without a world model is the fair baseline for the question whether imagination was needed at all.
     """
 
     def _judge_headings(
@@ -32,7 +32,7 @@ class Climber(Matcher):
 
 
 def similarity_slope(memory: Memory, here: NDArray[np.float64]) -> NDArray[np.float64]:
-    """float64 [2]: slope of the similarity per metre at `here`, by ridge regression over the places nearby."""
+    """Return the slope of the similarity per metre at `here`, by ridge regression over nearby places: float64 [2]."""
     points = np.array([place[:2] for place, _ in memory.places])
     values = np.array([value for _, value in memory.places])
     near = np.linalg.norm(points - here, axis=1) < NEIGHBOURHOOD

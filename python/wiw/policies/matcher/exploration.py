@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of what has been seen, built from panorama depth and odometry, and the way to its frontiers."""
+"""A map of explored space, built from panorama depth and odometry, and distances to its frontiers."""
 
 from __future__ import annotations
 
@@ -17,27 +17,29 @@ CELL = 0.1
 HALF = 160
 """Cells from the start to the map's edge."""
 RANGE = 4.0
-"""Metres up to which depth counts as seen."""
+"""Metres up to which depth marks space as explored."""
 CAMERA_HEIGHT = 1.0
 OBSTACLE = (0.25, 1.5)
-"""Heights above the floor, in metres, at which a surface blocks the agent."""
-FAR = 30.0
+"""Heights above the floor, in metres, between which a surface blocks the agent."""
+FAR_DISTANCE = 30.0
 
 
 @dataclass
 class ExplorationMap:
-    """Grid in the start frame: x forward (rows), y left (columns)."""
+    """A grid in the start frame: x forward (rows), y left (columns)."""
 
-    seen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), bool))
+    explored: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), bool))
     occupied: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.uint8))
     likeness: NDArray[np.float32] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.float32))
-    """How much the views in the direction of each cell looked like the goal; the mean over the times it was seen."""
+    """Mean similarity to the goal of the views in the direction of each cell."""
     times: NDArray[np.float32] = field(default_factory=lambda: np.zeros((2 * HALF, 2 * HALF), np.float32))
     trail: list[NDArray[np.float64]] = field(default_factory=list)
 
     def update(self, depth: NDArray[np.float32], odometry: NDArray[np.float64], likeness: NDArray[np.float32]) -> None:
-        """Adds one panorama of distances float32 [H, W] seen from (x, y, azimuth); `likeness` [W] of each column."""
-        rays, height = _rays(depth.shape)
+        """Add a panorama of distances float32 [H, W] at (x, y, azimuth); `likeness` [W] is the similarity of each
+        column.
+        """
+        rays, height = _get_rays(depth.shape)
         azimuth = odometry[2] + rays["azimuth"]
         flat = depth * rays["cos_latitude"]
         floor_height = CAMERA_HEIGHT + depth * height
@@ -45,12 +47,12 @@ class ExplorationMap:
         solid = hit & (floor_height > OBSTACLE[0]) & (floor_height < OBSTACLE[1])
         x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
         ground = hit & (np.abs(floor_height) < 0.12)
-        self.seen[cells(x[ground], y[ground])] = True
+        self.explored[to_cells(x[ground], y[ground])] = True
         self._sweep(np.where(solid, flat, np.inf).min(0), azimuth, odometry, likeness)
-        self.occupied[cells(x[solid], y[solid])] = 1
+        self.occupied[to_cells(x[solid], y[solid])] = 1
         self.trail.append(np.array(odometry[:2]))
-        here = cells(np.array([odometry[0]]), np.array([odometry[1]]))
-        self.seen[here] = True
+        here = to_cells(np.array([odometry[0]]), np.array([odometry[1]]))
+        self.explored[here] = True
 
     def _sweep(
         self,
@@ -59,98 +61,104 @@ class ExplorationMap:
         odometry: NDArray[np.float64],
         likeness: NDArray[np.float32],
     ) -> None:
-        """Marks what lies in front of the nearest obstacle of each column as seen."""
+        """Mark the space in front of each column's nearest obstacle as explored."""
         steps = np.arange(0.05, RANGE, CELL / 2)[:, None]
         inside = steps < np.minimum(reach, RANGE)[None] - CELL
         x, y = odometry[0] + steps * np.cos(azimuth), odometry[1] + steps * np.sin(azimuth)
-        here = cells(x[inside], y[inside])
-        self.seen[here] = True
+        here = to_cells(x[inside], y[inside])
+        self.explored[here] = True
         self.times[here] += 1
         values = np.broadcast_to(likeness, inside.shape)[inside]
         self.likeness[here] += (values - self.likeness[here]) / self.times[here]
 
-    def note_blocked(self, odometry: NDArray[np.float64]) -> None:
-        """Marks what is just ahead as solid if the agent has not moved since the last update: its step was refused."""
+    def mark_blocked(self, odometry: NDArray[np.float64]) -> None:
+        """Mark the cell ahead as occupied if the agent has not moved since the last update: its step was refused."""
         if self.trail and np.linalg.norm(odometry[:2] - self.trail[-1]) < 1e-3:
             ahead = odometry[:2] + 2.5 * CELL * np.array([np.cos(odometry[2]), np.sin(odometry[2])])
-            self.occupied[cells(ahead[:1], ahead[1:])] = 1
+            self.occupied[to_cells(ahead[:1], ahead[1:])] = 1
 
-    def free(self) -> NDArray[np.bool_]:
-        """Cells where the agent may stand: seen, and further than its radius from anything solid."""
-        return self.seen & ~_grown(self.occupied > 0)
+    def find_free_cells(self) -> NDArray[np.bool_]:
+        """Return the cells where the agent may stand: explored, and further than its radius from any obstacle."""
+        return self.explored & ~_dilate(self.occupied > 0)
 
     def look_ahead(
         self, odometry: NDArray[np.float64], headings: int, reach: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Free metres ahead in each of `headings` directions, at most `reach`, and the points [headings, 2] there."""
+        """Return the free metres in each of `headings` directions, at most `reach`, and their end points [headings,
+        2].
+        """
         azimuth = odometry[2] + np.arange(headings) * 2 * np.pi / headings
         steps = np.arange(CELL / 2, reach + 1e-9, CELL / 2)
         x = odometry[0] + steps * np.cos(azimuth)[:, None]
         y = odometry[1] + steps * np.sin(azimuth)[:, None]
-        clear = self.free()[cells(x, y)]
+        clear = self.find_free_cells()[to_cells(x, y)]
         clear |= steps < 1.5 * CELL  # the agent stands there already
         runs = np.where(clear.all(1), reach, steps[np.argmin(clear, axis=1)] - CELL / 2)
         ends = odometry[:2] + runs[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], 1)
         return runs, ends
 
-    def at(self, values: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values of a grid at points [N, 2] in metres."""
-        return values[cells(points[:, 0], points[:, 1])]
+    def sample_grid(self, values: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a grid's values at points [N, 2] in metres."""
+        return values[to_cells(points[:, 0], points[:, 1])]
 
     def distance_to_trail(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Metres from points [N, 2] to the nearest place the agent has been."""
+        """Return the metres from points [N, 2] to the nearest place the agent has been."""
         return np.linalg.norm(points[:, None] - np.stack(self.trail)[None], axis=2).min(1)
 
     def distance_to_target(self, likeness: float, travel: float) -> NDArray[np.float64]:
-        """Metres from each free cell to the frontier most worth going to; FAR everywhere where none can be reached.
+        """Return the metres from each free cell to the best frontier; FAR_DISTANCE where none can be reached.
 
-        A frontier is worth `likeness` times how much the views towards it look like the goal, less `travel` a metre.
+        A frontier's worth is `likeness` times the similarity of the views towards it, less `travel` per metre.
         """
-        free = self.free()
+        free = self.find_free_cells()
         here = np.zeros_like(free)
-        row, column = cells(self.trail[-1][:1], self.trail[-1][1:])
+        row, column = to_cells(self.trail[-1][:1], self.trail[-1][1:])
         here[row, column] = free[row, column] = True
-        way = distance_field(free, here)
-        worth = np.where(self._frontier(free) & (way < FAR), likeness * self.likeness - travel * way, -np.inf)
+        way = compute_distance_field(free, here)
+        worth = np.where(
+            self._find_frontier(free) & (way < FAR_DISTANCE), likeness * self.likeness - travel * way, -np.inf
+        )
         best = np.unravel_index(int(np.argmax(worth)), worth.shape)
         target = np.zeros_like(free)
         target[best] = np.isfinite(worth[best])
-        return distance_field(free, target)
+        return compute_distance_field(free, target)
 
-    def _frontier(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Free cells beside unseen ones, in clusters of at least three."""
-        unknown = ~self.seen & ~(self.occupied > 0)
-        frontier = free & _grown(unknown)
+    def _find_frontier(self, free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return free cells beside unexplored ones, in clusters of at least three."""
+        unknown = ~self.explored & ~(self.occupied > 0)
+        frontier = free & _dilate(unknown)
         labels, _ = ndimage.label(frontier, np.ones((3, 3)))
         return frontier & (np.bincount(labels.ravel())[labels] >= 3)
 
 
-def cells(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of positions in metres, clipped to the map."""
+def to_cells(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Convert positions in metres to row and column, clipped to the map."""
     row = np.clip(np.floor(x / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
     column = np.clip(np.floor(y / CELL).astype(np.intp) + HALF, 0, 2 * HALF - 1)
     return row, column
 
 
-def distance_field(free: NDArray[np.bool_], sources: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Metres from each free cell to the nearest source over 8-connected free cells; FAR where unreachable."""
-    field_ = np.full(free.shape, FAR)
+def compute_distance_field(free: NDArray[np.bool_], sources: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the metres from each free cell to the nearest source over 8-connected free cells; FAR_DISTANCE where
+    unreachable.
+    """
+    field_ = np.full(free.shape, FAR_DISTANCE)
     if not sources.any():
         return field_
     rows, columns = np.nonzero(free)
     top, left = rows.min(), columns.min()
     box = (slice(top, rows.max() + 1), slice(left, columns.max() + 1))
-    graph, index = _grid_graph(free[box])
+    graph, index = _build_grid_graph(free[box])
     starts = index[box_sources] if (box_sources := sources[box]).any() else np.array([], np.intp)
     distance = csgraph.dijkstra(graph, directed=False, indices=starts, min_only=True)
-    inner = np.full(index.shape, FAR)
-    inner[free[box]] = np.minimum(distance, FAR)
+    inner = np.full(index.shape, FAR_DISTANCE)
+    inner[free[box]] = np.minimum(distance, FAR_DISTANCE)
     field_[box] = inner
     return field_
 
 
-def _grid_graph(free: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.intp]]:
-    """8-connected graph of the free cells, with metres as weights, and each cell's node."""
+def _build_grid_graph(free: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.intp]]:
+    """Build the 8-connected graph of the free cells, weighted by metres; also return each cell's node."""
     index = np.cumsum(free.ravel()).reshape(free.shape) - 1
     heads, tails, weights = [], [], []
     height, width = free.shape
@@ -167,14 +175,14 @@ def _grid_graph(free: NDArray[np.bool_]) -> tuple[sparse.csr_array, NDArray[np.i
 
 
 @cache
-def _rays(shape: tuple[int, int]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
-    """Azimuth (left positive) of each column, cosine and sine of the latitude of each row."""
+def _get_rays(shape: tuple[int, int]) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64]]:
+    """Return azimuth (left positive) of each column, and cosine and sine of each row's latitude."""
     height, width = shape
     azimuth = np.pi - (np.arange(width) + 0.5) / width * 2 * np.pi
     latitude = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
     return {"azimuth": azimuth, "cos_latitude": np.cos(latitude)[:, None]}, np.sin(latitude)[:, None]
 
 
-def _grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """With the eight cells around each of the mask's."""
+def _dilate(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Add the eight cells around each of the mask's."""
     return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8))).view(bool)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Active Recognition without a language model: the trained recogniser answers, and judges plans by it."""
+"""Active Recognition without a language model: the trained recogniser answers, and its confidence scores plans."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from pathlib import Path
@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD
+from wiw.errors import ArgumentError
 from wiw.panorama import from_cubemap
-from wiw.perception.glimpses import Glimpses, glimpses, joined
+from wiw.perception.glimpses import Glimpses, extract_glimpses, join_glimpses
 from wiw.perception.recogniser import Recogniser
-from wiw.perception.tracking import Track, target_of, track_rollouts
+from wiw.perception.tracking import Track, get_target, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.recogniser import steering
 from wiw.registry import TRACKERS
@@ -24,39 +25,38 @@ from wiw.types import Answer, Goal, Key, Proposal, Rollout
 
 WEIGHTS = Path(__file__).parent / "weights.safetensors"
 SAME_PLACE = 0.05
-"""Metres; from no farther apart the panorama shows the same."""
+"""Places closer together than this, in metres, count as the same."""
 
 
 @dataclass
 class Memory:
-    """What is kept of one episode."""
+    """The memory of one episode."""
 
     looks: list[tuple[NDArray[np.float64], Glimpses]] = field(default_factory=list)
-    """Real looks at the target and where they were taken, [x, y] in the frame of the start; the latest last."""
+    """Real glimpses of the target and where they were taken, [x, y] in the start frame; the latest last."""
     place: NDArray[np.float64] | None = None
-    """Where the target was seen last, likewise."""
+    """The target's last known position, in the start frame."""
     side: int = 0
-    """On which side of the target the agent went past what hid it; 1 left, -1 right."""
+    """The side on which the agent passed what hides the target; 1 left, -1 right."""
     imagined: tuple[Any, list[Glimpses]] | None = None
-    """The looks of the plans that were last imagined, under the plans' name."""
+    """Glimpses of the plans imagined last, with the key of these plans."""
 
 
 class Recognition(Policy):
-    """Answers with the recogniser's distribution over all real looks kept and the imagined ones of this decision.
+    """Answers with the recogniser's distribution over the stored real glimpses and this decision's imagined ones.
 
-    It proposes to go towards the target, or aside where something stands before it, and scores a plan by how sure the
-    answer would be with the plan's imagined looks. Frames that lose the target count against a plan.
+    It proposes to approach the target, or to step aside where something hides it, and scores a plan by the confidence
+    of the answer with the plan's imagined glimpses. Frames that lose the target count against a plan.
 
     Args:
-        weights: of `wiw.perception.recogniser.Recogniser`; None means those that come with the package.
-        tracker: name of the tracker that finds the target in imagined frames, or an instance.
-        remember: real looks that are kept, from as many places.
-        views: imagined looks of a plan that are used, the last ones.
-        lost: what a plan's score loses if all its frames lose the target.
-        turning: what it loses for each turn, a primitive spent where it is; without, each decision turns back what the
-            one before it turned.
-        trust: what it loses for each place that the plan has in the order of steering, which is all that there is to
-            go by without a world model.
+        weights: of `wiw.perception.recogniser.Recogniser`; None means those shipped with the package.
+        tracker: name of the tracker that locates the target in imagined frames, or an instance.
+        remember: number of real glimpses stored, from as many places.
+        views: number of imagined glimpses of a plan used, the last ones.
+        lost: deduction from a plan's score if all its frames lose the target, else in proportion.
+        turning: deduction for each turn, which is a primitive that leads nowhere; without it, each decision would undo
+            the turns of the one before.
+        trust: deduction for each rank in the order of proposals, which is all that counts without a world model.
 
     Raises:
         BackendError: torch is not installed.
@@ -64,6 +64,20 @@ class Recognition(Policy):
     """
 
     frames = FrameSpec("panorama", (576, 1024))
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Require a task whose goal is to name an object.
+
+        Raises:
+            ArgumentError: the task has no categories to choose from.
+        """
+        if not task.get("categories"):
+            raise ArgumentError(
+                "policy recogniser names the object that a task marks, and task "
+                f"'{task.get('task', 'of this run')}' marks none; use it with task ar (`wiw run ar`), and for imagenav "
+                "a policy such as matcher"
+            )
 
     def __init__(
         self,
@@ -82,7 +96,7 @@ class Recognition(Policy):
         self.remember, self.views, self.lost, self.turning, self.trust = remember, views, lost, turning, trust
 
     def describe(self) -> dict[str, Any]:
-        """With a digest of the weights."""
+        """Return a JSON-able identity, with a digest of the weights."""
         return {
             "policy": type(self).__name__,
             "weights": blake2b(self.file.read_bytes(), digest_size=8).hexdigest(),
@@ -95,14 +109,16 @@ class Recognition(Policy):
         }
 
     def begin(self, goal: Goal, key: Key) -> Memory:
-        """Nothing seen yet."""
+        """Return an empty memory."""
         return Memory()
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Takes a real look where the target is in sight; one a place, the latest."""
+        """Store a real glimpse where the target is in sight; one per place, the latest."""
         for situation in situations:
             observation, memory = situation.observation, situation.memory
-            found, _ = glimpses(observation.panorama[None], target_of(observation).mask[None], np.ones(1, bool))
+            found, _ = extract_glimpses(
+                observation.panorama[None], get_target(observation).mask[None], np.ones(1, bool)
+            )
             if not len(found):
                 continue
             here = observation.odometry[:2]
@@ -110,21 +126,21 @@ class Recognition(Policy):
             memory.looks = [*others, (here, found)][-self.remember :]
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Different ways to a better look, the most promising first."""
-        return [self._plans(situation, candidates, horizon) for situation in situations]
+        """Return different ways to a better view, the most promising first."""
+        return [self._build_plans(situation, candidates, horizon) for situation in situations]
 
-    def _plans(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
+    def _build_plans(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         observation, memory = situation.observation, situation.memory
         assert observation.depth is not None
-        seen = steering.sight(target_of(observation).mask, observation.depth)
+        seen = steering.locate_in_view(get_target(observation).mask, observation.depth)
         if seen is not None:
-            memory.place = steering.place_of(observation, seen)
+            memory.place = steering.compute_target_place(observation, seen)
             memory.side = memory.side or seen.side
-        bearing = 0.0 if memory.place is None else steering.bearing_to(observation, memory.place)
-        free = steering.clearance(observation.depth)
+        bearing = 0.0 if memory.place is None else steering.compute_bearing(observation, memory.place)
+        free = steering.measure_clearance(observation.depth)
         plans: dict[bytes, Proposal] = {}
-        for rank, heading in enumerate(steering.headings(seen, bearing, memory.side)):
-            actions = steering.plan(heading, free, horizon)
+        for rank, heading in enumerate(steering.rank_headings(seen, bearing, memory.side)):
+            actions = steering.plan_towards(heading, free, horizon)
             plans.setdefault(actions.tobytes(), Proposal(actions, prior=0.0 - rank))
         return list(plans.values())[:candidates]
 
@@ -134,16 +150,18 @@ class Recognition(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """Confidence with the plan's imagined looks, less `lost` times the share of its frames that lose the target."""
+        """Return the confidence with the plan's imagined glimpses, less `lost` times its share of frames without the
+        target.
+        """
         tracks = track_rollouts(self.tracker, [each.observation for each in situations], proposals, rollouts)
         scores = []
         for situation, plans, futures, followed in zip(situations, proposals, rollouts, tracks, strict=True):
-            looks = [self._looks(future, track) for future, track in zip(futures, followed, strict=True)]
-            situation.memory.imagined = (_name(situation, plans), looks)
-            real = _real(situation)
+            looks = [self._extract_glimpses(future, track) for future, track in zip(futures, followed, strict=True)]
+            situation.memory.imagined = (_plans_key(situation, plans), looks)
+            real = _get_real_glimpses(situation)
             choices = situation.goal.choices
-            sure = self.recogniser([joined([*real, each]) for each in looks], choices).max(axis=1)
-            boxless = np.array([1 - track.found.mean() for track in followed])
+            sure = self.recogniser([join_glimpses([*real, each]) for each in looks], choices).max(axis=1)
+            boxless = np.array([1 - track.visible.mean() for track in followed])
             turns = np.array([np.count_nonzero(plan.actions != FORWARD) for plan in plans])
             rank = np.array([sum(other.prior > plan.prior for other in plans) for plan in plans])
             scores.append(sure - self.lost * boxless - self.turning * turns - self.trust * rank)
@@ -155,43 +173,48 @@ class Recognition(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[Answer | None]:
-        """From all looks that are kept and those of all plans."""
+        """Answer by all stored glimpses and those of all plans."""
         answers: list[Answer | None] = []
         for situation, plans, futures in zip(situations, proposals, rollouts, strict=True):
-            looks = _real(situation)
+            looks = _get_real_glimpses(situation)
             if futures is not None:
-                looks += self._imagined(situation, plans, futures)
+                looks += self._get_imagined_glimpses(situation, plans, futures)
             choices = situation.goal.choices
-            answers.append(Answer(choices, self.recogniser([joined(looks)], choices)[0]) if choices else None)
+            answers.append(Answer(choices, self.recogniser([join_glimpses(looks)], choices)[0]) if choices else None)
         return answers
 
-    def _imagined(self, situation: Situation, plans: Sequence[Proposal], futures: Sequence[Rollout]) -> list[Glimpses]:
-        """Looks of each plan; those that it was scored by, if it was."""
+    def _get_imagined_glimpses(
+        self, situation: Situation, plans: Sequence[Proposal], futures: Sequence[Rollout]
+    ) -> list[Glimpses]:
+        """Return the glimpses of each plan; the ones it was scored by, if it was scored."""
         kept = situation.memory.imagined
-        if kept is not None and kept[0] == _name(situation, plans):
+        if kept is not None and kept[0] == _plans_key(situation, plans):
             return list(kept[1])
         tracks = track_rollouts(self.tracker, [situation.observation], [plans], [futures])[0]
-        return [self._looks(future, track) for future, track in zip(futures, tracks, strict=True)]
+        return [self._extract_glimpses(future, track) for future, track in zip(futures, tracks, strict=True)]
 
-    def _looks(self, rollout: Rollout, track: Track) -> Glimpses:
-        """The last imagined frames in which the target is in sight; turned real ones show nothing new."""
-        wanted = np.flatnonzero(track.found & ~rollout.real)[len(track.boxes) and -self.views :]
+    def _extract_glimpses(self, rollout: Rollout, track: Track) -> Glimpses:
+        """Extract glimpses from the last imagined frames that show the target; rotated real frames show nothing new."""
+        wanted = np.flatnonzero(track.visible & ~rollout.real)[len(track.boxes) and -self.views :]
         frames, masks = rollout.frames[wanted], track.masks[wanted]
         if rollout.view == "front" and len(wanted):
-            frames, masks = _around(frames), _around(masks[..., None].astype(np.uint8))[..., 0] > 0
-        return glimpses(frames, masks, np.zeros(len(wanted), bool))[0]
+            frames, masks = (
+                _embed_front_views(frames),
+                _embed_front_views(masks[..., None].astype(np.uint8))[..., 0] > 0,
+            )
+        return extract_glimpses(frames, masks, np.zeros(len(wanted), bool))[0]
 
 
-def _real(situation: Situation) -> list[Glimpses]:
+def _get_real_glimpses(situation: Situation) -> list[Glimpses]:
     return [found for _, found in situation.memory.looks]
 
 
-def _name(situation: Situation, plans: Sequence[Proposal]) -> Any:
+def _plans_key(situation: Situation, plans: Sequence[Proposal]) -> Any:
     return situation.key, tuple(plan.actions.tobytes() for plan in plans)
 
 
-def _around(fronts: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Panoramas that show front views [K, S, S, C] where they belong, and black elsewhere."""
+def _embed_front_views(fronts: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Embed front views [K, S, S, C] into panoramas that are black elsewhere."""
     faces = np.zeros((len(fronts), 6, *fronts.shape[1:]), np.uint8)
     faces[:, 0] = fronts
     return np.asarray(from_cubemap(faces, (576, 1024)), np.uint8)

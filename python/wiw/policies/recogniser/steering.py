@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to go for a better look at a boxed thing: towards it, or aside, out from behind what hides it."""
+"""Where to go for a better view of a boxed object: towards it, or aside, out from behind what hides it."""
 
 from __future__ import annotations
 
@@ -9,59 +9,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, ActionSpace
-from wiw.perception.boxes import Mask, box_of, width_of
+from wiw.perception.boxes import Mask, box_width, find_box
 from wiw.types import Observation
 
 TURN = ActionSpace().turn_rad
-NEARER = 0.15
-"""Metres that a neighbouring pixel must be nearer than the target to count as something before it."""
-CUT = 0.25
-"""Part of the target's height along which something must stand before it, for it to count as hidden on that side."""
-ENOUGH = np.radians(40.0)
-"""A target that is larger than this is looked at from other sides instead of from nearer."""
-ASIDE = 2 * TURN
-"""How far beside the target a detour heads."""
-BODY = (0.15, 1.0)
-"""Heights above the floor, in metres, between which things are in the way; the camera is at 1 m."""
-CAMERA = 1.0
-CLEAR = 0.45
-"""Metres that a heading must be free for."""
+OCCLUDER_GAP = 0.15
+"""Metres that a neighbouring pixel must be closer than the target to count as something in front of it."""
+OCCLUDED_SHARE = 0.25
+"""Share of the target's rows that something must cut off for it to count as hidden on that side."""
+LARGE_TARGET = np.radians(40.0)
+"""A target that appears larger than this is viewed from other sides instead of from closer."""
+DETOUR_ANGLE = 2 * TURN
+"""Angle between a detour and the direction of the target."""
+OBSTACLE_HEIGHTS = (0.15, 1.0)
+"""Heights above the floor, in metres, between which surfaces are obstacles; the camera is at 1 m."""
+CAMERA_HEIGHT = 1.0
+MIN_CLEARANCE = 0.45
+"""Metres that a heading must be free."""
 
 
 @dataclass(frozen=True)
-class Sight:
-    """What the real observation tells of where the target is. Angles in radians, left positive."""
+class TargetSighting:
+    """What the real observation shows of the target's position. Angles in radians, left positive."""
 
     bearing: float
     distance: float
-    """Metres, median over what is seen of it."""
+    """Median distance of the visible part, in metres."""
     size: float
     """The larger of width and height."""
     hidden_left: float
-    """Part of its rows that end at something nearer on the left, 0 to 1."""
+    """Share of its rows that end at something closer on the left, 0 to 1."""
     hidden_right: float
 
     @property
     def side(self) -> int:
-        """1 if more is to be seen from further left, -1 from further right, 0 if neither is known.
+        """1 if more will be visible from further left, -1 from further right, 0 if neither is known.
 
-        What stands before its left part moves on to the left as one steps to the right.
+        An occluder of the left part moves further left as the agent steps to the right.
         """
-        if max(self.hidden_left, self.hidden_right) < CUT:
+        if max(self.hidden_left, self.hidden_right) < OCCLUDED_SHARE:
             return 0
         return -1 if self.hidden_left > self.hidden_right else 1
 
 
-def sight(mask: Mask, depth: NDArray[np.float32]) -> Sight | None:
-    """What a target's mask [H, W] and the depth there tell; None where nothing of it is seen."""
-    box = box_of(mask, wraps=True)
+def locate_in_view(mask: Mask, depth: NDArray[np.float32]) -> TargetSighting | None:
+    """Estimate the target's position from its mask [H, W] and the depth; None where it is out of sight."""
+    box = find_box(mask, wraps=True)
     if box is None:
         return None
     rows, columns = mask.shape
-    wide = width_of(box, columns)
-    left, right = _cuts(mask, depth)
-    return Sight(
-        bearing=_wrapped(np.pi - 2 * np.pi * (box[0] + wide / 2) / columns),
+    wide = box_width(box, columns)
+    left, right = _measure_occlusion(mask, depth)
+    return TargetSighting(
+        bearing=_wrap_angle(np.pi - 2 * np.pi * (box[0] + wide / 2) / columns),
         distance=float(np.median(depth[mask])),
         size=max(2 * np.pi * wide / columns, np.pi * (box[3] - box[1]) / rows),
         hidden_left=left,
@@ -69,23 +69,23 @@ def sight(mask: Mask, depth: NDArray[np.float32]) -> Sight | None:
     )
 
 
-def _cuts(mask: Mask, depth: NDArray[np.float32]) -> tuple[float, float]:
-    """Parts of the mask's rows of which the first or the last pixel has something nearer beside it."""
+def _measure_occlusion(mask: Mask, depth: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the shares of the mask's rows whose first, or last, pixel has something closer beside it."""
     filled = int(mask.any(axis=1).sum())
     parts = []
     for step in (1, -1):  # the pixel on the left, on the right
         beside, outside = np.roll(depth, step, axis=1), ~np.roll(mask, step, axis=1)
-        nearer = (beside > 0) & (beside < depth - NEARER)
+        nearer = (beside > 0) & (beside < depth - OCCLUDER_GAP)
         parts.append(float((mask & outside & nearer).any(axis=1).sum() / filled))
     return parts[0], parts[1]
 
 
-def clearance(depth: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Metres free of obstacles in 16 headings, turn by turn to the left: float64 [16], 0 straight ahead."""
+def measure_clearance(depth: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return the free metres in 16 headings, turn by turn to the left: float64 [16], straight ahead first."""
     rows, columns = depth.shape
     pitch = np.pi / 2 - np.pi * (np.arange(rows) + 0.5) / rows
-    height = CAMERA + depth * np.sin(pitch)[:, None]
-    blocked = (depth > 0) & (height > BODY[0]) & (height < BODY[1] + 0.3)
+    height = CAMERA_HEIGHT + depth * np.sin(pitch)[:, None]
+    blocked = (depth > 0) & (height > OBSTACLE_HEIGHTS[0]) & (height < OBSTACLE_HEIGHTS[1] + 0.3)
     away = np.where(blocked, depth * np.cos(pitch)[:, None], np.inf).min(axis=0)
     count = round(2 * np.pi / TURN)
     width = columns // count
@@ -93,53 +93,57 @@ def clearance(depth: NDArray[np.float32]) -> NDArray[np.float64]:
     return np.array([away[np.arange(start, start + 2 * width) % columns].min() for start in starts])
 
 
-def headings(seen: Sight | None, bearing: float, side: int) -> list[float]:
-    """Directions in which a better look may be had, the best first.
+def rank_headings(seen: TargetSighting | None, bearing: float, side: int) -> list[float]:
+    """Return directions in which a better view is likely, the best first.
 
     Args:
-        seen: what is seen now; None where the target is out of sight.
-        bearing: where it is, or should be.
-        side: on which side it was passed before, 0 if on none yet.
+        seen: the present sighting; None where the target is out of sight.
+        bearing: the target's direction, or its last known one.
+        side: the side on which it was passed before, 0 if on none yet.
     """
     chosen = (seen.side if seen is not None else 0) or side or 1
-    towards, aside, across = bearing, bearing + chosen * ASIDE, bearing - chosen * ASIDE
-    if seen is not None and (seen.side or seen.size > ENOUGH):
+    towards, aside, across = bearing, bearing + chosen * DETOUR_ANGLE, bearing - chosen * DETOUR_ANGLE
+    if seen is not None and (seen.side or seen.size > LARGE_TARGET):
         return [aside, towards, across]
     return [towards, aside, across]
 
 
-def plan(heading: float, free: NDArray[np.float64], horizon: int) -> NDArray[np.int8]:
-    """Turns to the clear heading that is nearest to the wanted one, then steps as far as it is free: int8 [horizon].
+def plan_towards(heading: float, free: NDArray[np.float64], horizon: int) -> NDArray[np.int8]:
+    """Plan turns to the clear heading nearest to the wanted one, then steps as far as it is free: int8 [horizon].
 
-    Where no step is free it turns on the spot, on towards the wanted heading.
+    Where no step is free it turns on the spot towards the wanted heading.
     """
-    wanted = round(_wrapped(heading) / TURN)
+    wanted = round(_wrap_angle(heading) / TURN)
     count = len(free)
-    turns = min(range(-count // 2, count // 2 + 1), key=lambda turn: (_cost(turn, wanted, free), abs(turn), -turn))
+    turns = min(
+        range(-count // 2, count // 2 + 1), key=lambda turn: (_compute_cost(turn, wanted, free), abs(turn), -turn)
+    )
     steps = max(0, horizon - abs(turns))
-    room = max(0.0, (free[turns % count] - CLEAR / 2) / ActionSpace().forward_m)  # infinite where nothing is in the way
+    room = max(
+        0.0, (free[turns % count] - MIN_CLEARANCE / 2) / ActionSpace().forward_m
+    )  # infinite where nothing is in the way
     way = TURN_LEFT if turns > 0 or (turns == 0 and wanted >= 0) else TURN_RIGHT
     made = [way] * min(abs(turns), horizon) + [FORWARD] * int(min(steps, room))
     return np.array(made or [way], np.int8)
 
 
-def _cost(turn: int, wanted: int, free: NDArray[np.float64]) -> float:
-    """Turns off the wanted heading; headings that are not clear come last."""
-    return abs(turn - wanted) + (100.0 if free[turn % len(free)] < CLEAR else 0.0)
+def _compute_cost(turn: int, wanted: int, free: NDArray[np.float64]) -> float:
+    """Return the number of turns off the wanted heading; headings that are not clear come last."""
+    return abs(turn - wanted) + (100.0 if free[turn % len(free)] < MIN_CLEARANCE else 0.0)
 
 
-def place_of(observation: Observation, seen: Sight) -> NDArray[np.float64]:
-    """Where the target is, [x, y] in the frame of the start, metres."""
+def compute_target_place(observation: Observation, seen: TargetSighting) -> NDArray[np.float64]:
+    """Return the target's position [x, y] in the start frame, in metres."""
     x, y, azimuth = observation.odometry
     angle = azimuth + seen.bearing
     return np.array([x + seen.distance * np.cos(angle), y + seen.distance * np.sin(angle)])
 
 
-def bearing_to(observation: Observation, place: NDArray[np.float64]) -> float:
-    """Direction of a place in the frame of the start, as seen from the agent."""
+def compute_bearing(observation: Observation, place: NDArray[np.float64]) -> float:
+    """Return the direction of a place of the start frame, as seen from the agent."""
     x, y, azimuth = observation.odometry
-    return _wrapped(float(np.arctan2(place[1] - y, place[0] - x) - azimuth))
+    return _wrap_angle(float(np.arctan2(place[1] - y, place[0] - x) - azimuth))
 
 
-def _wrapped(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     return float((angle + np.pi) % (2 * np.pi) - np.pi)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A manipulator without a language model: an expert that errs, so that choosing among its plans matters.
+"""Manipulation without a language model: an expert with deliberate errors, so that choosing among its plans matters.
 
-It reads the instruction, is told where objects are as the paper's policies are, and plans as the expert of the task
-does; but it may take one target for another, and it never knows places quite as they are. Imagined ends are scored by
-what the instruction asks to be seen.
+It reads the instruction, knows where objects are as the paper's policies do, and plans like the task's expert; but it
+may confuse targets, and its knowledge of poses is noisy. Imagined ends are scored by how well they show the
+instruction as carried out.
 """
 
 from __future__ import annotations
@@ -18,35 +18,38 @@ from scipy.special import ndtri
 from wiw._core import core
 from wiw.physics import place
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.tabletop.kind import Kind
-from wiw.tabletop.kinds import kind_of
-from wiw.types import ArmObservation, Proposal, Rollout
+from wiw.tabletop.base import TabletopTask
+from wiw.tabletop.tasks import find_task
+from wiw.types import GRIPPER_POSES, ArmObservation, Proposal, Rollout
 
-MISTAKEN = 0.55
-"""Chance that a plan is made for another target; high, because what went wrong is often put right by the next plan."""
-ASTRAY = 0.007
-"""Metres, standard deviation along x and y of where an object is thought to be; a ring and its peg bear 4 mm, a cup a
-centimetre, a button three."""
-TURNED = 0.05
-"""Radians, the same of how it is thought to be turned."""
+MISTAKE_PROBABILITY = 0.55
+"""Probability that a plan is made for another target; high, because the next plan often repairs the damage."""
+POSITION_NOISE = 0.007
+"""Standard deviation of object positions along x and y in metres; a ring and its peg tolerate 4 mm, a cup a centimetre,
+a button three.
+"""
+YAW_NOISE = 0.05
+"""Standard deviation of object yaws in radians."""
 PURPOSE = 0x73637269
-"""Keeps these draws apart from all others of the decision."""
+"""Separates these random draws from all others of the decision."""
 
 
 class Scripted(Policy):
-    """Plans with errors, and scores by what has to be seen at the end.
+    """Plans with errors, and scores plans by what their ends show.
 
-    The rates of errors are fixed so that the first plan alone does what is told in 40 to 50 of 100 episodes of the four
-    manipulation tasks (`docs/results.md`): there is as much to win as to lose by choosing.
+    The error rates are fixed so that the first plan alone succeeds in 40 to 50 of 100 episodes of the four manipulation
+    tasks (`docs/results.md`): choosing can win as much as it can lose.
     """
 
-    space = "pose7"
+    space = GRIPPER_POSES
     frames = FrameSpec("front", (240, 240))
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Plans that go on from where things stand, each with errors of its own; equally good as far as it knows."""
+        """Return plans that continue from the present state, each with its own errors; all equally good as far as it
+        knows.
+        """
         return [
-            [_plan(situation, number, horizon) for number in range(candidates if situation.imagines else 1)]
+            [_make_plan(situation, number, horizon) for number in range(candidates if situation.imagines else 1)]
             for situation in situations
         ]
 
@@ -56,46 +59,48 @@ class Scripted(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """How much each plan's last frame looks as if the instruction were followed, from 0 to 1."""
+        """Return how far each plan's last frame shows the instruction as carried out, from 0 to 1."""
         scores = []
         for situation, plans in zip(situations, rollouts, strict=True):
-            kind, target = _asked(situation)
+            task, target = _parse_goal(situation)
             places = situation.observation.places
-            scores.append(np.array([kind.looks_done(plan.frames[-1], places, target) for plan in plans]))
+            scores.append(np.array([task.estimate_completion(plan.frames[-1], places, target) for plan in plans]))
         return scores
 
 
-def _asked(situation: Situation) -> tuple[Kind, Any]:
-    """The kind of task and the target that an instruction asks for."""
+def _parse_goal(situation: Situation) -> tuple[TabletopTask, Any]:
+    """Return the task and the target of an instruction."""
     text = situation.goal.text or ""
-    kind = kind_of(text)
-    return kind, kind.target_of(text)
+    task = find_task(text)
+    return task, task.parse_target(text)
 
 
-def _plan(situation: Situation, number: int, horizon: int) -> Proposal:
-    """One plan, or staying where nothing is left to do."""
-    (kind, target), key = _asked(situation), situation.key
+def _make_plan(situation: Situation, number: int, horizon: int) -> Proposal:
+    """Make one plan; it keeps still where nothing is left to do."""
+    (task, target), key = _parse_goal(situation), situation.key
     seen: ArmObservation = situation.observation
     whether, which, *draws = core.uniform(
         core.fold_key([key.seed, key.episode, key.decision, number, PURPOSE]), 2 + 3 * len(seen.places)
     )
-    left = kind.left(seen, target)
+    left = task.find_remaining_target(seen, target)
     if left is None:
         return Proposal(np.tile(seen.pose, (horizon, 1)), text="keep still", note="nothing left to do")
-    rests = [kind.left(seen, other) for other in kind.alternatives(list(seen.places), target)]
+    rests = [task.find_remaining_target(seen, other) for other in task.list_alternatives(list(seen.places), target)]
     others = [rest for rest in rests if rest is not None]
-    mistaken = bool(others) and whether < MISTAKEN
+    mistaken = bool(others) and whether < MISTAKE_PROBABILITY
     if mistaken:
         left = others[int(which * len(others))]
-    believed = _believed(seen.places, np.array(draws).reshape(-1, 3))
-    plan = kind.expert(believed, left, seen.pose)[:horizon]
-    return Proposal(plan, text=kind.say(left), note="another target" if mistaken else "")
+    believed = _perturb_poses(seen.places, np.array(draws).reshape(-1, 3))
+    plan = task.plan_expert(believed, left, seen.pose)[:horizon]
+    return Proposal(plan, text=task.phrase_instruction(left), note="another target" if mistaken else "")
 
 
-def _believed(places: Mapping[str, NDArray[np.float64]], draws: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """Places as the policy takes them to be; draws [N, 3] from 0 to 1."""
+def _perturb_poses(
+    places: Mapping[str, NDArray[np.float64]], draws: NDArray[np.float64]
+) -> dict[str, NDArray[np.float64]]:
+    """Return the poses with the policy's errors; draws [N, 3] from 0 to 1."""
     found = {}
     for (name, pose), errors in zip(places.items(), ndtri(np.clip(draws, 1e-6, 1 - 1e-6)), strict=True):
-        found[name] = pose @ place(rpy=(0, 0, TURNED * errors[2]))
-        found[name][:2, 3] += ASTRAY * errors[:2]
+        found[name] = pose @ place(rpy=(0, 0, YAW_NOISE * errors[2]))
+        found[name][:2, 3] += POSITION_NOISE * errors[:2]
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A vision-language model as the paper's policy: it proposes, looks at what is imagined, answers and decides."""
+"""A vision-language model as the paper's policy: it proposes, inspects what is imagined, answers and decides."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from wiw._core import core
 from wiw.errors import ArgumentError, DependencyError
 from wiw.perception.tracking import Track, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.policies.vlm import looks, plans, presets
+from wiw.policies.vlm import plans, presets, prompt_images
 from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, Space
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
 from wiw.vlm import Reply, Request, connect, user
-from wiw.vlm.base import Part
-from wiw.vlm.cache import reply_cache
+from wiw.vlm.cache import open_reply_cache
+from wiw.vlm.messages import Part
 from wiw.vlm.prices import Prices
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-SEEN = "front view (90 degrees wide) and panorama (360 degrees)"
-"""Slot `obs_key`."""
+OBSERVATION_WORDS = "front view (90 degrees wide) and panorama (360 degrees)"
+"""Value of the slot `obs_key`."""
 OUT_OF_SIGHT = "the target is neither in sight nor in an imagined view, nothing was asked"
-DRAW, _ANSWER, _MOVE, REVISE = 0x64726177, 0x616E7377, 0x6D6F7665, 0x72657669
-"""Keep the seeds of a decision's questions apart."""
-DRAWN = "drawn: no answer could be used"
-TOKENS = 1024
-"""Of a plan at most."""
+FALLBACK_SEED, _ANSWER_SEED, _MOVE_SEED, REVISION_SEED = 0x64726177, 0x616E7377, 0x6D6F7665, 0x72657669
+"""Separate the seeds of a decision's questions."""
+FALLBACK_NOTE = "drawn: no answer could be used"
+MAX_PLAN_TOKENS = 1024
+"""Most tokens of a plan."""
 MOVES = list(plans.PRIMITIVES.values())
 
 
 @dataclass
 class Memory:
-    """What is kept of one episode."""
+    """The memory of one episode."""
 
     horizon: int = 1
-    """Primitives, or poses, that a plan may have."""
-    believed: NDArray[np.float64] | None = None
+    """Most primitives, or poses, of a plan."""
+    belief: NDArray[np.float64] | None = None
     """The last answer."""
-    decided: tuple[Key, NDArray[Any]] | None = None
+    decision: tuple[Key, NDArray[Any]] | None = None
     """The plan written, or the primitive chosen, at the latest decision."""
     tracks: tuple[Any, list[Track]] | None = None
-    """Where the target is in the plans imagined last, under their name."""
+    """The target's tracks in the plans imagined last, with the key of these plans."""
 
 
 class VLM(Policy):
@@ -88,9 +88,9 @@ class VLM(Policy):
 
     frames = FrameSpec("panorama", (576, 1024))
     tasks: tuple[str, ...] = ("ar", "imagenav")
-    """That it has prompts for."""
-    drawn = "a primitive was drawn"
-    """What is done where no plan can be used."""
+    """Tasks that it has prompts for."""
+    fallback_action = "a primitive was drawn"
+    """Description of the fallback where no plan can be used."""
 
     def __init__(
         self,
@@ -119,21 +119,15 @@ class VLM(Policy):
         _require_packages()
         self.prompts = Prompts(prompts)
         table = None if prices is None else Prices.load(prices)
-        kept = {"cache": reply_cache(cache), "prices": table} if isinstance(vlm, str) else {}
-        self.client = connect(vlm, **{**kept, **presets.client_options(model), **client})
+        kept = {"cache": open_reply_cache(cache), "prices": table} if isinstance(vlm, str) else {}
+        self.client = connect(vlm, **{**kept, **presets.get_client_options(model), **client})
         self.proposals, self.revision, self.temperature, self.tries = proposals, revision, temperature, tries
         self.tracker = TRACKERS.make(tracker)
         self.needs = tuple(self.tracker.needs)
         self._journal: dict[tuple[int, int], list[Exchange]] = {}
 
-    def for_space(self, space: Space) -> Policy:
-        """The same model asked for poses of a gripper."""
-        from wiw.policies.vlm.arm import ArmVLM
-
-        return self if space == "discrete" else ArmVLM(self)
-
     def describe(self) -> dict[str, Any]:
-        """With the model and a digest of the prompts."""
+        """Return a JSON-able identity, with the model and a digest of the prompts."""
         return {
             "policy": type(self).__name__,
             **self.client.describe(),
@@ -151,91 +145,95 @@ class VLM(Policy):
         return {"vlm_tokens": 0.0, **self.client.spent}
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
-        """What was said for a decision, handed over once."""
+        """Return the exchanges of a decision, once."""
         return tuple(self._journal.pop((key.episode, key.decision), ()))
 
     def begin(self, goal: Goal, key: Key) -> Memory:
-        """Nothing believed yet.
+        """Return a memory without any belief.
 
         Raises:
-            ArgumentError: a task that there are no prompts for.
+            ArgumentError: a task without prompts.
         """
         if goal.task not in self.tasks:
             raise ArgumentError(f"policy vlm: expected a task among {', '.join(self.tasks)}, got '{goal.task}'")
         return Memory()
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Begins the record of a decision anew."""
+        """Start the record of a decision anew."""
         for situation in situations:
             self._journal.pop((situation.key.episode, situation.key.decision), None)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Plans as the model writes them; one where none will be imagined, and then for recognition one primitive."""
-        wanted = [self._questions(situation, candidates, horizon) for situation in situations]
+        """Return the model's plans; only one where none will be imagined, and then for recognition one primitive."""
+        wanted = [self._build_requests(situation, candidates, horizon) for situation in situations]
         replies = iter(self.client.ask([request for _, requests in wanted for request in requests]))
         return [
-            self._proposed(situation, purpose, [next(replies) for _ in requests], horizon)
+            self._build_proposals(situation, purpose, [next(replies) for _ in requests], horizon)
             for situation, (purpose, requests) in zip(situations, wanted, strict=True)
         ]
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """As `propose`, from imagined places."""
+        """Propose from imagined places."""
         there = [replace(situation, memory=deepcopy(situation.memory)) for situation in situations]
         return self.propose(there, candidates, horizon)
 
-    def _questions(self, situation: Situation, candidates: int, horizon: int) -> tuple[str, list[Request]]:
+    def _build_requests(self, situation: Situation, candidates: int, horizon: int) -> tuple[str, list[Request]]:
         if not situation.imagines and situation.goal.choices:
-            return "move", [self._move_request(situation, [])]
+            return "move", [self._build_move_request(situation, [])]
         situation.memory.horizon = horizon
         count = candidates if situation.imagines else 1
         shared = count if self.proposals == "listed" else 1
-        asked = user(*self._before(situation, horizon), self._words(situation, "output", horizon, shared))
+        asked = user(
+            *self._build_plan_prompt(situation, horizon), self._render_prompt(situation, "output", horizon, shared)
+        )
         options: dict[str, Any] = {
-            "schema": self._schema(horizon, shared),
+            "schema": self._get_plan_schema(horizon, shared),
             "temperature": self.temperature,
-            "max_tokens": TOKENS * shared,
+            "max_tokens": MAX_PLAN_TOKENS * shared,
             "tries": self.tries,
         }
-        seeds = [seed_of(situation.key, number) for number in range(count if shared == 1 else 1)]
+        seeds = [derive_seed(situation.key, number) for number in range(count if shared == 1 else 1)]
         return "propose", [Request((asked,), seed=seed, **options) for seed in seeds]
 
-    def _before(self, situation: Situation, horizon: int) -> list[Part]:
-        """What is told and shown before plans are asked for."""
-        front, panorama = looks.now(situation.observation)
-        words = self._words(situation, "planner", horizon)
+    def _build_plan_prompt(self, situation: Situation, horizon: int) -> list[Part]:
+        """Return the text and images before the request for plans."""
+        front, panorama = prompt_images.render_observation(situation.observation)
+        words = self._render_prompt(situation, "planner", horizon)
         parts: list[Part] = [words, "Front view:", front, "Panorama:", panorama]
         return parts if situation.goal.image is None else [*parts, "Goal image:", situation.goal.image]
 
-    def _schema(self, longest: int, count: int = 1) -> type[BaseModel]:
+    def _get_plan_schema(self, longest: int, count: int = 1) -> type[BaseModel]:
         return plans.plan_schema(longest, count)
 
-    def _plans_in(self, value: Any) -> list[Proposal]:
-        """The plans of a validated answer."""
-        return [Proposal(actions, note=cut(reason)) for actions, reason in plans.plans_in(value)]
+    def _parse_plans(self, value: Any) -> list[Proposal]:
+        """Return the plans of a validated answer."""
+        return [Proposal(actions, note=shorten(reason)) for actions, reason in plans.parse_plans(value)]
 
-    def _proposed(self, situation: Situation, purpose: str, replies: Sequence[Reply], horizon: int) -> list[Proposal]:
-        """Different plans of an episode, in the order in which they were written."""
+    def _build_proposals(
+        self, situation: Situation, purpose: str, replies: Sequence[Reply], horizon: int
+    ) -> list[Proposal]:
+        """Return the different plans of an episode, in the order in which they were written."""
         if purpose == "move":
-            probabilities = self._move_probabilities(situation, replies[0], self.drawn)
+            probabilities = self._read_move_probabilities(situation, replies[0], self.fallback_action)
             if probabilities is None:
-                return [self._drawn(situation)]
+                return [self._draw_fallback(situation)]
             best = int(probabilities.argmax())
             return [Proposal(np.array([MOVES[best]], np.int8), prior=float(probabilities[best]))]
         usable = [reply for reply in replies if reply.problem is None]
-        instead = "the plan was left out" if usable else self.drawn
+        instead = "the plan was left out" if usable else self.fallback_action
         found: dict[bytes, Proposal] = {}
         for number, reply in enumerate(replies):
-            self._note(situation.key, f"propose/{number}", reply, instead)
-            for plan in [] if reply.problem else self._plans_in(reply.value):
+            self._record_exchange(situation.key, f"propose/{number}", reply, instead)
+            for plan in [] if reply.problem else self._parse_plans(reply.value):
                 found.setdefault(plan.actions.tobytes(), replace(plan, prior=float(-len(found))))
-        return list(found.values()) or [self._drawn(situation)]
+        return list(found.values()) or [self._draw_fallback(situation)]
 
-    def _drawn(self, situation: Situation) -> Proposal:
+    def _draw_fallback(self, situation: Situation) -> Proposal:
         key = situation.key
-        draw = core.uniform(core.fold_key([key.seed, key.episode, key.decision, DRAW]), 1)[0]
-        return Proposal(np.array([MOVES[int(draw * len(MOVES))]], np.int8), note=DRAWN)
+        draw = core.uniform(core.fold_key([key.seed, key.episode, key.decision, FALLBACK_SEED]), 1)[0]
+        return Proposal(np.array([MOVES[int(draw * len(MOVES))]], np.int8), note=FALLBACK_NOTE)
 
     # -- judging futures -----------------------------------------------------------------------------------------------
 
@@ -245,23 +243,25 @@ class VLM(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout]],
     ) -> list[NDArray[np.float64]]:
-        """Recognition: probability of each plan's first primitive. Navigation: probability of each plan ("select"), or
-        how much of each agrees with the plan that was written, from its beginning ("write").
+        """Return the score of each plan.
+
+        Recognition: probability of each plan's first primitive. Navigation: probability of each plan ("select"), or
+        the share of each that agrees from its beginning with the plan written by the model ("write").
         """
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        requests = [self._judging(*row) for row in rows]
+        requests = [self._build_scoring_request(*row) for row in rows]
         asked = [request for request in requests if request is not None]
         replies = iter(self.client.ask(asked))
         return [
-            np.ones(1) if request is None else self._judged(situation, proposed, next(replies))
+            np.ones(1) if request is None else self._read_scores(situation, proposed, next(replies))
             for (situation, proposed, _), request in zip(rows, requests, strict=True)
         ]
 
     def revise(
         self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
     ) -> tuple[NDArray[Any], int | None]:
-        """What was decided on; the first proposal that begins so, if one does."""
-        decided = situation.memory.decided
+        """Return the decided plan, and the first proposal that begins with it, if there is one."""
+        decided = situation.memory.decision
         if decided is None or decided[0] != situation.key:
             return super().revise(situation, proposals, scores)
         actions = decided[1]
@@ -272,69 +272,75 @@ class VLM(Policy):
                 return plan.actions, index
         return actions, None
 
-    def _judging(
+    def _build_scoring_request(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
     ) -> Request | None:
         if situation.goal.choices:
-            tracks = self._tracked(situation, proposals, rollouts)
-            strips = [looks.plan_strip(*row) for row in zip(proposals, rollouts, tracks, strict=True)]
-            return self._move_request(situation, _captioned(proposals, strips))
+            tracks = self._track_target(situation, proposals, rollouts)
+            strips = [prompt_images.render_plan_strip(*row) for row in zip(proposals, rollouts, tracks, strict=True)]
+            return self._build_move_request(situation, _caption_strips(proposals, strips))
         if self._selects(proposals) and len(proposals) == 1:
             return None
-        return self._revising(situation, proposals, rollouts)
+        return self._build_revision_request(situation, proposals, rollouts)
 
     def _selects(self, proposals: Sequence[Proposal]) -> bool:
-        """Whether one of the proposals is chosen, rather than a plan written."""
+        """Return whether the model selects one of the proposals, rather than writing a plan."""
         return self.revision == "select"
 
-    def _revising(self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]) -> Request:
-        """Which of the proposals is to be followed, or what else."""
+    def _build_revision_request(
+        self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
+    ) -> Request:
+        """Ask which of the proposals to follow, or for another plan."""
         assert situation.goal.image is not None
-        strips = [looks.plan_strip(plan, rollout) for plan, rollout in zip(proposals, rollouts, strict=True)]
+        strips = [
+            prompt_images.render_plan_strip(plan, rollout) for plan, rollout in zip(proposals, rollouts, strict=True)
+        ]
         horizon = max(situation.memory.horizon, *(len(plan.actions) for plan in proposals))
         name = "chooser" if self.revision == "select" else "planner_imagined"
-        parts: list[Part] = [self._words(situation, name, horizon), "Goal image:", situation.goal.image]
-        parts += _captioned(proposals, strips)
-        seed = seed_of(situation.key, REVISE)
+        parts: list[Part] = [self._render_prompt(situation, name, horizon), "Goal image:", situation.goal.image]
+        parts += _caption_strips(proposals, strips)
+        seed = derive_seed(situation.key, REVISION_SEED)
         if self.revision == "select":
-            choices = tuple(f"plan {k + 1}: {', '.join(plans.named(p.actions))}" for k, p in enumerate(proposals))
+            choices = tuple(
+                f"plan {k + 1}: {', '.join(plans.name_actions(p.actions))}" for k, p in enumerate(proposals)
+            )
             return Request((user(*parts),), choices=choices, seed=seed, tries=self.tries)
-        parts.append(self._words(situation, "output", horizon))
+        parts.append(self._render_prompt(situation, "output", horizon))
         return Request((user(*parts),), schema=plans.plan_schema(horizon), seed=seed, tries=self.tries)
 
-    def _judged(self, situation: Situation, proposals: Sequence[Proposal], reply: Reply) -> NDArray[np.float64]:
+    def _read_scores(self, situation: Situation, proposals: Sequence[Proposal], reply: Reply) -> NDArray[np.float64]:
         fallback = -np.arange(len(proposals), dtype=np.float64)
         memory: Memory = situation.memory
         if situation.goal.choices:
-            found = self._move_probabilities(situation, reply, "the first plan was taken")
+            found = self._read_move_probabilities(situation, reply, "the first plan was taken")
             if found is None:
-                memory.decided = None
+                memory.decision = None
                 return fallback
-            memory.decided = situation.key, np.array([MOVES[int(found.argmax())]], np.int8)
+            memory.decision = situation.key, np.array([MOVES[int(found.argmax())]], np.int8)
             return np.array(
                 [found[MOVES.index(plan.actions[0])] if plan.actions[0] in MOVES else 0.0 for plan in proposals]
             )
-        self._note(situation.key, "revise", reply, "the first plan was taken")
-        memory.decided = None
+        self._record_exchange(situation.key, "revise", reply, "the first plan was taken")
+        memory.decision = None
         if reply.problem is not None:
             return fallback
         if reply.probabilities is not None:
             return reply.probabilities
-        (written,) = self._plans_in(reply.value)
-        memory.decided = situation.key, written.actions
-        return np.array([_agreement(plan.actions, written.actions) for plan in proposals])
+        (written,) = self._parse_plans(reply.value)
+        memory.decision = situation.key, written.actions
+        return np.array([_measure_agreement(plan.actions, written.actions) for plan in proposals])
 
-    def _move_request(self, situation: Situation, imagined: Sequence[Part]) -> Request:
-        """Which primitive comes next."""
-        front, panorama = looks.now(situation.observation)
-        parts: list[Part] = [self._words(situation, "planner", 1), "Front view:", front, "Panorama:", panorama]
+    def _build_move_request(self, situation: Situation, imagined: Sequence[Part]) -> Request:
+        """Ask for the next primitive."""
+        front, panorama = prompt_images.render_observation(situation.observation)
+        parts: list[Part] = [self._render_prompt(situation, "planner", 1), "Front view:", front, "Panorama:", panorama]
         if imagined:
-            parts += [self._words(situation, "planner_imagined", 1), *imagined]
+            parts += [self._render_prompt(situation, "planner_imagined", 1), *imagined]
         choices = tuple(plans.MEANINGS.values())
-        return Request((user(*parts),), choices=choices, seed=seed_of(situation.key, _MOVE), tries=self.tries)
+        return Request((user(*parts),), choices=choices, seed=derive_seed(situation.key, _MOVE_SEED), tries=self.tries)
 
-    def _move_probabilities(self, situation: Situation, reply: Reply, instead: str) -> NDArray[np.float64] | None:
-        self._note(situation.key, "move", reply, instead)
+    def _read_move_probabilities(self, situation: Situation, reply: Reply, instead: str) -> NDArray[np.float64] | None:
+        self._record_exchange(situation.key, "move", reply, instead)
         return reply.probabilities
 
     # -- recognition ---------------------------------------------------------------------------------------------------
@@ -345,49 +351,58 @@ class VLM(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> list[Answer | None]:
-        """The category, from views centred on the boxed target: the real one, and those imagined for each plan."""
+        """Return the category, by views centred on the boxed target: the real one, and those imagined for each plan."""
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        requests = [self._answer_request(*row) if row[0].goal.choices else None for row in rows]
+        requests = [self._build_answer_request(*row) if row[0].goal.choices else None for row in rows]
         replies = iter(self.client.ask([request for request in requests if request is not None]))
         return [
-            self._answered(situation, None if request is None else next(replies)) if situation.goal.choices else None
+            self._build_answer(situation, None if request is None else next(replies))
+            if situation.goal.choices
+            else None
             for situation, request in zip(situations, requests, strict=True)
         ]
 
-    def _answer_request(
+    def _build_answer_request(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout] | None
     ) -> Request | None:
-        """None where the target is nowhere to be seen."""
-        real = looks.target_now(situation.observation)
-        strips: list[looks.Image] = []
+        """Ask for the category; None where the target is in no view."""
+        real = prompt_images.render_target(situation.observation)
+        strips: list[prompt_images.Image] = []
         if rollouts is not None:
-            tracks = self._tracked(situation, proposals, rollouts)
-            found = [looks.target_strip(rollout, track) for rollout, track in zip(rollouts, tracks, strict=True)]
+            tracks = self._track_target(situation, proposals, rollouts)
+            found = [
+                prompt_images.render_target_strip(rollout, track)
+                for rollout, track in zip(rollouts, tracks, strict=True)
+            ]
             strips = [strip for strip in found if strip is not None]
         if real is None and not strips:
             return None
-        parts: list[Part] = [self._words(situation, "answerer", 1)]
+        parts: list[Part] = [self._render_prompt(situation, "answerer", 1)]
         parts += [] if real is None else [real]
         if strips:
-            parts += [self._words(situation, "answerer_imagined", 1), *strips]
+            parts += [self._render_prompt(situation, "answerer_imagined", 1), *strips]
         choices = situation.goal.choices
-        return Request((user(*parts),), choices=choices, seed=seed_of(situation.key, _ANSWER), tries=self.tries)
+        return Request(
+            (user(*parts),), choices=choices, seed=derive_seed(situation.key, _ANSWER_SEED), tries=self.tries
+        )
 
-    def _answered(self, situation: Situation, reply: Reply | None) -> Answer:
+    def _build_answer(self, situation: Situation, reply: Reply | None) -> Answer:
         memory, choices = situation.memory, situation.goal.choices
-        instead = "no choice was preferred" if memory.believed is None else "the last answer was kept"
+        instead = "no choice was preferred" if memory.belief is None else "the last answer was kept"
         if reply is None:
             lost = Exchange("answer", self.client.model, (), problem=OUT_OF_SIGHT, instead=instead)
             self._journal.setdefault((situation.key.episode, situation.key.decision), []).append(lost)
         else:
-            self._note(situation.key, "answer", reply, instead)
+            self._record_exchange(situation.key, "answer", reply, instead)
             if reply.probabilities is not None:
-                memory.believed = reply.probabilities
-        believed = _no_belief(situation.key, len(choices)) if memory.believed is None else memory.believed
+                memory.belief = reply.probabilities
+        believed = _make_uniform_belief(situation.key, len(choices)) if memory.belief is None else memory.belief
         return Answer(choices, believed)
 
-    def _tracked(self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]) -> list[Track]:
-        """Where the target is in the plans' frames; looked for once a decision."""
+    def _track_target(
+        self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
+    ) -> list[Track]:
+        """Return the target's tracks in the plans' frames, computed once per decision."""
         memory: Memory = situation.memory
         name = situation.key, tuple(plan.actions.tobytes() for plan in proposals), id(rollouts[0].frames)
         if memory.tracks is None or memory.tracks[0] != name:
@@ -397,27 +412,27 @@ class VLM(Policy):
 
     # ------------------------------------------------------------------------------------------------------------------
 
-    def _words(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
-        return self.prompts.text(
+    def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
+        return self.prompts.render(
             situation.goal.task,
             name,
-            obs_key=SEEN,
+            obs_key=OBSERVATION_WORDS,
             look_ahead_action_num=horizon,
             plan_num=count,
             actions=plans.MEANINGS,
         )
 
-    def _read(self, reply: Reply) -> dict[str, Any]:
-        """How an answer was read; what is empty is left out."""
+    def _describe_reading(self, reply: Reply) -> dict[str, Any]:
+        """Return how an answer was read, without empty entries."""
         return {"by": reply.by, "mass": reply.mass, "doubtful": reply.doubtful, "repaired": reply.repaired}
 
-    def _note(self, key: Key, purpose: str, reply: Reply, instead: str) -> None:
-        """Writes down what came of a question."""
+    def _record_exchange(self, key: Key, purpose: str, reply: Reply, instead: str) -> None:
+        """Record a question's outcome."""
         exchange = Exchange(
             purpose,
             self.client.model,
             tuple({"call": said.call, **said.completion.to_json()} for said in reply.said),
-            {name: value for name, value in self._read(reply).items() if value},
+            {name: value for name, value in self._describe_reading(reply).items() if value},
             "" if reply.problem is None else str(reply.problem),
             "" if reply.problem is None else instead,
         )
@@ -430,32 +445,34 @@ def _require_packages() -> None:
         raise DependencyError(f"policy vlm needs {', '.join(missing)}: pip install 'wiw[vlm]'")
 
 
-def seed_of(key: Key, number: int) -> int:
+def derive_seed(key: Key, number: int) -> int:
     return int(core.fold_key([key.seed, key.episode, key.decision, number]))
 
 
-def _captioned(proposals: Sequence[Proposal], strips: Sequence[looks.Image]) -> list[Part]:
-    """Each plan in words before its strip."""
+def _caption_strips(proposals: Sequence[Proposal], strips: Sequence[prompt_images.Image]) -> list[Part]:
+    """Put each plan in words before its strip."""
     parts: list[Part] = []
     for number, (plan, strip) in enumerate(zip(proposals, strips, strict=True), 1):
-        parts += [f"Plan {number}: {plans.named(plan.actions)}", strip]
+        parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", strip]
     return parts
 
 
-def _agreement(plan: NDArray[Any], written: NDArray[Any]) -> float:
-    """Share of the longer one's actions that both begin with."""
+def _measure_agreement(plan: NDArray[Any], written: NDArray[Any]) -> float:
+    """Return the share of the longer plan's actions that both begin with."""
     same = 0
     while same < min(len(plan), len(written)) and np.array_equal(plan[same], written[same]):
         same += 1
     return same / max(len(plan), len(written))
 
 
-def _no_belief(key: Key, count: int) -> NDArray[np.float64]:
-    """All choices as probable as each other, but for less than a millionth that is drawn: no choice is always first."""
-    weights = 1 + 1e-7 * np.asarray(core.uniform(core.fold_key([key.seed, key.episode, key.decision, _ANSWER]), count))
+def _make_uniform_belief(key: Key, count: int) -> NDArray[np.float64]:
+    """Return equal probabilities, up to random differences below a millionth, so that no choice is always first."""
+    weights = 1 + 1e-7 * np.asarray(
+        core.uniform(core.fold_key([key.seed, key.episode, key.decision, _ANSWER_SEED]), count)
+    )
     return np.asarray(weights / weights.sum(), np.float64)
 
 
-def cut(reason: str, most: int = 300) -> str:
+def shorten(reason: str, most: int = 300) -> str:
     text = " ".join(reason.encode("utf-8", "replace").decode().split())
     return text if len(text) <= most else text[: most - 1] + "…"

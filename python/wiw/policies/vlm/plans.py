@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans as a language model writes them."""
+"""Parsing plans of primitives that a language model writes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,9 @@ _MEANING_OF = {PRIMITIVES[name]: meaning for name, meaning in MEANINGS.items()}
 
 @lru_cache(maxsize=32)
 def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
-    """{reason, actions}: 1 to `longest` primitives; {plans: [...]} of up to `count` of them where count > 1."""
+    """Return the schema {reason, actions} with 1 to `longest` primitives; {plans: [...]} of up to `count` of them where
+    count > 1.
+    """
     from pydantic import ConfigDict, Field, create_model
 
     names = Literal["forward", "turn_left", "turn_right"]
@@ -39,20 +41,20 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     return create_model("Plans", __config__=strict, plans=plans)
 
 
-def plans_in(value: Any) -> list[tuple[NDArray[np.int8], str]]:
-    """Primitives and reasons of a validated answer."""
+def parse_plans(value: Any) -> list[tuple[NDArray[np.int8], str]]:
+    """Return primitives and reasons of a validated answer."""
     return [
         (np.array([PRIMITIVES[name] for name in plan.actions], np.int8), plan.reason)
         for plan in getattr(value, "plans", None) or [value]
     ]
 
 
-def in_words(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
-    """What each primitive does; "stop" for what ends a plan."""
+def describe_actions(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
+    """Return what each primitive does; "stop" for what ends a plan."""
     return [_MEANING_OF.get(int(action), "stop") for action in actions]
 
 
-def named(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
-    """The primitives' names, as plans are written."""
+def name_actions(actions: Sequence[int] | NDArray[np.int8]) -> list[str]:
+    """Return the primitives' names, as plans are written."""
     names = {primitive: name for name, primitive in PRIMITIVES.items()}
     return [names.get(int(action), "stop") for action in actions]

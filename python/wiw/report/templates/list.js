@@ -7,8 +7,8 @@ function fits(line, wanted) {
   const of_arm = wanted.arm === "" || wanted.arm === undefined ? line.states : [line.states[wanted.arm]];
   return (!wanted.scene || line.scene === wanted.scene)
     && (!wanted.state || of_arm.includes(wanted.state))
-    && (!wanted.won || line.states[wanted.won] === "reached")
-    && (!wanted.lost || line.states[wanted.lost] === "missed")
+    && (!wanted.won || line.states[wanted.won] === "success")
+    && (!wanted.lost || line.states[wanted.lost] === "failure")
     && (!form.elements.pictures.checked || line.pictures);
 }
 function show() {
@@ -21,10 +21,10 @@ function show() {
   document.getElementById("count").textContent = `${count} of ${rows.length}`;
   document.querySelectorAll(".list .arm").forEach((head, i) => {
     const shown = rows.filter((line) => !line.row.hidden).map((line) => line.states[i]);
-    const reached = shown.filter((state) => state === "reached").length;
-    const judged = shown.filter((state) => state === "reached" || state === "missed").length;
+    const successes = shown.filter((state) => state === "success").length;
+    const scored = shown.filter((state) => state === "success" || state === "failure").length;
     head.classList.toggle("lit", wanted.arm === String(i));
-    head.querySelector("small").textContent = `${reached} of ${judged}`;
+    head.querySelector("small").textContent = `${successes} of ${scored}`;
   });
   const said = new URLSearchParams(Object.entries(wanted).filter(([, value]) => value));
   if (form.elements.pictures.checked) said.set("pictures", "1");

@@ -40,14 +40,14 @@ def _bare() -> Workbench:
 @cache
 def plate(size: tuple[int, int]) -> Sight:
     """Return the front view of the bare table without an arm."""
-    seen = _bare().picture("front", size, arm=False)
+    seen = _bare().render_view("front", size, arm=False)
     seen["color"].setflags(write=False)
     return Sight(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
 
 
 @cache
 def _depth(size: tuple[int, int]) -> NDArray[np.float32]:
-    depth: NDArray[np.float32] = _bare().picture("front", size, ("depth",), arm=False)["depth"]
+    depth: NDArray[np.float32] = _bare().render_view("front", size, ("depth",), arm=False)["depth"]
     return depth
 
 
@@ -55,8 +55,8 @@ def sights(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[Sight]
     """Yield the arm after it has gone to each of the poses [N, 7] in turn, from where it waits."""
     bench = _bare().fork()
     for pose in poses:
-        bench.go(np.clip(pose, *_RANGE))
-        seen = bench.picture("front", size, ("color", "depth"))
+        bench.move_to(np.clip(pose, *_RANGE))
+        seen = bench.render_view("front", size, ("color", "depth"))
         yield Sight(seen["color"], seen["depth"] < _depth(size) - NEARER, bench.pose)
 
 

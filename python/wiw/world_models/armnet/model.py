@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.networks import one_thread
-from wiw.types import Conditioning, Control
+from wiw.networks import single_thread
+from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models.base import accepts
 from wiw.world_models.trained import Trained
 
@@ -41,7 +41,7 @@ class ArmNet(Trained):
     """
 
     accepts = accepts(
-        control="action", space="pose7", view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
+        control="action", space=GRIPPER_POSES, view="perspective", size=SIZE, causal=True, best_batch=16, cacheable=True
     )
 
     @classmethod
@@ -71,7 +71,7 @@ class ArmNet(Trained):
 
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         frames[:, 0] = observations.image
-        with one_thread():
+        with single_thread():
             for image, control, future in zip(observations.image, controls, frames, strict=True):
                 assert control.ids is not None
                 poses = np.asarray(control.ids[: control.length + 1], np.float64)

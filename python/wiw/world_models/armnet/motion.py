@@ -36,7 +36,7 @@ def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> Motion:
 def _tips(points: NDArray[np.float64]) -> Tensor:
     """Return pixels in the window, and metres along the camera's axis, [B, 3] of points [B, 3]."""
     front = CAMERAS["front"]
-    pixels = front.pixels_of(points, FRONT) - (WINDOW[1].start, WINDOW[0].start)
+    pixels = front.project_points(points, FRONT) - (WINDOW[1].start, WINDOW[0].start)
     depth = (points - front.eye) @ -front.pose[:3, 2]
     return _float(np.concatenate([pixels, depth[:, None]], axis=1))
 

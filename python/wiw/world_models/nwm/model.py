@@ -15,6 +15,7 @@ from wiw.errors import ArgumentError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
+from wiw.world_models.nwm.context import context_images
 from wiw.world_models.nwm.motion import SHIFT, motions
 from wiw.world_models.video.loading import versions
 
@@ -28,8 +29,8 @@ HUB = "facebook/nwm"
 class NWM(WorldModel):
     """Navigation World Models: frame after frame, each from the last four and the motion to it (Bar et al. 2025).
 
-    It sees the middle of the front view in 4:3; the rest of its frames is black. Where `observations.history` holds
-    earlier views of a row (uint8 [N, H, W, 3], oldest first) they are the first context, else the observation repeated.
+    It sees the middle of the front view in 4:3; the rest of its frames is black. The first context is taken from
+    `observations.history` at the spacing of its own frames (`context.py`); without one it is the observation repeated.
     Each row has a generator of its own, seeded with the row's seed.
 
     Args:
@@ -54,7 +55,9 @@ class NWM(WorldModel):
         ArgumentError: an option out of range, or a device that torch does not have.
     """
 
-    accepts = accepts(control="trajectory", view="perspective", size=(480, 480), cacheable=True)
+    accepts = accepts(
+        control="trajectory", view="perspective", size=(480, 480), cacheable=True, needs=("history",), history=4
+    )
     version = "1"
     immaterial = ("weights", "file", "revision", "vae", "vae_revision", "batch")
     requires = Requirements(("torch", "diffusers", "safetensors"), "diffusers", HUB, gpu=True)
@@ -92,6 +95,7 @@ class NWM(WorldModel):
             path = weights.fetch(self.weights, self.file, self.revision)
             self._network = weights.load_cdit(path).to(self._place)
             self._codec = weights.load_codec(self.vae or weights.codec_beside(path), self.vae_revision).to(self._place)
+        self.accepts = replace(self.accepts, history=self._network.size.context)
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
 
     def describe(self) -> dict[str, Any]:
@@ -146,16 +150,16 @@ class NWM(WorldModel):
         return frames
 
     def _first_context(self, observations: Conditioning) -> Tensor:
-        """Latents [B, N, C, h, w] of what was seen before and now; too short a past begins with its first view."""
+        """Latents [B, N, C, h, w] of what was observed before and now."""
         from wiw.world_models.nwm.images import to_network
 
         count = self._network.size.context
-        views: list[NDArray[np.uint8]] = []
-        for row, now in enumerate(observations.image):
-            seen = [*(observations.history[row] if observations.history else ()), now][-count:]
-            views += [seen[0]] * (count - len(seen)) + seen
-        latents = self._encoded(to_network(np.stack(views), self._side).to(self._place))
-        return latents.unflatten(0, (-1, count))
+        if observations.history is None:
+            images = np.repeat(observations.image[:, None], count, axis=1)
+        else:
+            images = context_images(observations.history, count)
+        images = images.reshape(-1, *images.shape[2:])
+        return self._encoded(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
 
     def _next(self, context: Tensor, motion: Tensor, generators: list[Any]) -> Tensor:
         """The frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 from wiw.errors import RemoteError
+from wiw.types import GRIPPER_POSES, History
 from wiw.wire.messages import MOST_BYTES
 from wiw.wire.rows import Row
 from wiw.world_models.base import Accepts
 
-HISTORY = 64
-"""Most frames of a row's history."""
 CONTROL_BYTES = 2**20
 """Of a row beside its images."""
 
@@ -17,7 +16,7 @@ CONTROL_BYTES = 2**20
 def most_bytes(accepts: Accepts) -> int:
     """Return the greatest size of one message of a client."""
     height, width = accepts.size
-    needs = {"depth": 4, "semantic": 4, "history": 3 * HISTORY}
+    needs = {"depth": 4, "semantic": 4, "history": 3 * accepts.history}
     pixel = 3 + sum(size for need, size in needs.items() if need in accepts.needs)
     return min(MOST_BYTES, height * width * pixel + CONTROL_BYTES)
 
@@ -33,10 +32,12 @@ def check_row(row: Row, accepts: Accepts) -> None:
         array, needed = getattr(row, name), name == "image" or name in accepts.needs
         if (array is not None) != needed:
             raise RemoteError(f"row.{name}: {'missing' if needed else 'the model does not take it'}", "row")
-        if array is not None and (array.shape[1:3] if name == "history" else array.shape[:2]) != size:
+        if array is not None and name != "history" and array.shape[:2] != size:
             raise RemoteError(f"row.{name}: expected {size} pixels, got shape {array.shape}", "row")
-    if row.image.shape[2:] != (3,) or (row.history is not None and row.history.shape[3:] != (3,)):
+    if row.image.shape[2:] != (3,):
         raise RemoteError("row: expected images of three channels", "row")
+    if row.history is not None:
+        _check_history(row.history, accepts)
     if (row.control.ids is not None) != (accepts.control == "action"):
         raise RemoteError(f"row.ids: a model of control '{accepts.control}' and these ids do not fit", "row")
     if count < 1 or (accepts.frames and count != accepts.frames - 1):
@@ -44,3 +45,13 @@ def check_row(row: Row, accepts: Accepts) -> None:
         raise RemoteError(f"row.actions: expected {expected} actions, got {count}", "row")
     if (count + 1) * row.image.size > MOST_BYTES - CONTROL_BYTES:
         raise RemoteError(f"row.actions: {count} frames of {size} pixels are more than can be sent", "row")
+
+
+def _check_history(history: History, accepts: Accepts) -> None:
+    expected, images = (accepts.history, *accepts.size, 3), history.images.shape[1:]
+    if images != expected:
+        raise RemoteError(f"row.history: expected images {expected}, got {images}", "row")
+    follows = accepts.control not in ("image", "text")  # those know nothing of primitives or poses
+    width = 7 if accepts.space == GRIPPER_POSES else 3
+    if follows and history.poses.shape[2] != width:
+        raise RemoteError(f"row.history: expected poses of {width} numbers, got {history.poses.shape[2]}", "row")

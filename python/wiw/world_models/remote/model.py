@@ -19,7 +19,7 @@ from wiw.types import Conditioning, Control
 from wiw.wire.rows import pack_row
 from wiw.world_models.base import Accepts, WorldModel, seconds_left
 from wiw.world_models.remote.declaration import parse_declaration, parse_description
-from wiw.world_models.remote.limits import HISTORY, most_bytes
+from wiw.world_models.remote.limits import most_bytes
 from wiw.world_models.remote.link import Link
 
 TOKEN = "WIW_TOKEN"
@@ -85,8 +85,8 @@ class Remote(WorldModel):
         ]
         if (longest := max(map(len, rows))) > (most := most_bytes(self.accepts) - OVERHEAD):
             raise RemoteError(
-                f"a row of {longest} bytes is more than the {most} that a server of this model takes; a history may "
-                f"have {HISTORY} frames",
+                f"a row of {longest} bytes is more than the {most} that a server of this model takes; a smaller size, "
+                "or a shorter history if it needs one, makes it less",
                 "row",
             )
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, 3), np.uint8)

@@ -7,20 +7,32 @@ import importlib.metadata
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 from wiw.errors import ArgumentError, WeightsError
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements
 
-if TYPE_CHECKING:
-    from wiw.world_models.video.model import VideoModel
-
 Precision = Literal["float32", "bfloat16", "float16"]
 Offload = Literal["none", "model", "sequential"]
 
 
-def load_pipeline(model: VideoModel, folder: Path, components: Mapping[str, Any]) -> Any:
+class Loadable(Protocol):
+    """What is read here of a video model (`wiw.world_models.video.model.VideoModel`)."""
+
+    pipeline_class: ClassVar[str]
+    half_precision: ClassVar[Precision]
+    network_precisions: ClassVar[Mapping[str, Precision]]
+    variant: str | None
+    device: str | None
+    precision: Precision | None
+    offload: Offload
+    size: Any
+    batch: int
+    frames: int
+
+
+def load_pipeline(model: Loadable, folder: Path, components: Mapping[str, Any]) -> Any:
     """Return the pipeline, ready to be called; `components` are parts of it that are not in the folder.
 
     Raises:
@@ -91,7 +103,7 @@ def _hide_progress_bars() -> Iterator[None]:
             library.enable_progress_bar()
 
 
-def _choose_dtypes(model: VideoModel) -> dict[str, Any]:
+def _choose_dtypes(model: Loadable) -> dict[str, Any]:
     """Return the precision of each network."""
     import torch
 
@@ -100,7 +112,7 @@ def _choose_dtypes(model: VideoModel) -> dict[str, Any]:
     return {name: getattr(torch, kind) for name, kind in {"default": model.precision, **parts}.items()}
 
 
-def _move_to_device(pipeline: Any, model: VideoModel) -> None:
+def _move_to_device(pipeline: Any, model: Loadable) -> None:
     if model.offload == "none":
         pipeline.to(model.device)
     elif model.device == "cpu":
@@ -111,12 +123,12 @@ def _move_to_device(pipeline: Any, model: VideoModel) -> None:
         pipeline.enable_sequential_cpu_offload(device=model.device)
 
 
-def memory_guard(model: VideoModel) -> AbstractContextManager[None]:
+def memory_guard(model: Loadable) -> AbstractContextManager[None]:
     """Turn torch's error of a full GPU into one that says which options need less."""
     return devices.memory_guard(f"{type(model).__name__} on {model.device}", "; ".join(_list_remedies(model)))
 
 
-def _list_remedies(model: VideoModel) -> list[str]:
+def _list_remedies(model: Loadable) -> list[str]:
     """List the options that need less memory than the present ones, the mildest first."""
     height, width = model.size
     remedies = [f"batch=1 (now {model.batch})"] if model.batch > 1 else []

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.networks import explained, is_path
+from wiw.networks import explain_hub_error as explained
+from wiw.networks import is_path
 
 __all__ = [
     "SAMPLES",

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.networks import one_thread
+from wiw.networks import single_thread
 from wiw.types import Conditioning, Control
 from wiw.world_models.base import accepts
 from wiw.world_models.trained import Trained
@@ -53,7 +53,7 @@ class WarpNet(Trained):
         """Return panoramas; frames that another row answers and frames of padding are left unwritten."""
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *observations.image.shape[1:]), np.uint8)
         frames[:, 0] = observations.image
-        with one_thread():
+        with single_thread():
             for image, control, future in zip(observations.image, controls, frames, strict=True):
                 wanted = slice(control.shared, control.length)
                 self._write_views(image, control.trajectory[wanted], future[1 + control.shared :])

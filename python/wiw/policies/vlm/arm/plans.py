@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans of gripper poses as a language model writes them: whole numbers of `wiw.action.PoseGrid`."""
+"""Plans of gripper poses that a language model writes: whole numbers of `wiw.action.PoseGrid`."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 GRID = PoseGrid()
 SURFACE = int(GRID.encode([0, 0, TABLE, 0, 0, 0, 0])[2])
 """Z of the table's top."""
-FARTHEST = 1_000_000
-"""Numbers beyond it are no slips of a bin or two, but nonsense."""
-SHOWN = 5
-"""Poses of a plan that are shown at most."""
-SCENE = "A robot arm works at a table. "
-"""What world models read before a plan in words."""
+NUMBER_LIMIT = 1_000_000
+"""Numbers beyond it are not off by a bin or two, but nonsense."""
+MAX_SHOWN = 5
+"""Most poses of a plan that are shown."""
+SCENE_WORDS = "A robot arm works at a table. "
+"""Text that world models read before a plan in words."""
 
 
 @lru_cache(maxsize=32)
 def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
-    """The paper's four fields with 1 to `longest` actions; {plans: [...]} of up to `count` of them where count > 1.
+    """Return the schema of the paper's four fields with 1 to `longest` actions; {plans: [...]} where count > 1.
 
-    Servers are told the range of the numbers; those that do not keep to it are understood as `PoseGrid` does.
+    Servers receive the range of the numbers; numbers outside are read as `PoseGrid` does.
     """
     from pydantic import ConfigDict, Field, WithJsonSchema, create_model
 
     strict: Any = ConfigDict(extra="forbid")
     told = WithJsonSchema({"type": "integer", "minimum": 0, "maximum": max(GRID.bins, GRID.turns)})
-    number = Annotated[int, Field(ge=-FARTHEST, le=FARTHEST), told]
+    number = Annotated[int, Field(ge=-NUMBER_LIMIT, le=NUMBER_LIMIT), told]
     numbers: Any = (list[number], Field(min_length=7, max_length=7))
     step = create_model("Step", __config__=strict, action=numbers)
     steps: Any = (list[step], Field(min_length=1, max_length=longest))  # type: ignore[valid-type]
@@ -56,49 +56,51 @@ def plan_schema(longest: int, count: int = 1) -> type[BaseModel]:
     return create_model("Plans", __config__=strict, plans=plans)
 
 
-def plans_in(value: Any) -> list[Proposal]:
-    """The plans of a validated answer, with their reasons and words."""
+def parse_plans(value: Any) -> list[Proposal]:
+    """Return the plans of a validated answer, with their reasons and words."""
     return [
-        Proposal(GRID.decode(_numbers(plan)), note=plan.reasoning_and_reflection, text=SCENE + plan.language_plan)
+        Proposal(
+            GRID.decode(_to_numbers(plan)), note=plan.reasoning_and_reflection, text=SCENE_WORDS + plan.language_plan
+        )
         for plan in getattr(value, "plans", None) or [value]
     ]
 
 
-def out_of_range(value: Any) -> int:
-    """How many numbers of a validated answer were clamped or wrapped."""
-    written = [_numbers(plan) for plan in getattr(value, "plans", None) or [value]]
+def count_out_of_range(value: Any) -> int:
+    """Return how many numbers of a validated answer were clamped or wrapped."""
+    written = [_to_numbers(plan) for plan in getattr(value, "plans", None) or [value]]
     most = np.array([GRID.bins] * 3 + [GRID.turns] * 3 + [1])
     return sum(int(((numbers < 0) | (numbers > most)).sum()) for numbers in written)
 
 
-def on_grid(poses: NDArray[np.float64]) -> bool:
-    """Whether poses [K, 7] are such as can be written in whole numbers."""
+def is_on_grid(poses: NDArray[np.float64]) -> bool:
+    """Return whether poses [K, 7] can be written in whole numbers."""
     return np.array_equal(GRID.decode(GRID.encode(poses)), poses)
 
 
-def named(poses: NDArray[np.float64]) -> str:
-    """Poses [K, 7] as they are written."""
+def format_poses(poses: NDArray[np.float64]) -> str:
+    """Return poses [K, 7] as they are written."""
     return str(GRID.encode(poses).tolist())
 
 
-def shown(count: int) -> NDArray[np.int64]:
-    """Which poses of a plan are shown: all of a short one, else the ends of equal parts."""
-    parts = min(count, SHOWN)
+def select_shown(count: int) -> NDArray[np.int64]:
+    """Return the indices of a plan's shown poses: all of a short plan, else the ends of equal parts."""
+    parts = min(count, MAX_SHOWN)
     return np.arange(1, parts + 1) * count // parts - 1
 
 
-def indexed(places: Mapping[str, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
-    """Positions [3] by the objects' indices from 1.
+def index_objects(places: Mapping[str, NDArray[np.float64]]) -> dict[int, NDArray[np.float64]]:
+    """Return positions [3] by the objects' indices from 1.
 
-    They are numbered by their names' alphabet: a task may name first what it asks for.
+    Indices follow the alphabetical order of names: a task may list the requested object first.
     """
     return {index: places[name][:3, 3] for index, name in enumerate(sorted(places), 1)}
 
 
-def dictionary(places: Mapping[str, NDArray[np.float64]]) -> dict[int, list[int]]:
-    """Whole numbers [X, Y, Z] by the objects' indices."""
-    return {index: GRID.encode([*spot, 0, 0, 0, 0])[:3].tolist() for index, spot in indexed(places).items()}
+def encode_objects(places: Mapping[str, NDArray[np.float64]]) -> dict[int, list[int]]:
+    """Return whole numbers [X, Y, Z] by the objects' indices."""
+    return {index: GRID.encode([*spot, 0, 0, 0, 0])[:3].tolist() for index, spot in index_objects(places).items()}
 
 
-def _numbers(plan: Any) -> NDArray[np.int64]:
+def _to_numbers(plan: Any) -> NDArray[np.int64]:
     return np.array([step.action for step in plan.executable_plan], np.int64)

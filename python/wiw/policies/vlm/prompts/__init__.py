@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prompt templates: one folder a task, one Jinja file a question, with the paper's slots. A user's own may stand in.
+"""Prompt templates: one folder per task, one Jinja file per question, with the paper's slots; a user's own may replace
+them.
 
-Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (plans asked for at once). Where agents
-walk: `obs_key` (what is seen now, in words) and `actions` (name to meaning). Of manipulation: `position_bins`,
+Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
+and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,
 `rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of its top), `colours` (names),
-`instruction`, `objects` (index to [X, Y, Z]), `gripper` (where it is) and `executed` (actions so far).
+`instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far).
 
 The shipped templates are filled here, a user's in a process with limits on time, memory and length (`filling.py`).
 """
@@ -27,7 +28,7 @@ SLOTS: dict[str, Any] = {
     "plan_num": 1,
     "actions": {"forward": "go straight for 0.20 m"},
 }
-"""Every slot where agents walk, with a value to try a template on."""
+"""Every slot of navigation and recognition, with a value to test templates with."""
 ARM_SLOTS: dict[str, Any] = {
     "look_ahead_action_num": 5,
     "plan_num": 1,
@@ -41,37 +42,39 @@ ARM_SLOTS: dict[str, Any] = {
     "gripper": [50, 50, 40, 0, 60, 60, 1],
     "executed": [[50, 50, 40, 0, 60, 60, 1]],
 }
-"""The same of manipulation."""
+"""Every slot of manipulation, likewise."""
 
 
-def tasks() -> list[str]:
-    """Tasks that prompts are shipped for."""
+def list_tasks() -> list[str]:
+    """Return the tasks with shipped prompts."""
     return sorted(path.name for path in FOLDER.iterdir() if any(path.glob("*.j2")))
 
 
 class Prompts:
-    """Templates of all tasks: a user's where there are any, else those that come with the package.
+    """Templates of all tasks: a user's where there are any, else those shipped with the package.
 
     Args:
-        folder: with templates as `<task>/<name>.j2`, under the names that are shipped; None means the shipped ones.
+        folder: with templates as `<task>/<name>.j2`, named like the shipped ones; None means the shipped ones.
 
     Raises:
-        PromptError: no such folder, nothing to be used in it, a template under another name, with an unknown slot, or
-            one that cannot be read.
+        PromptError: no such folder, no templates in it, a template under an unknown name, with an unknown slot, or one
+            that cannot be read.
     """
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.folder = None if folder is None else Path(folder).expanduser()
-        self._templates = {path.relative_to(FOLDER).as_posix(): (path, _source(path)) for path in _files(FOLDER)}
+        self._templates = {
+            path.relative_to(FOLDER).as_posix(): (path, _read_source(path)) for path in _list_templates(FOLDER)
+        }
         self._filling = Filling()
         if self.folder is not None:
-            self._templates |= self._own(self.folder)
+            self._templates |= self._load_own(self.folder)
 
     def __reduce__(self) -> Any:
         return Prompts, (self.folder,)
 
-    def text(self, task: str, name: str, **slots: Any) -> str:
-        """A prompt with its slots filled.
+    def render(self, task: str, name: str, **slots: Any) -> str:
+        """Return a prompt with its slots filled.
 
         Raises:
             ArgumentError: a task without prompts.
@@ -79,36 +82,36 @@ class Prompts:
         """
         template = self._templates.get(f"{task}/{name}.j2")
         if template is None:
-            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {tasks()}")
+            raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
         path, source = template
         own = self.folder is not None and path.is_relative_to(self.folder)
         return (self._filling.fill(path, source, slots) if own else worker.filled(source, slots)).strip()
 
     @cached_property
     def digest(self) -> str:
-        """Of all templates, as hexadecimal digits."""
+        """Digest of all templates, as hexadecimal digits."""
         parts = [f"{name}\0{source}\0" for name, (_, source) in sorted(self._templates.items())]
         return blake2b("".join(parts).encode(), digest_size=8).hexdigest()
 
-    def _own(self, folder: Path) -> dict[str, tuple[Path, str]]:
-        found = {path.relative_to(folder).as_posix(): path for path in _files(folder)}
+    def _load_own(self, folder: Path) -> dict[str, tuple[Path, str]]:
+        found = {path.relative_to(folder).as_posix(): path for path in _list_templates(folder)}
         if not found:
             raise PromptError(f"{folder}: expected templates such as {folder / 'ar/planner.j2'}, found none")
         for name, path in found.items():
             if name not in self._templates:
                 raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
-        own = {name: (path, _source(path)) for name, path in found.items()}
+        own = {name: (path, _read_source(path)) for name, path in found.items()}
         for path, source in own.values():  # tried on, so that what is wrong is known before the first question
             slots = ARM_SLOTS if path.parent.name == "manipulation" else SLOTS
             self._filling.fill(path, source, slots, check=True)
         return own
 
 
-def _files(folder: Path) -> list[Path]:
+def _list_templates(folder: Path) -> list[Path]:
     return sorted(folder.glob("*/*.j2"))
 
 
-def _source(path: Path) -> str:
+def _read_source(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

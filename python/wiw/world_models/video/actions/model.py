@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import WeightsError
-from wiw.types import Conditioning, Control
+from wiw.types import GRIPPER_POSES, Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import WorldModel, accepts
 from wiw.world_models.video.actions.config import ActionConfig
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from wiw.world_models.video.actions.conditioning import ActionConditioning
 
 PANORAMA = (576, 1024)
-POSES = {"space": "pose7", "view": "perspective", "null_first": False}
+POSES = {"space": GRIPPER_POSES, "view": "perspective", "null_first": False}
 """What a model of poses accepts otherwise than one of primitives."""
 
 

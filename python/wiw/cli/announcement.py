@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run is about to do, in four lines, before anything heavy is loaded."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from wiw.cli.terminal import printable
+from wiw.runs.config import RunConfig
+from wiw.tasks.base import Task
+
+
+def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
+    """Print task, scenes, arms, workers and folder of a run.
+
+    Args:
+        task: as built.
+        arms: recipes by name.
+        config: how the run goes.
+
+    Raises:
+        RegistryError: an arm's part is not known, or takes other options.
+        ArgumentError: an arm does not fit the task.
+    """
+    said = task.describe()
+    for recipe in arms.values():
+        recipe.describe()
+        recipe.require(said)
+    count = task.default_episodes if config.episodes is None else config.episodes
+    policies = sorted({str(recipe.policy) for recipe in arms.values()})
+    trials = f"{count_noun(count, 'episode')}{_describe_scenes(said, count)}"
+    lines = {
+        "task": f"{said.get('task', task.name)}: {trials}, seed {config.seed}",
+        "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",
+        "workers": str(config.workers),
+        "run": str(config.out),
+    }
+    for name, line in lines.items():
+        print(f"{name:<8}{printable(line)}", file=sys.stderr)
+    print(file=sys.stderr, flush=True)
+
+
+def count_noun(count: int, noun: str) -> str:
+    """Return "1 episode" or "3 episodes"."""
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def _describe_scenes(task: Mapping[str, Any], episodes: int) -> str:
+    """Return where the episodes take place; empty for a task that does not say."""
+    from wiw.scenes import resolve
+
+    file, spec, each = task.get("episode_file"), task.get("scenes"), task.get("per_scene")
+    if file is not None:
+        return f" of {file}"
+    if spec is None:
+        return f" of {', '.join(task['tasks'])}" if task.get("tasks") else ""
+    try:
+        there = len(resolve(spec))
+    except Exception:  # a wrong spec is refused where the scenes are made, with a message of its own
+        return f" in {spec}"
+    used = min(there, math.ceil(episodes / each)) if each else there
+    of = f"{used} of {count_noun(there, 'scene')}" if used < there else count_noun(there, "scene")
+    return f" in {of} ({spec}{f', {each} per scene' if each else ''})"

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers on the command line: what is no number is refused in plain words."""
+
+from __future__ import annotations
+
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
+
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+NOUNS = {int: "a whole number", float: "a number"}
+
+
+def make_registry() -> ConstructorRegistry:
+    """Return how the commands read `int`, `float`, and these or None."""
+    registry = ConstructorRegistry()
+    registry.primitive_rule(_read_number)
+    return registry
+
+
+def _read_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    kinds = set(get_args(info.type)) if get_origin(info.type) in (Union, UnionType) else {info.type}
+    kind = next(iter(kinds - {NoneType}), None) if len(kinds - {NoneType}) == 1 else None
+    if kind not in NOUNS:
+        return None
+
+    def parse(words: list[str]) -> Any:
+        if words == ["None"] and NoneType in kinds:
+            return None
+        try:
+            return kind(words[0])
+        except ValueError:
+            raise ValueError(f"expected {NOUNS[kind]}, got '{words[0]}'") from None
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="N",
+        instance_from_str=parse,
+        is_instance=lambda value: type(value) in kinds or (kind is float and type(value) is int),
+        str_from_instance=lambda value: [str(value)],
+    )

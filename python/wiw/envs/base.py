@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Env`: what the closed loop asks of an environment, whatever the task and whatever its plans are made of."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.types import Answer, Episode, Goal, Key, Truth
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The outcome of carrying out the actions of one decision."""
+
+    observation: Any
+    """The view at its end, such as a `wiw.types.Observation`."""
+    executed: NDArray[Any]
+    """The actions carried out: fewer than planned where the episode ended on the way."""
+    path: NDArray[np.float64]
+    """float64 [len(executed) + 1, 3]: world positions from before the first action to after the last."""
+    terminated: bool
+    truncated: bool
+    key: Key | None = None
+    """Of the next decision, where the environment counts decisions itself."""
+    refused: tuple[str, ...] = ()
+    """Why actions were not carried out to their ends, one reason for each such action."""
+
+
+class Guide(ABC):
+    """The truth about plans from where an environment stands.
+
+    Only the loop hands a guide on, to stages that an experiment tells the truth; no policy and no world model gets one.
+    """
+
+    @abstractmethod
+    def worth(self, plan: NDArray[Any]) -> float:
+        """Return how good a plan truly is: the best progress after any of its actions, the higher the better."""
+
+    @abstractmethod
+    def plan(self, length: int) -> NDArray[Any]:
+        """Return a plan of at most `length` actions that truly leads on."""
+
+
+class Env(ABC):
+    """An environment that runs one episode at a time for the closed loop.
+
+    The loop calls `begin` once per episode, then `run` once per decision until a segment is terminated or truncated,
+    then `result`. An environment is used for one episode after another until it is closed.
+    """
+
+    task: Any
+    """The `wiw.Task` whose episodes it runs."""
+
+    @abstractmethod
+    def begin(self, episode: Episode) -> Any:
+        """Start an episode and return the first observation."""
+
+    @abstractmethod
+    def run(self, plan: Any, answer: Answer | None = None) -> Segment:
+        """Carry out the actions of one decision, as far as the episode goes on, and observe once, at the end.
+
+        `answer` is what the agent believes now; the loop gives it only where the goal has choices.
+        """
+
+    @property
+    @abstractmethod
+    def goal(self) -> Goal:
+        """The goal of the running episode."""
+
+    @property
+    @abstractmethod
+    def observation(self) -> Any:
+        """The agent's present view, such as a `wiw.types.Observation`."""
+
+    @abstractmethod
+    def truth(self) -> Truth:
+        """Return where the agent truly is; for records, metrics and reports alone."""
+
+    @abstractmethod
+    def result(self) -> Mapping[str, float]:
+        """Return the metrics of the running episode, "success" (0 or 1) among them."""
+
+    def fork(self) -> Any:
+        """Return a copy of the simulator as it stands, which the world model `oracle` runs ahead."""
+        raise self._lacks("has no simulator to copy, which world model 'oracle' runs ahead", "fork")
+
+    def guide(self) -> Guide:
+        """Return the truth about plans from here, which `wiw blame` tells stages of the loop."""
+        raise self._lacks("does not tell what plans are truly worth, which `wiw blame` asks", "guide")
+
+    def semantic(self) -> NDArray[np.uint32]:
+        """Return the true category of each pixel of the panorama, uint32 [H, W], for `--semantics simulator`."""
+        raise self._lacks("has no true semantics, which `--semantics simulator` asks for", "semantic")
+
+    def close(self) -> None:
+        """Release the resources of the environment."""
+        return
+
+    def _lacks(self, what: str, method: str) -> ArgumentError:
+        name = type(self).__name__
+        return ArgumentError(f"{name} {what}; use something else, or write `{name}.{method}`")
+
+
+def read_episode_option(options: Mapping[str, Any] | None) -> Any:
+    """Return the "episode" of gymnasium's reset options; None where it is left open.
+
+    Raises:
+        ArgumentError: another option.
+    """
+    given = options or {}
+    if unknown := [str(name) for name in given if name != "episode"]:
+        raise ArgumentError(f"reset: unknown option '{unknown[0]}'; the only one is 'episode', its number")
+    return given.get("episode")

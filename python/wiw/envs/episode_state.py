@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One navigation episode in progress, as the single and the vector environment both keep it, and what judges it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import env as _env
+from wiw.action import STOP
+from wiw.datasets.worlds import World, world
+from wiw.envs.pointing import IDS, Pointing
+from wiw.errors import ArgumentError
+from wiw.types import Answer, Episode, Goal, Observation, Truth
+
+
+class NavigationSpec(ABC):
+    """The side of a navigation task that its environments use: goals, and when one is reached."""
+
+    name: str
+    seed: int
+    backend: Literal["auto", "cpu", "gpu"]
+    choices: tuple[str, ...] = ()
+    """Labels that answers are chosen from, where the task asks for any."""
+
+    @property
+    @abstractmethod
+    def decisions(self) -> int:
+        """K: decisions that an episode may take."""
+
+    @property
+    @abstractmethod
+    def budget(self) -> int:
+        """Primitives that an episode may take where they are given one by one."""
+
+    @property
+    @abstractmethod
+    def motion(self) -> str:
+        """Rule for blocked moves: "refuse" or "slide"."""
+
+    @property
+    @abstractmethod
+    def episode_count(self) -> int | None:
+        """How many episodes there are; None where there is no end of them."""
+
+    @property
+    def pointing(self) -> Pointing | None:
+        """How the task points its target out, where it has one."""
+        return None
+
+    @abstractmethod
+    def episode(self, index: int) -> Episode:
+        """Return an episode by its number."""
+
+    @abstractmethod
+    def make_goal(self, place: World, episode: Episode) -> Goal:
+        """Return what the agent is asked to do."""
+
+    @abstractmethod
+    def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
+        """Return where distances to the goal end."""
+
+    @abstractmethod
+    def is_success(self, state: EpisodeState) -> bool:
+        """Return whether an episode has been successful so far."""
+
+    @abstractmethod
+    def measure(self, state: EpisodeState) -> dict[str, float]:
+        """Return the metrics of an episode."""
+
+    def is_sure(self, state: EpisodeState) -> bool:
+        """Return whether the answers given so far end the episode."""
+        return False
+
+    def find_destination(self, state: EpisodeState) -> NDArray[np.float64]:
+        """Return where an agent that knew the scene would go."""
+        return state.goal_position
+
+    def measure_progress(self, state: EpisodeState, fork: Any, primitives_left: float) -> float:
+        """Return how good it would be to stand where a fork of the simulator stands, the higher the better.
+
+        `primitives_left` counts those of the shortest path from there to the destination; here the fewer, the better.
+        """
+        return -primitives_left
+
+
+@dataclass
+class EpisodeState:
+    """The privileged record of one episode so far: what metrics are computed from."""
+
+    episode: Episode
+    world: World
+    goal_position: NDArray[np.float64]
+    """As the distances to it are measured: on the floor, as the positions are."""
+    positions: list[NDArray[np.float64]]
+    """After each primitive, beginning with the start."""
+    decisions: int = 0
+    """Segments carried out by `run`."""
+    at_decision: bool = True
+    """Whether the agent stands at the end of an executed segment."""
+    stopped: bool = False
+    success: bool = False
+    ended: bool = False
+    """By success, by stopping, by an answer that was sure enough, or for want of a target."""
+    answers: list[Answer] = field(default_factory=list)
+    """The agent's beliefs, decision by decision."""
+
+    @property
+    def actions(self) -> int:
+        """Primitives carried out, refused moves and stop included."""
+        return len(self.positions) - 1
+
+    @property
+    def travelled(self) -> float:
+        """Metres walked, measured horizontally as shortest paths are."""
+        steps = np.diff(self.positions, axis=0).reshape(-1, 3)
+        return float(np.hypot(steps[:, 0], steps[:, 2]).sum())
+
+    def distance_to_goal(self) -> float:
+        """Return the straight-line metres from the agent to the goal's position."""
+        return float(np.linalg.norm(self.positions[-1] - self.goal_position))
+
+    def geodesic_to_goal(self) -> float:
+        """Return the metres of the shortest walk to the goal; inf when it cannot be reached."""
+        return float(self.world.navmesh.geodesic_distance(self.positions[-1], self.goal_position))
+
+    def make_truth(self, yaw: float) -> Truth:
+        """Return where the agent truly is, heading `yaw` radians."""
+        return Truth(self.positions[-1], yaw, self.distance_to_goal(), self.geodesic_to_goal())
+
+    def record_primitive(
+        self, task: NavigationSpec, action: int, position: NDArray[np.float64], at_decision: bool
+    ) -> None:
+        """Record where a primitive led."""
+        self.positions.append(position)
+        self.stopped, self.at_decision = action == STOP, at_decision
+        self.ended = self.stopped
+        self.success = task.is_success(self)
+        self.ended = self.ended or self.success
+
+    def record_answer(self, task: NavigationSpec, answer: Answer, final: bool = False) -> bool:
+        """Record what the agent believes; return whether it is the last answer, after which nothing is carried out.
+
+        It is when the task says that it is sure enough, with the last decision, and when the agent calls it `final`.
+        """
+        self.answers.append(answer)
+        self.ended = final or task.is_sure(self)
+        self.success = task.is_success(self)
+        return self.ended or self.is_out_of_budget(task)
+
+    def record_observation(self, task: NavigationSpec, observation: Observation) -> None:
+        """End the episode where the task says so once its target is out of sight."""
+        if task.pointing is not None and task.pointing.ends(observation.target):
+            self.ended = True
+            self.success = task.is_success(self)
+
+    def is_out_of_budget(self, task: NavigationSpec) -> bool:
+        """Return whether the decisions are used up, or the primitives where they are given one by one."""
+        return self.decisions >= task.decisions if self.decisions else self.actions >= task.budget
+
+
+def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
+    """Return a random episode's number; among the first 64 where there is no end of them."""
+    return int(random.integers(task.episode_count or 64))
+
+
+def wrap_episode(task: NavigationSpec, index: int) -> int:
+    """Return the number of an episode, counted round where the last one is passed.
+
+    Raises:
+        ArgumentError: a negative number.
+    """
+    if index < 0:
+        raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+    return index % task.episode_count if task.episode_count else index
+
+
+def start_episode(task: NavigationSpec, episode: Episode) -> tuple[Any, EpisodeState, Goal]:
+    """Return the simulator at the start of an episode, the episode's record, and what the agent is asked to do."""
+    place = world(episode.scene, task.backend)
+    config = _env.NavigationConfig(motion=_env.Motion.__members__[task.motion])
+    core = _env.NavigationEnv(place.renderer.core, place.navmesh, place.ground, config)
+    core.reset(np.asarray(episode.start_position), episode.start_yaw)
+    goal_position = task.find_goal_position(place, episode)
+    state = EpisodeState(episode, place, goal_position, [core.position])
+    return core, state, task.make_goal(place, episode)
+
+
+def image_names(task: NavigationSpec, depth: bool) -> list[str]:
+    """Return the images that the simulator is asked for, by its names."""
+    return ["panorama", "front", *(["depth"] if depth else []), *([] if task.pointing is None else IDS)]
+
+
+def make_observation(
+    task: NavigationSpec, images: dict[str, Any], odometry: NDArray[np.float64], state: EpisodeState
+) -> Observation:
+    """Return what the agent is given of what the simulator shows."""
+    if task.pointing is not None:
+        images = task.pointing.split(images, int(state.episode.info["target"]))
+    return Observation(**images, odometry=odometry)

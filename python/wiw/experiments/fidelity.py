@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How true imagination was, decision by decision: every candidate is replayed in the oracle and scored again.
+
+Open-loop error of the frames and the order that their scores bring about are two things: a model may blur every picture
+and still tell the better plan. What is found here is written down and reported; no policy or world model sees it.
+
+PSNR and SSIM are taken of what the reviser sees, latitude-weighted where that is panoramas. LPIPS knows no sphere and
+needs pixels, so it is taken of perspective views of 90 degrees, 256x256, whatever the reviser sees: the front view of a
+model that imagines no more, else the mean over front, left, right and back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.loop.attempts import Attempted
+from wiw.loop.clock import Clock
+from wiw.loop.contract import check_scores
+from wiw.loop.imagination import ModelInput, Request
+from wiw.loop.model_imaginer import ModelImaginer
+from wiw.loop.observers import Futures, Observer
+from wiw.loop.privileged import LiveEnvironments, Privileged
+from wiw.metrics import Lpips, psnr, ssim
+from wiw.policies.base import FrameSpec, Situation
+from wiw.registry import WORLD_MODELS
+from wiw.types import Decision, Fidelity, Key, Rollout
+
+PERSPECTIVE = (256, 256)
+"""Size of the views that LPIPS is taken of."""
+
+
+class FidelityObserver(Observer, Privileged):
+    """Replays every plan in the simulator and lets the reviser score the true futures as well.
+
+    Args:
+        lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
+
+    Raises:
+        WeightsError: those of LPIPS are not there.
+    """
+
+    def __init__(self, lpips: str | Path | None = None) -> None:
+        self._lpips = None if lpips is None else Lpips(lpips)
+        self._environments = LiveEnvironments()
+        self._seen: dict[Key, _Truth] = {}
+
+    def grant(self, environments: LiveEnvironments) -> None:
+        """Take the environments that plans are replayed in."""
+        self._environments = environments
+
+    def watch(self, futures: Futures) -> None:
+        """Imagine the same plans truly, and score them with copies of the reviser's memories."""
+        with futures.clock("replay"):
+            places = [place for place, own in enumerate(futures.imagined.rollouts) if own is not None]
+            if places:
+                self._seen |= _replay(self._environments, futures, places, self._lpips)
+
+    def annotate(self, decision: Decision) -> Decision:
+        """Add how true the imagination of a decision was."""
+        truth = None if decision.key is None else self._seen.pop(decision.key, None)
+        if truth is None or decision.rollouts is None or decision.scores is None:
+            return decision
+        return replace(decision, fidelity=_compare(decision.rollouts, decision.scores, truth))
+
+
+@dataclass(frozen=True)
+class _Truth:
+    rollouts: Sequence[Rollout]
+    scores: NDArray[np.float64]
+    distances: NDArray[np.float64] | None
+
+
+def _replay(
+    environments: LiveEnvironments, futures: Futures, places: Sequence[int], lpips: Lpips | None
+) -> dict[Key, _Truth]:
+    """Return truth beside imagination for each episode of which something was imagined."""
+    imagined = [futures.imagined.rollouts[place] or () for place in places]
+    plans = [futures.plans[place] for place in places]
+    queries = [futures.queries[place] for place in places]
+    request = Request(
+        futures.space,
+        [query.key for query in queries],
+        [query.observation for query in queries],
+        [ModelInput(query.observation) for query in queries],
+        plans,
+        [range(len(own)) for own in plans],
+        _view_of(imagined[0][0]),
+        Clock(),
+    )
+    oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=futures.reviser.space), math.inf))
+    oracle.grant(environments)
+    true = oracle.imagine(request)
+    situations = [_copy_memory(futures.situations[place]) for place in places]
+    rollouts = [own or () for own in true.rollouts]
+    scores = check_scores(futures.reviser, futures.reviser.score(situations, plans, rollouts), plans)
+    distances: Sequence[Any] = [None] * len(places)
+    if lpips is not None:
+        view = FrameSpec("front" if futures.imagined.view == "perspective" else "surround", PERSPECTIVE)
+        shown, truths = futures.imagined.show(view), true.show(view)
+        distances = _distances(lpips, [shown[place] for place in places], truths)
+    found = zip(queries, rollouts, scores, distances, strict=True)
+    return {query.key: _Truth(own, score, distance) for query, own, score, distance in found}
+
+
+def _copy_memory(situation: Situation) -> Situation:
+    return replace(situation, memory=deepcopy(situation.memory))
+
+
+def _view_of(rollout: Rollout) -> FrameSpec:
+    return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]))
+
+
+def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _Truth) -> Fidelity:
+    errors = np.array([_errors(one, other) for one, other in zip(imagined, truth.rollouts, strict=True)])
+    agreement = rank_agreement(scores, truth.scores)
+    return Fidelity(
+        tuple(truth.rollouts), truth.scores, agreement, psnr=errors[:, 0], ssim=errors[:, 1], lpips=truth.distances
+    )
+
+
+def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    """Kendall's tau-b of two scorings of the same plans; NaN where one of them tells nothing apart."""
+    from scipy.stats import kendalltau
+
+    if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:
+        return math.nan
+    return float(kendalltau(scores, true).statistic)
+
+
+def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
+    """Mean PSNR and SSIM over the frames that were imagined; NaN where all are the real view turned."""
+    made = ~imagined.real
+    if not made.any():
+        return math.nan, math.nan
+    frames, truth = imagined.frames[made], true.frames[made]
+    weights: Any = "latitude" if imagined.view == "panorama" else "uniform"
+    return float(np.mean(psnr(frames, truth, weights=weights))), float(np.mean(ssim(frames, truth, weights=weights)))
+
+
+def _distances(
+    lpips: Lpips, imagined: Sequence[Sequence[Rollout]], true: Sequence[Sequence[Rollout]]
+) -> list[NDArray[np.float64]]:
+    """Return the mean LPIPS over the imagined frames of each plan, float64 [M] per episode; NaN without any."""
+    return [
+        np.array([_distance(lpips, one, other) for one, other in zip(plans, truths, strict=True)])
+        for plans, truths in zip(imagined, true, strict=True)
+    ]
+
+
+def _distance(lpips: Lpips, imagined: Rollout, true: Rollout) -> float:
+    made = ~imagined.real
+    return float(np.mean(lpips(imagined.frames[made], true.frames[made]))) if made.any() else math.nan

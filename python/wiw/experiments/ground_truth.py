@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stages of the loop that are given the ground truth, one or several, to find out which of them a failure is due to.
+
+imagination: the oracle stands in for the world model, or for the lack of one.
+scoring: plans are judged by how far they truly get, and the best one is followed; policies still score and remember.
+proposals: the plan of an agent that knows the scene leads the policy's own, as the one that the policy likes best; the
+policy's last one gives way where there would be too many. It still has to be recognised.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.loop.privileged import LiveEnvironments, Privileged
+from wiw.policies.base import Policy, Situation
+from wiw.policies.wrapper import PolicyWrapper
+from wiw.types import Key, Proposal, Rollout
+
+STAGES = ("imagination", "scoring", "proposals")
+
+
+def sort_stages(stages: Collection[str]) -> tuple[str, ...]:
+    """Return the stages in their order.
+
+    Raises:
+        ArgumentError: an unknown one.
+    """
+    if isinstance(stages, str) or not set(stages) <= set(STAGES):
+        raise ArgumentError(f"expected stages among {', '.join(STAGES)}, got {stages!r}")
+    return tuple(stage for stage in STAGES if stage in stages)
+
+
+class _Guided(PolicyWrapper, Privileged):
+    """A policy with an environment's guide at hand."""
+
+    stage: ClassVar[str]
+    """Which of `STAGES` is given the truth."""
+
+    def __init__(self, inner: Policy) -> None:
+        super().__init__(inner)
+        self._environments = LiveEnvironments()
+
+    def grant(self, environments: LiveEnvironments) -> None:
+        """Take the live environments, whose guides know what plans are worth."""
+        self._environments = environments
+        if isinstance(self.inner, Privileged):
+            self.inner.grant(environments)
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the wrapped policy, and which stage is given the truth."""
+        return {**super().describe(), "ground_truth": self.stage}
+
+    def _guide(self, key: Key) -> Any:
+        return self._environments.find(key).guide()
+
+
+class TruePlans(_Guided):
+    """A policy among whose proposals there is a true plan."""
+
+    stage = "proposals"
+
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Propose the true plan before the policy's own, at most `candidates` in all."""
+        proposals = super().propose(situations, candidates, horizon)
+        return [
+            _put_first(self._guide(situation.key).plan(horizon), plans, candidates)
+            for situation, plans in zip(situations, proposals, strict=True)
+        ]
+
+
+class TrueScores(_Guided):
+    """A reviser that knows how far each plan truly gets, and follows the best."""
+
+    stage = "scoring"
+
+    def score_or_prefer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[NDArray[np.float64]]:
+        """Let the wrapped reviser score and remember, and return the true worth of each plan."""
+        super().score_or_prefer(situations, proposals, rollouts)
+        return [self._worths(situation.key, plans) for situation, plans in zip(situations, proposals, strict=True)]
+
+    def revise(
+        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], int | None]:
+        """Follow the best plan, where the wrapped reviser would write one of its own, too."""
+        super().revise(situation, proposals, scores)
+        best = int(np.argmax(scores))
+        return proposals[best].actions, best
+
+    def _worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
+        guide = self._guide(key)
+        return np.array([guide.worth(plan.actions) for plan in plans], np.float64)
+
+
+def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:
+    best = Proposal(actions, max(plan.prior for plan in plans), "true")
+    others = [plan for plan in plans if not np.array_equal(plan.actions, actions)]
+    return [best, *others][:candidates]

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Placebos at equal compute: the world model works as hard as ever, and what it imagines says nothing of the plan.
+
+"shuffled" imagines plans made of the same primitives in another order and shows their futures as the plans' own.
+"swapped" imagines the very plans, but from the first observation of another episode. A world model whose score a
+placebo reaches has helped by something else than foresight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import core, planner
+from wiw.action import STOP
+from wiw.errors import ArgumentError
+from wiw.loop.imagination import Imagination, ImaginerWrapper, ModelInput, Request
+from wiw.loop.imagine import make_model_spec
+from wiw.loop.model_imaginer import as_imaginer
+from wiw.types import Key, Proposal
+
+PLACEBOS = ("shuffled", "swapped")
+DRAWS = 64
+"""Orders that are tried for one that costs as much as the plans themselves."""
+_PURPOSE = 0x706C6163
+"""Keeps these draws apart from all others of the decision."""
+
+
+class Placebo(ImaginerWrapper):
+    """A world model that is asked as much, for something else than the plans.
+
+    Args:
+        model: a world model, or an imaginer.
+    """
+
+    kind: str
+
+    def __init__(self, model: Any) -> None:
+        super().__init__(as_imaginer(model))
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the model and the kind of placebo."""
+        return {**super().describe(), "placebo": self.kind}
+
+
+class ShuffledPlacebo(Placebo):
+    """Imagines plans made of the same primitives in another order, and shows their futures as the plans' own."""
+
+    kind = "shuffled"
+
+    def imagine(self, request: Request) -> Imagination:
+        """Imagine the plans' primitives in another order.
+
+        Raises:
+            ArgumentError: the plans are not made of primitives.
+        """
+        if any(plan.actions.ndim != 1 for plans in request.plans for plan in plans):
+            raise ArgumentError(NO_POSES)
+        spec = make_model_spec(self.accepts)
+        plans = [shuffle(own, key, spec) for own, key in zip(request.plans, request.keys, strict=True)]
+        return super().imagine(replace(request, plans=plans))
+
+
+class FirstMoments(Protocol):
+    """Where a swapped placebo gets the first moment of another episode."""
+
+    def of(self, key: Key) -> ModelInput:
+        """Return the first moment of an episode that is not the key's own, the same one at each of its decisions."""
+
+    def forget(self, key: Key) -> None:
+        """Drop what is kept for an episode that has ended."""
+
+
+class SwappedPlacebo(Placebo):
+    """Imagines the very plans, but from the first observation of another episode.
+
+    Args:
+        model: a world model, or an imaginer.
+        moments: the other episodes' first moments; `wiw.runs` gives the run's next episode's.
+    """
+
+    kind = "swapped"
+
+    def __init__(self, model: Any, moments: FirstMoments) -> None:
+        super().__init__(model)
+        self._moments = moments
+
+    def imagine(self, request: Request) -> Imagination:
+        """Imagine the plans from elsewhere; real views, those of leading turns, stay the episodes' own."""
+        return super().imagine(replace(request, inputs=[self._moments.of(key) for key in request.keys]))
+
+    def forget(self, key: Key) -> None:
+        """Drop the moment that is kept for an episode."""
+        super().forget(key)
+        self._moments.forget(key)
+
+
+NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made of none; use 'swapped'"
+
+
+def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> list[Proposal]:
+    """Put the primitives of all plans in another order, drawn by the decision's key, and deal them at equal lengths.
+
+    Stops stay where they are: nothing follows them. Leading turns, equal plans and common beginnings cost a model
+    nothing, and an order may have more or fewer of them. Of `DRAWS` orders the first is taken that asks for as many
+    rollouts and frames as the plans do, or else the one that comes nearest.
+    """
+    pool = np.concatenate([plan.actions for plan in plans])
+    movable = np.flatnonzero(pool != STOP)
+    wanted = _cost([plan.actions for plan in plans], spec)
+    ends = np.cumsum([len(plan.actions) for plan in plans])[:-1]
+    best: tuple[tuple[int, int], list[NDArray[np.int8]]] | None = None
+    for draw in range(DRAWS):
+        key_of_draw = core.fold_key([key.seed, key.episode, key.decision, _PURPOSE, draw])
+        dealt = pool.copy()
+        dealt[movable] = pool[movable[np.argsort(core.uniform(key_of_draw, len(movable)))]]
+        made = np.split(dealt, ends)
+        rows, frames = _cost(made, spec)
+        miss = abs(rows - wanted[0]), abs(frames - wanted[1])
+        if best is None or miss < best[0]:
+            best = miss, made
+        if miss == (0, 0):
+            break
+    assert best is not None
+    return [Proposal(actions, plan.prior, plan.note) for actions, plan in zip(best[1], plans, strict=True)]
+
+
+def _cost(plans: Sequence[NDArray[np.int8]], spec: planner.ModelSpec) -> tuple[int, int]:
+    """Return the rollouts and frames that plans of one episode ask of a model."""
+    batch = planner.Batch.build([list(plans)], spec)
+    return len(batch.row_length), int((batch.row_length - batch.row_shared).sum())

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Semantics for world models that read what each pixel is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.loop.imagination import Imagination, ImaginerWrapper, ModelInput, Request
+from wiw.loop.imagine import stack_depths
+from wiw.loop.model_imaginer import as_imaginer
+from wiw.loop.privileged import LiveEnvironments
+from wiw.perception.semantics import Semantics
+from wiw.registry import SEMANTICS
+
+SIMULATOR = "simulator"
+"""The environment's own semantics, which know its scene."""
+
+
+def find_source(semantics: Any) -> Semantics | str:
+    """Return a source of semantics by name, class or instance; "simulator" as it is.
+
+    Raises:
+        RegistryError: no such source.
+        ArgumentError: a source that needs instance ids, which differ from scene to scene.
+    """
+    if semantics == SIMULATOR:
+        return SIMULATOR
+    source: Semantics = SEMANTICS.make(semantics)
+    if "ids" in source.needs:
+        raise ArgumentError(f"Agent: {type(source).__name__} knows one scene; give semantics='simulator' for any")
+    return source
+
+
+class Labelled(ImaginerWrapper):
+    """A world model that is told what each pixel of the panorama is.
+
+    Args:
+        model: a world model, or an imaginer.
+        source: "simulator", "rednet", or another source (`wiw.perception.semantics`).
+    """
+
+    def __init__(self, model: Any, source: Any) -> None:
+        super().__init__(as_imaginer(model))
+        self.source = find_source(source)
+        self._environments = LiveEnvironments()
+
+    def grant(self, environments: LiveEnvironments) -> None:
+        """Take the environments, whose own semantics the source "simulator" gives, and pass them on."""
+        self._environments = environments
+        super().grant(environments)
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """The model's, and depth where the source needs it."""
+        own = frozenset() if isinstance(self.source, str) else frozenset(self.source.needs) & {"depth"}
+        return super().needs | own
+
+    @property
+    def gives(self) -> frozenset[str]:
+        """Semantics, beside what the wrapped imaginer gives."""
+        return super().gives | {"semantic"}
+
+    def imagine(self, request: Request) -> Imagination:
+        """Imagine with labels, where the model needs them; what is labelled already stays so."""
+        if "semantic" not in self.accepts.needs:
+            return super().imagine(request)
+        if isinstance(self.source, str):
+            pairs = zip(request.keys, request.inputs, strict=True)
+            labels = [
+                self._environments.find(key).semantic() if own.semantic is None else own.semantic for key, own in pairs
+            ]
+        else:
+            labels = list(_label(self.source, request.inputs))
+        inputs = [replace(own, semantic=label) for own, label in zip(request.inputs, labels, strict=True)]
+        return super().imagine(replace(request, inputs=inputs))
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the model and the source."""
+        source = self.source if isinstance(self.source, str) else self.source.describe()
+        return {**super().describe(), "semantics": source}
+
+
+def _label(source: Semantics, inputs: Any) -> NDArray[np.uint32]:
+    own: list[ModelInput] = list(inputs)
+    depth = stack_depths(own) if "depth" in source.needs else None
+    return source.label_panoramas(np.stack([shown.observation.panorama for shown in own]), depth)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept of each live episode between its decisions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError
+from wiw.loop.contract import check_answerer
+from wiw.loop.history import EpisodeHistories
+from wiw.loop.imagination import Imaginer
+from wiw.policies.base import Policy, Situation
+from wiw.types import ArmObservation, Goal, Key, Observation
+from wiw.world_models.base import WorldModel
+
+
+@dataclass(frozen=True)
+class Query:
+    """One live episode that asks for a decision: what an agent may know of it."""
+
+    observation: Observation | ArmObservation
+    goal: Goal
+    key: Key
+
+
+def read_observation(observation: Any) -> Observation | ArmObservation:
+    """Return an observation as agents take it, from one or from the dict of an environment.
+
+    Raises:
+        ArgumentError: a dict whose images have boxes drawn on them, which no world model is to see, or a
+            manipulator's, which lacks what policies are given.
+    """
+    if not isinstance(observation, dict):
+        return observation
+    if "pose" in observation:
+        raise ArgumentError("decide: this dict does not say where things are; pass env.unwrapped.observation")
+    if "panorama_box" in observation:
+        raise ArgumentError("decide: these images have the target's box drawn on them; pass env.observation")
+    return Observation(**observation)
+
+
+@dataclass
+class EpisodeMemory:
+    """Of one live episode."""
+
+    proposer: Any
+    """Memory of the proposing policy; the reviser's too where one policy is both."""
+    reviser: Any
+    executed: list[Any] = field(default_factory=list)
+    """Actions of all decisions so far, as far as they were to be carried out."""
+
+
+class EpisodeMemories:
+    """Memories of all live episodes; an episode's is made with its first decision."""
+
+    def __init__(self, policy: Policy, reviser: Policy, model: WorldModel | None) -> None:
+        self._policy, self._reviser = policy, reviser
+        self.histories = EpisodeHistories(None if model is None else model.accepts)
+        """What world models with a memory are shown."""
+        self._by_episode: dict[tuple[int, int], EpisodeMemory] = {}
+
+    def recall(self, queries: Sequence[Query], imaginer: Imaginer) -> tuple[list[Situation], list[Situation]]:
+        """Return each episode as its proposer and as its reviser know it."""
+        proposing, revising = [], []
+        for query in queries:
+            memory = self._begin_or_continue(query)
+            imagines = imaginer.consults(query.key)
+            known = query.observation, query.goal, query.key
+            proposing.append(Situation(*known, memory.proposer, tuple(memory.executed), imagines))
+            revising.append(Situation(*known, memory.reviser, tuple(memory.executed), imagines))
+        return proposing, revising
+
+    def record(self, key: Key, actions: NDArray[Any]) -> None:
+        """Keep what is about to be carried out."""
+        self._by_episode[key.seed, key.episode].executed += actions.tolist()
+
+    def forget(self, key: Key) -> None:
+        """Drop the memory of an episode that has ended."""
+        self._by_episode.pop((key.seed, key.episode), None)
+        self.histories.forget(key)
+
+    def _begin_or_continue(self, query: Query) -> EpisodeMemory:
+        """Return an episode's memory; its first decision begins anew, for a retried episode knows nothing."""
+        name = query.key.seed, query.key.episode
+        if query.key.decision == 0 or name not in self._by_episode:
+            check_answerer(self._reviser, query.goal)
+            proposer = reviser = self._policy.begin(query.goal, query.key)
+            if self._reviser.unwrapped is not self._policy.unwrapped:
+                reviser = self._reviser.begin(query.goal, query.key)
+            self._by_episode[name] = EpisodeMemory(proposer, reviser)
+        return self._by_episode[name]

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Observers of decisions: they measure what an agent does and change none of it."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from wiw.loop.clock import Clock
+from wiw.loop.imagination import Imagination
+from wiw.loop.memory import Query
+from wiw.loop.plan_space import PlanSpace
+from wiw.policies.base import Policy, Situation
+from wiw.types import Decision, Proposal
+
+
+@dataclass(frozen=True)
+class Futures:
+    """What the reviser is about to score."""
+
+    reviser: Policy
+    space: PlanSpace
+    queries: Sequence[Query]
+    situations: Sequence[Situation]
+    """As the reviser knows them; their memories must not be changed."""
+    plans: Sequence[Sequence[Proposal]]
+    imagined: Imagination
+    clock: Clock
+
+
+class Observer(ABC):
+    """Sees every batch of decisions twice: before the futures are scored, and once it is decided."""
+
+    @abstractmethod
+    def watch(self, futures: Futures) -> None:
+        """Look at the futures that are chosen from."""
+
+    @abstractmethod
+    def annotate(self, decision: Decision) -> Decision:
+        """Return the decision with what was measured."""

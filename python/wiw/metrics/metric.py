@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics: a number per episode and how a run's tables summarise it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from wiw.errors import ContractError
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One column of a run's tables: the mean of a number over episodes, with its interval.
+
+    A package adds its own by an entry point in "wiw.metrics":
+
+        NEAR = wiw.Metric("near", "Near", "rate", True, of=lambda metrics: metrics["distance_to_goal"] < 1.5)
+    """
+
+    name: str
+    """Key in `EpisodeResult.metrics`, also for the value that `of` computes."""
+    label: str
+    """Title of the column."""
+    kind: Literal["rate", "length"]
+    """"rate": episode values in [0, 1], shown as percent. "length": any number."""
+    higher_is_better: bool
+    of: Callable[[Mapping[str, float]], float] | None = None
+    """Computes an episode's value from its other metrics where the task does not measure it; raises KeyError where
+    one that it needs is missing, and then the episode has no value."""
+    about: str = ""
+    """One line for `wiw list`."""
+    least: float = -math.inf
+    """Smallest possible value; intervals of the mean end there."""
+    paper_name: str = ""
+    """Name of the metric in the World-in-World paper, if it differs from the label."""
+
+    @property
+    def scale(self) -> float:
+        """Factor from episode values to the numbers in tables."""
+        return 100.0 if self.kind == "rate" else 1.0
+
+    @property
+    def unit(self) -> str:
+        """Unit in the column's title."""
+        return "%" if self.kind == "rate" else ""
+
+    def add_to(self, metrics: Mapping[str, float]) -> Mapping[str, float]:
+        """Return an episode's metrics with this one's value, if it can be computed from them.
+
+        Raises:
+            ContractError: `of` raised, or its value is not finite, or a rate is outside [0, 1].
+        """
+        if self.of is None or self.name in metrics:
+            return metrics
+        try:
+            value = float(self.of(metrics))
+        except KeyError:
+            return metrics
+        except Exception as error:
+            message = f"{type(error).__name__}: {error}"
+            raise ContractError(f"metric '{self.name}': {message}; it was given {dict(metrics)}") from error
+        if not math.isfinite(value) or (self.kind == "rate" and not 0 <= value <= 1):
+            expected = "a number from 0 to 1" if self.kind == "rate" else "a finite number"
+            raise ContractError(f"metric '{self.name}': expected {expected}, got {value} of {dict(metrics)}")
+        return {**metrics, self.name: value}
+
+
+SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
+SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
+MEAN_TRAJECTORY = Metric(
+    "actions",
+    "Actions",
+    "length",
+    False,
+    about="Mean number of executed actions per episode; for manipulation, of decisions. Mean Traj in the paper.",
+    least=0.0,
+    paper_name="Mean Traj",
+)
+REFUSED = Metric(
+    "refused", "Refused", "length", False, about="Mean number of gripper motions that ended early.", least=0.0
+)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The images shown to a language model: the present observation, and strips of imagined views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw import annotate
+from wiw.panorama import PerspectivePlan
+from wiw.perception.boxes import find_box
+from wiw.perception.tracking import Track
+from wiw.perception.views import cut_target_views
+from wiw.policies.vlm.plans import describe_actions
+from wiw.types import Observation, Proposal, Rollout
+
+VIEW = 384
+"""Side of frames in pixels, as in the paper."""
+Image = NDArray[np.uint8]
+
+
+def render_observation(observation: Observation) -> tuple[Image, Image]:
+    """Return front view and panorama, with the target's box where there is a target."""
+    shown = observation.as_dict()
+    return shown["front"], shown["panorama"]
+
+
+def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> Image:
+    """Return front views along a plan, side by side; each under a bar with its action and number, with the target's
+    box.
+    """
+    fronts, masks = _cut_front_views(rollout, track)
+    if masks is not None:
+        boxes = [find_box(mask) for mask in masks]
+        fronts = np.stack(
+            [
+                front if box is None else annotate.box(front, box, outside=True)
+                for front, box in zip(fronts, boxes, strict=True)
+            ]
+        )
+    titles = [f"Imagined action {k}: {word}" for k, word in enumerate(describe_actions(plan.actions[: len(fronts)]), 1)]
+    return annotate.strip(fronts, titles)
+
+
+def render_target(observation: Observation) -> Image | None:
+    """Return the view centred on the target, boxed; None where it is out of sight."""
+    assert observation.target is not None
+    views = cut_target_views(observation.panorama[None], observation.target.mask[None], (VIEW, VIEW))
+    return views.images[0] if len(views.images) else None
+
+
+def render_target_strip(rollout: Rollout, track: Track) -> Image | None:
+    """Return views centred on the target, boxed, of the imagined frames that show it; None where none does.
+
+    Front views, which is all that a perspective model gives, are shown as they are.
+    """
+    wanted = np.flatnonzero(track.visible & ~rollout.real)
+    if not len(wanted):
+        return None
+    if rollout.view == "panorama":
+        images = cut_target_views(rollout.frames[wanted], track.masks[wanted], (VIEW, VIEW)).images
+    else:
+        boxes = [track.boxes[k] for k in wanted]
+        images = np.stack(
+            [annotate.box(rollout.frames[k], box or (), outside=True) for k, box in zip(wanted, boxes, strict=True)]
+        )
+    return annotate.strip(images, _number_views(len(images))) if len(images) else None
+
+
+def _number_views(count: int) -> Sequence[str]:
+    return [f"Imagined view {k + 1}" for k in range(count)]
+
+
+def _cut_front_views(rollout: Rollout, track: Track | None) -> tuple[Image, NDArray[np.bool_] | None]:
+    masks = None if track is None else track.masks
+    if rollout.view != "panorama":
+        return rollout.frames, masks
+    plan = _get_plan(rollout.frames.shape[1:3])
+    fronts = np.asarray(plan(rollout.frames, 0.0))
+    if masks is None:
+        return fronts, None
+    moved = plan(masks[..., None].astype(np.uint8), 0.0, interpolation="nearest")
+    return fronts, np.asarray(moved)[..., 0] > 0
+
+
+@cache
+def _get_plan(size: tuple[int, int]) -> PerspectivePlan:
+    return PerspectivePlan(size, (VIEW, VIEW), 90.0)

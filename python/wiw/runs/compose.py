@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Composes an agent: what experiments and limits a run puts around a policy and a world model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wiw.errors import ArgumentError
+from wiw.experiments.fidelity import FidelityObserver
+from wiw.experiments.gating import Gated
+from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
+from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
+from wiw.experiments.semantics import Labelled
+from wiw.loop.agent import Agent
+from wiw.loop.attempts import Attempted, make_model
+from wiw.loop.imagination import Imaginer, ModelInput
+from wiw.loop.limits import DEADLINE, Limits
+from wiw.loop.model_imaginer import ModelImaginer
+from wiw.loop.parts import Parts, space_option
+from wiw.loop.rollout_cache import cache_rollouts
+from wiw.registry import WORLD_MODELS
+from wiw.types import PRIMITIVES, Episode, Key
+from wiw.world_models.base import WorldModel
+
+
+@dataclass(frozen=True)
+class RunContext:
+    """What an agent is run on: the task, and the episodes of the whole run."""
+
+    task: Any
+    episodes: Sequence[Episode] = ()
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What is done to an agent to learn about it; see `wiw.experiments`."""
+
+    placebo: str | None = None
+    """"shuffled" or "swapped"."""
+    imagine_fraction: float | None = None
+    """Share of decisions for which the model is consulted; None means all."""
+    ground_truth: tuple[str, ...] = ()
+    """Stages that are given the ground truth."""
+    semantics: Any = None
+    """Source of semantics for models that need it."""
+
+
+def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunContext) -> Agent:
+    """Return the agent that a run evaluates.
+
+    Raises:
+        ArgumentError: an experiment without a world model, or one that does not fit the plans.
+    """
+    stages = sort_stages(experiment.ground_truth)
+    config = parts.config.resolve(context.task.defaults)
+    policy = Parts(parts.policy, None, None, config, ()).build().policy
+    placebo = None if "imagination" in stages else experiment.placebo
+    model = make_for_space("oracle" if "imagination" in stages else parts.model, policy.space, limits.deadline)
+    imaginer = _wrap_model(model, policy.space, placebo, experiment, limits, context)
+    reviser = parts.reviser
+    if reviser is None and policy.default_revision is not None:
+        reviser = context.task.defaults.get("revision")
+    if "scoring" in stages or "proposals" in stages:
+        reviser = Parts(policy, imaginer, reviser, config, ()).build().reviser
+    if "scoring" in stages:
+        reviser = TrueScores(reviser)
+    if "proposals" in stages:
+        policy = TruePlans(policy)
+    measured = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
+    observers = [*parts.observers, *measured]
+    return Agent(policy, imaginer, reviser, config, observers=observers)
+
+
+def make_for_space(model: Any, space: str, deadline: float = DEADLINE, **options: Any) -> WorldModel | Imaginer | None:
+    """Return a world model for plans of a space, from a name or class; instances and imaginers as they are."""
+    if model is None or isinstance(model, WorldModel | Imaginer):
+        return model
+    return make_model(model, deadline, **{**space_option(WORLD_MODELS, model, space), **options})
+
+
+def _wrap_model(
+    model: WorldModel | Imaginer | None,
+    space: str,
+    placebo: str | None,
+    experiment: Experiment,
+    limits: Limits,
+    context: RunContext,
+) -> Imaginer | None:
+    if model is None:
+        if placebo is not None:
+            raise ArgumentError(f"placebo='{placebo}' needs a world model, and this agent has none")
+        return None
+    imaginer = model if isinstance(model, Imaginer) else ModelImaginer(_limit(model, limits))
+    if experiment.semantics is not None:
+        imaginer = Labelled(imaginer, experiment.semantics)
+    if placebo is not None:
+        imaginer = _as_placebo(imaginer, placebo, space, context)
+    if experiment.imagine_fraction is not None:
+        imaginer = Gated(imaginer, experiment.imagine_fraction)
+    return imaginer
+
+
+def _limit(model: WorldModel, limits: Limits) -> WorldModel:
+    """Return the model with deadline, retries and cache; one that its user has wrapped stays as it is."""
+    if model is not model.unwrapped:
+        return model
+    return cache_rollouts(Attempted(model, limits.deadline), limits.cache, limits.cache_gb)
+
+
+def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContext) -> Imaginer:
+    if placebo not in PLACEBOS:
+        raise ArgumentError(f"expected placebo {' or '.join(PLACEBOS)}, got '{placebo}'")
+    if placebo == "swapped":
+        return SwappedPlacebo(imaginer, NextEpisodes(context, imaginer))
+    if space != PRIMITIVES:
+        raise ArgumentError(NO_POSES)
+    return ShuffledPlacebo(imaginer)
+
+
+class NextEpisodes:
+    """First moments of the run's next episode, counted round, for swapped placebos.
+
+    Raises:
+        ArgumentError: the run has a single episode.
+    """
+
+    def __init__(self, context: RunContext, imaginer: Imaginer) -> None:
+        if len(context.episodes) < 2:
+            raise ArgumentError(
+                "placebo-swapped shows the model another episode: expected at least 2 episodes, got "
+                f"{len(context.episodes)}"
+            )
+        self._context, self._needs = context, imaginer.accepts.needs
+        self._depth = "depth" in imaginer.needs
+        self._env: Any = None
+        self._moments: dict[tuple[int, int], ModelInput] = {}
+
+    def of(self, key: Key) -> ModelInput:
+        """Return the first moment of the next episode."""
+        name = key.seed, key.episode
+        if name not in self._moments:
+            self._moments[name] = self._begin((key.episode + 1) % len(self._context.episodes))
+        return self._moments[name]
+
+    def forget(self, key: Key) -> None:
+        """Drop the moment that is kept for an episode."""
+        self._moments.pop((key.seed, key.episode), None)
+
+    def _begin(self, index: int) -> ModelInput:
+        if self._env is None:
+            self._env = self._context.task.environment(depth=self._depth)
+        observation = self._env.begin(self._context.episodes[index])
+        simulator = self._env.fork() if "simulator" in self._needs else None
+        semantic = self._env.semantic() if "semantic" in self._needs else None
+        return ModelInput(observation, simulator, semantic)

@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The settings of a run, declared once: Python, the command line and the manifest read them here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from wiw.errors import ArgumentError
+from wiw.loop.limits import Limits
+from wiw.types import checked_seed
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Limits):
+    """How a run goes, whatever agents it compares. All randomness is keyed by (seed, episode, decision, candidate):
+    neither `workers` nor `live` changes a result.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    episodes: Annotated[int | None, arg(metavar="N")] = None
+    """How many; if not given, as many as the task says: all of an episode file, else 20; for manipulation 50 of each of
+    its tasks."""
+    seed: Annotated[int | None, arg(metavar="N")] = None
+    """All randomness is a function of it; the task's own, 0, if not given."""
+    out: Annotated[Path | str | None, arg(metavar="DIR")] = None
+    """Folder of the run; runs/TASK-TIME if not given."""
+    workers: Annotated[int, arg(metavar="N")] = 1
+    """Processes; results do not depend on it. More than one needs a task and an agent that can be pickled, or names."""
+    live: Annotated[int, arg(metavar="N")] = 4
+    """Episodes kept live at a time in a process, so that model calls are batched."""
+    keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
+    """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
+    0.2 MB per decision."""
+    resume: bool = False
+    """Whether to go on with the run in `out` where it was stopped."""
+    progress: bool = True
+    """Whether to show progress bars."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, least in (("episodes", 1), ("workers", 1), ("live", 1), ("keep_images", 0)):
+            value = getattr(self, name)
+            if isinstance(value, int) and value < least:
+                raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
+        if self.seed is not None:
+            checked_seed(self.seed)
+
+    def count_pictured(self, episodes: int) -> int:
+        """Return how many of a run's episodes keep pictures."""
+        return episodes if isinstance(self.keep_images, str) else self.keep_images
+
+
+def take_settings(
+    config: RunConfig | None, settings: Mapping[str, Any], episodes: int | None = None
+) -> tuple[RunConfig, dict[str, Any]]:
+    """Return the config with the settings that are its own in place of its values, and the other settings."""
+    names = {field.name for field in fields(RunConfig)}
+    own = {name: value for name, value in settings.items() if name in names}
+    own |= {} if episodes is None else {"episodes": episodes}
+    others = {name: value for name, value in settings.items() if name not in names}
+    return replace(config or RunConfig(), **own), others

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which episodes of a run keep their pictures.
+
+Pictures are written while an episode runs, and which ones tell most is known at the end. So a pool of episodes keeps
+them during the run, and those that are not chosen lose them when every arm has ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from wiw.runs.store import RunStore
+from wiw.types import Episode
+
+POOL = 12
+"""Episodes that keep pictures during a run; more if more are to keep them after it."""
+FLOORS, CEILING, CONTROL = ("copy", "none"), "oracle", "placebo"
+"""Names of arms that are no model under test; of the floors the first that the run has counts."""
+
+
+def spread_evenly(episodes: Sequence[Episode], count: int) -> list[int]:
+    """Return `count` indices spread evenly over the episodes, and the first of each kind that has none among them."""
+    count, last = min(count, len(episodes)), len(episodes) - 1
+    chosen = {round(i * last / max(1, count - 1)) for i in range(count)}
+    for index, episode in enumerate(episodes):
+        if count and episode.kind not in {episodes[other].kind for other in chosen}:
+            chosen.add(index)
+    return sorted(chosen)
+
+
+def pool_episodes(episodes: Sequence[Episode], count: int) -> list[int]:
+    """Return the episodes that keep pictures during a run after which `count` keep them."""
+    if count == 0:
+        return []
+    return sorted({*spread_evenly(episodes, count), *spread_evenly(episodes, max(count, POOL))})
+
+
+def choose_episodes(
+    episodes: Sequence[Episode], pool: Sequence[int], outcomes: Sequence[Mapping[str, Any]], count: int
+) -> list[int]:
+    """Return the episodes that keep their pictures, the first of them being the one to show first.
+
+    They are spread evenly over the run; an episode of the pool in which a model succeeds and the floor fails takes the
+    place of the nearest of its kind, unless there is such an episode among them.
+    """
+    chosen = spread_evenly(episodes, count)
+    gains = {index: _rate_gain(index, outcomes) for index in {*pool, *chosen}}
+    best = max(sorted(gains), key=lambda index: (gains[index], index in chosen), default=None)
+    if best is None or gains[best] == (0, 0):
+        return chosen
+    rivals = [index for index in chosen if episodes[index].kind == episodes[best].kind]
+    if best not in chosen and rivals:
+        chosen.remove(min(rivals, key=lambda index: abs(index - best)))
+    return [best, *(index for index in chosen if index != best)]
+
+
+def pictured_episodes(store: RunStore) -> list[int]:
+    """Return the episodes to show with pictures; during a run those that would be chosen if it ended now."""
+    info = store.info
+    if "keep_images" not in info:
+        return [int(index) for index in info["pictures"]]
+    return choose_episodes(store.episodes(), info["pictures"], store.outcomes(), info["keep_images"])
+
+
+def drop_spare_pictures(store: RunStore) -> None:
+    """Drop the pictures of the episodes that are not chosen, once every arm has ended every episode."""
+    if "keep_images" not in store.info or any(store.pending(arm["name"]) for arm in store.config["arms"]):
+        return
+    store.keep_pictures(pictured_episodes(store))
+
+
+def _rate_gain(index: int, outcomes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:
+    """Return how many models, and whether the ceiling, succeed in an episode in which the floor fails."""
+    success = {
+        row["arm"]: bool(row["metrics"].get("success"))
+        for row in outcomes
+        if row["episode"] == index and row["status"] == "done"
+    }
+    floor = next((success[arm] for arm in FLOORS if arm in success), True)
+    if floor:
+        return 0, 0
+    models = [
+        arm for arm in success if arm not in (*FLOORS, CEILING) and not arm.rpartition("+")[2].startswith(CONTROL)
+    ]
+    return sum(success[arm] for arm in models), int(success.get(CEILING, False))

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rerun the failures of a run with ground truth in one stage of the loop at a time, and in all of them.
+
+Episodes, keys, agents and limits are the run's own, so that a rerun differs by its ground truth and nothing else.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from wiw._core import core
+from wiw.analysis.blame import FOLDER, RERUNS, Blame, list_failures, list_reruns, name_rerun, read_blame
+from wiw.errors import ArgumentError
+from wiw.runs.execute import recipes_of, require_own_sources, require_scenes, run_pending
+from wiw.runs.platform import describe_platform
+from wiw.runs.recipes import AgentRecipe
+from wiw.runs.store import RunStore
+
+_ORDER = 0x626C616D
+"""Separates the order in which failures are rerun from all other random numbers."""
+
+
+def blame(
+    run: str | Path,
+    arms: str | Sequence[str] | None = None,
+    episodes: int | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+    *,
+    retry_errors: bool = False,
+) -> Blame:
+    """Find the stage that causes the failures of a run: imagination, scoring or proposals.
+
+        found = wiw.blame("runs/first", "warp")
+        found.summary()
+        found["warp"].verdicts      # {"imagination": 3, "scoring": 12, "proposals": 7, "joint": 1, "beyond": 0}
+
+    Each failure is rerun with the oracle world model, with ground-truth scores, with a ground-truth plan among the
+    proposals, and with all three (`wiw.experiments.ground_truth`). Reruns are stored in the folder `blame` of the run;
+    a second call continues where the first one stopped, and runs nothing twice.
+
+    Args:
+        run: the run's folder.
+        arms: one, several, or None for all.
+        episodes: largest number of failures per arm, drawn at random; a larger number contains a smaller one's. None
+            means all.
+        workers: processes; None means as many as the run was begun with. Results do not depend on it.
+        progress: whether to show bars.
+        retry_errors: whether to repeat reruns that ended with an infrastructure error.
+
+    Raises:
+        ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success
+            or progress is, or an agent that cannot use the ground truth, such as one without a reviser.
+        StoreError: no readable run, one that was begun with objects in memory or by another version, or whose task,
+            agents or navigation meshes have changed.
+        FileError: a scene is not there.
+    """
+    for name, value in (("episodes", episodes), ("workers", workers)):
+        if value is not None and value < 1:
+            raise ArgumentError(f"blame: expected {name} of at least 1, got {value}")
+    with RunStore.read(run) as base:
+        wanted = _wanted(base, arms, episodes)
+        task, agents = _recipes(base, wanted)
+        store = _store(base, agents)
+        named = {name_rerun(arm, rerun): indices for arm, indices in wanted.items() for rerun in list_reruns(base, arm)}
+        pending = {name: sorted({*store.pending(name, retry_errors)} & indices) for name, indices in named.items()}
+        run_pending(store, task, agents, pending, workers or base.info["workers"], progress)
+        found = read_blame(base)
+        assert found is not None
+        return Blame(found.run, tuple(line for line in found.arms if line.arm in wanted))
+
+
+def _wanted(base: RunStore, arms: str | Sequence[str] | None, most: int | None) -> dict[str, set[int]]:
+    """Return the failures to be rerun, by arm."""
+    known = [one["name"] for one in base.config["arms"]]
+    names = known if arms is None else [arms] if isinstance(arms, str) else list(arms)
+    if unknown := [name for name in names if name not in known]:
+        raise ArgumentError(f"blame: no arm '{unknown[0]}' in {base.path.parent}; it has {', '.join(known)}")
+    failures = {arm: list_failures(base, arm) for arm in dict.fromkeys(names)}
+    if not any(failures.values()):
+        errors = sum(row["status"] == "error" and row["arm"] in failures for row in base.outcomes())
+        more = f"; {errors} ended with an infrastructure error, see `wiw resume --retry-errors`" if errors else ""
+        raise ArgumentError(f"blame: {', '.join(failures)} in {base.path.parent} has no failure to explain{more}")
+    seed = base.config["seed"]
+    return {arm: {*sorted(found, key=lambda episode: _draw(seed, episode))[:most]} for arm, found in failures.items()}
+
+
+def _draw(seed: int, episode: int) -> int:
+    return int(core.fold_key([seed, episode, _ORDER]))
+
+
+def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[str, AgentRecipe]]:
+    """Return the run's task, and for each of its arms the agent of each rerun.
+
+    Raises:
+        ArgumentError: the task does not say what progress is.
+        StoreError: see `blame`.
+        FileError: a scene is not there.
+    """
+    base.require_version()
+    task, agents = recipes_of(base)
+    require_own_sources(base, task, agents)
+    built, episodes = task.build(), base.episodes()
+    base.require_task(built.describe())
+    if not built.has_guide:
+        raise ArgumentError(
+            f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it "
+            "from wiw.tasks.navigation.NavigationTask, or write `guide` of its environment and set `has_guide`"
+        )
+    require_scenes(built, base, [episodes[index] for found in wanted.values() for index in found])
+    return task, {
+        name_rerun(arm, rerun): _with_ground_truth(recipe, RERUNS[rerun])
+        for arm, recipe in agents.items()
+        for rerun in list_reruns(base, arm)
+    }
+
+
+def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRecipe:
+    """Return the agent with ground truth in some stages; a model that the oracle replaces is not built."""
+    own = replace(recipe.with_model("oracle"), placebo=None) if "imagination" in stages else recipe
+    return replace(own, ground_truth=stages)
+
+
+def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
+    """Create or resume the store of reruns."""
+    config = {
+        "task": base.config["task"],
+        "seed": base.config["seed"],
+        "episodes": base.config["episodes"],
+        "arms": [{"name": name, "agent": _explicit_options(recipe)} for name, recipe in agents.items()],
+        "attributes": base.created,
+    }
+    folder = base.path.parent / FOLDER
+    if RunStore.exists(folder):
+        return RunStore.resume(folder, config)
+    info = {name: value for name, value in base.info.items() if name != "keep_images"}  # the run chooses for both
+    info |= {
+        "platform": describe_platform(),
+        "agents": {name: recipe.to_json() for name, recipe in agents.items()},
+        "limits": {name: value for name, value in info["limits"].items() if name not in ("fidelity", "lpips")},
+        "command": sys.argv,
+        "preparation_seconds": 0.0,
+        "built": _expected_agents(base),
+    }
+    return RunStore.create(folder, config, info, base.episodes())
+
+
+def _explicit_options(recipe: AgentRecipe) -> dict[str, Any]:
+    return {name: value for name, value in (recipe.to_json() or {}).items() if value not in (None, {})}
+
+
+def _expected_agents(base: RunStore) -> dict[str, Any]:
+    """Return how the agents of reruns must describe themselves, so that weights other than the run's are refused."""
+    return {
+        name_rerun(arm, stage): {**agent, part: {**agent[part], "ground_truth": stage}}
+        for arm, agent in base.info.get("built", {}).items()
+        for part, stage in (("revision", "scoring"), ("policy", "proposals"))
+    }

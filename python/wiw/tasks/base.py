@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`Task`: everything that evaluation asks of a task, with defaults where a task may be silent.
+
+`docs/write-your-own-task.md` has the shortest one.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+from wiw.envs.base import Env
+from wiw.errors import ArgumentError
+from wiw.types import PRIMITIVES, Episode, Wording
+
+if TYPE_CHECKING:
+    import gymnasium
+
+    from wiw.datasets.worlds import World
+    from wiw.tabletop.table import Table
+
+
+class Task(ABC):
+    """Episodes, the environment they are run in, and what reports say about them.
+
+    A task is pickled to worker processes, and built anew by its name and options when a run is resumed.
+    """
+
+    name: str
+    """As in tables and run folders."""
+    seed: int = 0
+    """Of the run, where it is not given another."""
+    space: str = PRIMITIVES
+    """Elements of plans: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or a space of the task's own."""
+    metrics: tuple[str, ...] = ("success",)
+    """Names of the metrics that the paper reports of it."""
+    default_policy: str | None = None
+    """Name of the policy that runs it where none is named."""
+    sensor_options: tuple[str, ...] = ()
+    """Options of `wiw.make` that are the environment's, not the task's."""
+    choices: tuple[str, ...] = ()
+    """Labels that answers are chosen from, where the task asks for any."""
+    wording: Wording = Wording()
+    """How reports speak of its episodes."""
+    has_guide: bool = False
+    """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
+
+    # -- what every task says ------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return the JSON-able identity of the task: what must be equal for two runs to be comparable."""
+
+    @abstractmethod
+    def environment(self, depth: bool = False) -> Env:
+        """Return a new environment for the task's episodes; `depth` asks for it in the observations."""
+
+    @abstractmethod
+    def episodes(self, count: int) -> list[Episode]:
+        """Return the first `count` episodes, the same ones however many are asked for.
+
+        Raises:
+            ArgumentError: there are fewer.
+        """
+
+    # -- where a task may be silent ------------------------------------------------------------------------------------
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Numbers of the search where the agent leaves them open: the paper's candidates M, horizon L and execute."""
+        return {"candidates": 3, "horizon": 5, "execute": 1}
+
+    @property
+    def default_episodes(self) -> int:
+        """How many episodes a run has where it is not told."""
+        return 20
+
+    @property
+    def decisions(self) -> int:
+        """Decisions that an episode may take, as far as known beforehand: what progress bars expect."""
+        return 20
+
+    @property
+    def stage(self) -> dict[str, Any] | None:
+        """Where reports draw plans on front views: "camera" and "ground" (see `wiw.report.stage`); None for nowhere."""
+        return None
+
+    @property
+    def file_header(self) -> dict[str, Any] | None:
+        """Header of a file of its episodes (`wiw episodes`); None where episodes are not kept in files."""
+        return None
+
+    @staticmethod
+    def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the task's options so that they mean the same in any folder and on resuming."""
+        return dict(options)
+
+    def episode(self, index: int) -> Episode:
+        """Return an episode by its number.
+
+        Raises:
+            ArgumentError: a negative number, or there are fewer.
+        """
+        if index < 0:
+            raise ArgumentError(f"expected an episode's number of at least 0, got {index}")
+        return self.episodes(index + 1)[index]
+
+    def vector_environment(self, num_envs: int, depth: bool = False) -> gymnasium.vector.VectorEnv[Any, Any, Any]:
+        """Return a gymnasium vector environment with `num_envs` episodes at a time.
+
+        Raises:
+            ArgumentError: the task has none.
+        """
+        raise ArgumentError(f"task '{self.name}' has no vector environment; use several of `wiw.make`")
+
+    def require(self, episodes: Iterable[Episode]) -> dict[str, dict[str, str]]:
+        """Check that all that episodes need is there, without loading any of it.
+
+        Returns:
+            For each scene, what it is used with, which must not change while a run goes on.
+
+        Raises:
+            FileError: something is not there.
+        """
+        return {}
+
+    def open_world(self, episode: Episode) -> World | None:
+        """Return the scene that reports draw from above, with its navigation mesh; None for no drawing."""
+        return None
+
+    def set_table(self, episode: Episode) -> Table | None:
+        """Return the table that reports film, as the episode begins; None for no film."""
+        return None

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Image-Goal Navigation: reach the place where the goal image was taken (paper, appendix "Image-Goal Navigation")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets.imagenav import EpisodeRules, camera_pose, generate, ideal_primitives
+from wiw.datasets.worlds import World
+from wiw.envs.episode_state import EpisodeState
+from wiw.errors import ArgumentError
+from wiw.metrics import path_efficiency
+from wiw.tasks.navigation import NavigationTask
+from wiw.types import Episode, Goal, Wording
+
+
+@dataclass(frozen=True)
+class ImageNavRules:
+    """Budget, stop rule and metric variants; their values are in the presets (`wiw/configs`)."""
+
+    decisions: int
+    """K."""
+    candidates: int
+    """M, plans imagined per decision."""
+    horizon: int
+    """L, primitives per plan."""
+    execute: int
+    """Primitives carried out per decision; negative: all but that many of the chosen plan, at least one."""
+    radius: float
+    """Metres; the episode succeeds on entering this sphere around the goal's position. Where an episode file gives a
+    goal's radius, that one holds, unless the radius is given as an option of the task."""
+    checked: Literal["primitive", "decision"]
+    """Whether success is looked at after every primitive or only where a decision is due."""
+    distance: Literal["euclidean", "geodesic"]
+    spl: Literal["metres", "actions"]
+    """SPL by path length (the paper's formula) or by number of primitives."""
+    motion: Literal["refuse", "slide"]
+
+    def __post_init__(self) -> None:
+        if min(self.decisions, self.candidates, self.horizon) < 1 or self.radius <= 0:
+            raise ArgumentError(f"imagenav: decisions, candidates, horizon and radius must be positive, got {self}")
+
+
+class ImageNav(NavigationTask):
+    """Reach the place where a goal image was taken.
+
+    Goal images, when one is reached, and what is measured; `NavigationTask` documents the arguments.
+    """
+
+    name = "imagenav"
+    default_policy = "matcher"
+    metrics = ("success", "spl", "mean_trajectory")
+    rules_class = ImageNavRules
+    generator_class = EpisodeRules
+    wording = Wording(
+        succeeded="reached the goal", won="reached", lost="not reached", asked="The goal: find where this was taken"
+    )
+
+    def make_goal(self, place: World, episode: Episode) -> Goal:
+        """Return the goal image: front view at the goal's pose."""
+        pose = camera_pose(np.asarray(place.ground.put_down(episode.goal_position), float), episode.goal_yaw)
+        image = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("color",))["color"][0]
+        return Goal(self.name, image=image)
+
+    def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
+        """Return the goal's position, on the floor that is drawn."""
+        return place.ground.put_down(episode.goal_position).astype(np.float64)
+
+    def is_success(self, state: EpisodeState) -> bool:
+        """Return whether the agent has entered the goal's sphere, looked at as the rules say."""
+        if state.success:
+            return True
+        if self.rules.checked == "decision" and not state.at_decision:
+            return False
+        return self._within(state, state.positions[-1])
+
+    def measure_progress(self, state: EpisodeState, fork: Any, primitives_left: float) -> float:
+        """Return 0 within the goal's sphere, else less by the primitives to its centre."""
+        return 0.0 if self._within(state, fork.position) else -primitives_left
+
+    def _within(self, state: EpisodeState, place: NDArray[np.float64]) -> bool:
+        radius = state.episode.info.get("radius", self.rules.radius)
+        if np.linalg.norm(place - state.goal_position) > radius:  # no walk is shorter than the straight line
+            return False
+        walked = state.world.navmesh.geodesic_distance
+        return self.rules.distance == "euclidean" or float(walked(place, state.goal_position)) <= radius
+
+    def measure(self, state: EpisodeState) -> dict[str, float]:
+        """Return the metrics of one finished episode; `spl` is its contribution, 0 to 1."""
+        by_actions = self.rules.spl == "actions"
+        geodesic, ideal = _find_shortest(state)
+        shortest = float(ideal) if by_actions else geodesic
+        walked = float(state.actions) if by_actions else state.travelled
+        return {
+            "success": float(state.success),
+            "actions": float(state.actions),
+            "travelled": state.travelled,
+            "shortest": geodesic,
+            "spl": float(path_efficiency([state.success], [shortest], [walked])[0]),
+            "distance_to_goal": state.distance_to_goal(),
+        }
+
+    def load_episodes(self) -> list[Episode]:
+        """Return the file's episodes, under the task's radius where that was given as an option."""
+        loaded = super().load_episodes()
+        if "radius" not in self.overridden:
+            return loaded
+        return [replace(e, info={name: value for name, value in e.info.items() if name != "radius"}) for e in loaded]
+
+    def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
+        """Return episodes with goals out of sight of the start, yet within reach."""
+        return generate(place, self.per_scene, self.seed, self.generator, first=first)
+
+
+def _find_shortest(state: EpisodeState) -> tuple[float, int]:
+    """Return metres and primitives of an ideal run, as the episode gives them; what it does not give is measured."""
+    episode = state.episode
+    geodesic, ideal = episode.geodesic, episode.info.get("ideal_primitives")
+    if np.isfinite(geodesic) and ideal is not None:
+        return geodesic, int(ideal)
+    path, length = state.world.navmesh.shortest_path(episode.start_position, episode.goal_position, return_length=True)
+    primitives = ideal_primitives(np.asarray(path, float), episode.start_yaw) if ideal is None else int(ideal)
+    return geodesic if np.isfinite(geodesic) else length, primitives

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a newcomer's command says: what will run, what there is, and what is wrong."""
+
+from __future__ import annotations
+
+import re
+import socket
+from pathlib import Path
+
+import pytest
+
+from wiw.cli import main
+from wiw.errors import VlmError
+from wiw.vlm.openai import OpenAIClient
+
+FAKES = Path(__file__).with_name("fakes.py")
+
+
+def test_a_run_announces_itself_before_it_does_anything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("wiw.studies.evaluate.evaluate", refuse)
+    options = ["--scenes", "apartments:val:4", "--episodes", "8", "--arms", "copy,oracle", "--workers", "2"]
+    assert main(["run", "imagenav", *options, "--out", str(tmp_path / "r")]) == 130
+    assert capsys.readouterr().err.splitlines()[:4] == [
+        "task    imagenav: 8 episodes in 2 of 4 scenes (apartments:val:4, 5 per scene), seed 0",
+        "arms    copy, oracle (policy matcher)",
+        "workers 2",
+        f"run     {tmp_path / 'r'}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("what", "names", "others"),
+    [
+        ("tasks", ["imagenav", "ar", "manipulation"], ["warp"]),
+        ("policies", ["matcher", "vlm"], ["warp", "imagenav"]),
+        ("trackers", ["reprojection", "sam2"], ["matcher"]),
+        ("metrics", ["spl", "mean_trajectory"], ["matcher"]),
+        ("presets", ["official", "paper-diffusion"], ["matcher"]),
+    ],
+)
+def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", what]) == 0
+    first_words = set(re.findall(r"^  (\S+)", capsys.readouterr().out, re.MULTILINE))
+    assert set(names) <= first_words and not set(others) & first_words
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--policy-option", "a=b"], "policy matcher: unknown option 'a'; there are histogram,"),
+        (["--policy-option", "turn=left"], "policy matcher: expected a number for turn, got 'left'"),
+        (["--width", "2"], "give --depth 2 or more"),
+        (["--policy", "recogniser"], "use it with task ar"),
+        (["--policy", "matcher", "--revision", "recogniser"], "use it with task ar"),
+        (["--world-model", f"{FAKES}:Nothing"], "fakes.py defines no 'Nothing'; it has Outcome,"),
+    ],
+)
+def test_a_mistake_is_explained_in_one_line(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--scenes", "apartments:val:1", "--episodes", "1", "--out", str(tmp_path / "r"), "--no-report"]
+    assert main(["run", "imagenav", *options, *arguments]) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith("wiw: ") and message in last
+
+
+def test_what_is_no_number_is_refused_plainly(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments, message in (
+        (["run", "--episodes", "two"], "--episodes: expected a whole number, got 'two'"),
+        (["run", "--episodes", "2.5"], "--episodes: expected a whole number, got '2.5'"),
+        (["run", "--deadline", "soon"], "--deadline: expected a number, got 'soon'"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(arguments)
+        assert stop.value.code == 2
+        shown = " ".join(capsys.readouterr().err.replace("│", " ").split())
+        assert message in shown and "no type matching" not in shown
+
+
+def test_a_sheet_that_cannot_be_written_is_an_error(two_rooms: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scenes", two_rooms, "--views", "1", "--out", "/proc/sheet.png"]) == 2
+    assert "/proc/sheet.png: cannot be written" in capsys.readouterr().err
+
+
+def test_without_a_server_the_mock_is_suggested() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    client = OpenAIClient(f"http://127.0.0.1:{port}/v1", attempts=1)
+    with pytest.raises(VlmError, match=r"no server answers there.*--vlm mock"):
+        _ = client.model

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables in terminals of any usual width: no number is ever cut."""
+
+from __future__ import annotations
+
+import io
+import json
+import sqlite3
+
+import pytest
+from fakes import LineAgent, LineTask
+from rich.console import Console
+
+from wiw.analysis.costs import costs
+from wiw.analysis.summary import show_estimate
+from wiw.cli import main
+from wiw.report import tables
+from wiw.runs.store import store_path
+from wiw.studies.evaluate import run_arms
+
+ARMS = ("none", "copy", "warp", "placebo-shuffled:a_model_with_a_long_name", "oracle")
+FIDELITY = {"scores": [0.25, 0.5], "rank": 0.5, "regret": 0.125, "best": False, "psnr": [21.5] * 2, "ssim": [0.75] * 2}
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    out = tmp_path_factory.mktemp("tables") / "run"
+    agents = {name: LineAgent(0.3 + 0.15 * number) for number, name in enumerate(ARMS)}
+    log = run_arms(LineTask(), agents, 6, out=out, progress=False)
+    with sqlite3.connect(store_path(out)) as store:
+        store.execute("UPDATE decision SET fidelity = ? WHERE arm = 'warp'", (json.dumps(FIDELITY),))
+    return log
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    """A function that prints into a terminal of a width and returns the text."""
+
+    def show(width, print_tables):
+        console = Console(width=width, file=io.StringIO(), record=True, force_terminal=True)
+        monkeypatch.setattr(tables, "Console", lambda *_, **__: console)
+        print_tables()
+        return console.export_text()
+
+    return show
+
+
+def squeeze(text):
+    return " ".join(text.split())
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 140])
+def test_costs_are_stacked_rather_than_cut(log, terminal, width):
+    shown = terminal(width, lambda: tables.print_costs(log))
+    assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
+    for line in costs(log):
+        for cell in line.cells()[:11]:
+            assert cell in shown.split() or all(part in shown.split() for part in cell.split())
+    assert ("Costs per episode (continued)" in shown) == (width < 140)
+    assert "s / success" in shown and shown.count("none") == shown.count("oracle") >= 1
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_summary_shows_every_estimate_whole(log, terminal, width):
+    shown = terminal(width, lambda: tables.print_summary(log.numbers()))
+    assert "…" not in shown and all(len(line.rstrip()) <= width for line in shown.splitlines())
+    for line in log.numbers().arms:
+        for estimate in line.estimates.values():
+            assert show_estimate(estimate) in shown
+    for difference in log.numbers().differences:
+        estimate = show_estimate(difference.estimate, signed=True)
+        assert all(part in squeeze(shown) for part in estimate.split(" ", 1))
+
+
+def test_fidelity_is_printed_where_it_was_measured(log, terminal, tmp_path, capsys):
+    shown = terminal(80, lambda: tables.print_fidelity(log))
+    assert "Fidelity of imagination" in shown and "warp" in shown and "none" not in shown
+    assert all(number in shown.split() for number in ("0.50", "0.125", "21.5", "0.750"))
+    plain = run_arms(LineTask(), {"none": LineAgent()}, 2, out=tmp_path / "plain", progress=False)
+    assert terminal(80, lambda: tables.print_fidelity(plain)) == ""
+
+
+def test_the_end_of_a_run_prints_fidelity(log, capsys):
+    assert main(["report", str(log.path)]) == 0
+    assert "Fidelity of imagination" in capsys.readouterr().out
+    from wiw.cli.run import finish
+
+    assert finish(log, report=False) == 0 and "Fidelity of imagination" in capsys.readouterr().out

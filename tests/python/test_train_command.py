@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw train`: its help, and the numbers that it refuses before anything is prepared."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from wiw.cli.app import main
+from wiw.errors import ArgumentError
+from wiw.training.trainer import run_training, warmup_cosine_schedule
+
+NETWORKS = ("recogniser", "warpnet", "armnet", "diffuser")
+
+
+def test_both_helps_name_all_networks(capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["--help"], ["train", "--help"]):
+        with pytest.raises(SystemExit) as end:
+            main(command)
+        assert end.value.code == 0
+        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert "recogniser, warpnet, armnet or diffuser" in text
+
+
+@pytest.mark.parametrize("what", NETWORKS)
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("minutes", "-3", "--minutes: expected a number above 0, got -3.0"),
+        ("minutes", "0", "--minutes: expected a number above 0, got 0.0"),
+        ("minutes", "nan", "--minutes: expected a number above 0, got nan"),
+        ("minutes", "inf", "--minutes: expected a number above 0, got inf"),
+        ("epochs", "0", "--epochs: expected 1 or more, got 0"),
+        ("places", "-1", "--places: expected 1 or more, got -1"),
+        ("plays", "0", "--plays: expected 1 or more, got 0"),
+        ("workers", "0", "--workers: expected 1 or more, got 0"),
+        ("seed", "-1", "--seed: expected 0 to 2**63 - 1, got -1"),
+    ],
+)
+def test_numbers_out_of_range_are_refused(
+    what: str, option: str, value: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", what, f"--{option}", value, "--out", str(tmp_path / "x")]) == 2
+    assert expected in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
+
+
+class _Counter:
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def train_step(self, learning_rate: float) -> float:
+        self.steps += 1
+        return learning_rate
+
+
+@pytest.mark.parametrize("minutes", [-3.0, 0.0, float("nan"), float("inf")])
+def test_training_in_python_refuses_such_minutes_too(minutes: float) -> None:
+    counter = _Counter()
+    with pytest.raises(ArgumentError, match="minutes: expected a finite number above 0"):
+        run_training(lambda: counter, None, 1, minutes, warmup_cosine_schedule(0.1), lambda *_: None)
+    assert counter.steps == 0
