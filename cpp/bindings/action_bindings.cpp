@@ -12,6 +12,7 @@
 
 namespace py = pybind11;
 using namespace wiw;
+using namespace wiw::action;
 using namespace wiw::bindings;
 
 namespace {

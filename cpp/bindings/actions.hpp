@@ -14,7 +14,7 @@ namespace wiw::bindings {
 
 /// Checked action ids of any shape, flattened.
 struct ActionArray {
-  std::vector<Action> values;
+  std::vector<action::Action> values;
   std::vector<py::ssize_t> shape;
 };
 
@@ -28,10 +28,10 @@ inline ActionArray to_actions(const py::array& array) {
     throw ArgumentError("expected discrete action ids (integers), got " + shape_text(array));
   }
   const Array<std::int64_t> ids(array);
-  ActionArray actions{.values = std::vector<Action>(static_cast<std::size_t>(ids.size())),
+  ActionArray actions{.values = std::vector<action::Action>(static_cast<std::size_t>(ids.size())),
                       .shape = std::vector<py::ssize_t>(ids.shape(), ids.shape() + ids.ndim())};
   std::transform(ids.data(), ids.data() + ids.size(), actions.values.begin(),
-                 [](std::int64_t id) { return to_action(id); });
+                 [](std::int64_t id) { return action::to_action(id); });
   return actions;
 }
 
@@ -43,24 +43,24 @@ inline py::array to_array(const py::handle& object) {
 }
 
 /// One plan: ids of shape [K].
-inline std::vector<Action> to_plan(const py::array& array) {
+inline std::vector<action::Action> to_plan(const py::array& array) {
   ActionArray actions = to_actions(array);
   if (actions.shape.size() != 1) throw ArgumentError("expected one plan of action ids [K], got " + shape_text(array));
   return std::move(actions.values);
 }
 
-inline py::array_t<std::int8_t> to_ids(std::span<const Action> actions) {
+inline py::array_t<std::int8_t> to_ids(std::span<const action::Action> actions) {
   py::array_t<std::int8_t> ids(static_cast<py::ssize_t>(actions.size()));
   std::transform(actions.begin(), actions.end(), ids.mutable_data(),
-                 [](Action a) { return static_cast<std::int8_t>(a); });
+                 [](action::Action a) { return static_cast<std::int8_t>(a); });
   return ids;
 }
 
 /// float64 [K, 3].
-inline py::array_t<double> planar_array(std::span<const PlanarPose> poses) {
+inline py::array_t<double> planar_array(std::span<const action::PlanarPose> poses) {
   py::array_t<double> array({static_cast<py::ssize_t>(poses.size()), py::ssize_t{3}});
   double* out = array.mutable_data();
-  for (const PlanarPose& pose : poses) {
+  for (const action::PlanarPose& pose : poses) {
     *out++ = pose.x;
     *out++ = pose.y;
     *out++ = pose.azimuth;

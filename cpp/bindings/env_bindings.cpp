@@ -8,6 +8,7 @@
 
 namespace py = pybind11;
 using namespace wiw;
+using namespace wiw::env;
 using namespace wiw::bindings;
 
 namespace {
@@ -67,7 +68,7 @@ void bind_env(py::module_& module) {
            py::arg("front") = std::pair(480, 480), py::arg("front_hfov_deg") = 90.0);
 
   py::class_<NavigationEnv>(module, "NavigationEnv")
-      .def(py::init([](std::shared_ptr<Renderer> renderer, std::shared_ptr<nav::NavMesh> navmesh,
+      .def(py::init([](std::shared_ptr<render::Renderer> renderer, std::shared_ptr<nav::NavMesh> navmesh,
                        std::shared_ptr<nav::Ground> ground, const NavigationConfig& config) {
              return NavigationEnv({std::move(renderer), std::move(navmesh), std::move(ground)}, config);
            }),
@@ -75,7 +76,7 @@ void bind_env(py::module_& module) {
       .def("reset", &NavigationEnv::reset, py::arg("position"), py::arg("yaw"), py::arg("tolerance") = 0.3,
            "Puts the agent on the mesh at `position` (metres), heading `yaw` (radians, left positive).")
       .def(
-          "step", [](NavigationEnv& env, int action) { return env.step(to_action(action)); }, py::arg("action"),
+          "step", [](NavigationEnv& env, int action) { return env.step(action::to_action(action)); }, py::arg("action"),
           "Carries out one primitive; True if the pose changed.")
       .def_property_readonly(
           "position", [](const NavigationEnv& env) { return Eigen::Vector3d(env.position()); },
@@ -117,7 +118,7 @@ void bind_env(py::module_& module) {
       .def(
           "step",
           [](VectorEnv& envs, const py::object& ids) {
-            const std::vector<Action> actions = to_plan(to_array(ids));
+            const std::vector<action::Action> actions = to_plan(to_array(ids));
             py::array_t<bool> moved(static_cast<py::ssize_t>(envs.size()));
             const std::span<bool> view(moved.mutable_data(), envs.size());
             {

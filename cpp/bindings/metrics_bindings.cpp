@@ -11,6 +11,7 @@
 
 namespace py = pybind11;
 using namespace wiw;
+using namespace wiw::metrics;
 using namespace wiw::bindings;
 
 namespace {

@@ -314,7 +314,7 @@ void bind_ground(py::module_& module) {
 
 Recast rounds floors up by as much as a cell (0.2 m at Habitat's settings): points on a navigation mesh lie above the
 floor, by another amount in every scene. What stands or is seen from there has to be put down first.)")
-      .def(py::init<const Scene&>(), py::arg("scene"), py::call_guard<py::gil_scoped_release>())
+      .def(py::init<const scene::Scene&>(), py::arg("scene"), py::call_guard<py::gil_scoped_release>())
       .def("put_down", &on_ground, py::arg("points"),
            "float32 [N, 3] (or [3]): points of a navigation mesh (metres) with the floor's height; the highest surface "
            "from 0.45 m below to 0.1 m above counts. Points without any stay where they are.");

@@ -39,8 +39,8 @@ py::array by_type(const py::array& images, const Body& body) {
 
 /// A batch [B, H, W, C] as the kernels want it.
 template <class T>
-struct Batch {
-  explicit Batch(const py::array& images) : array(images) {
+struct ImageBatch {
+  explicit ImageBatch(const py::array& images) : array(images) {
     bindings::expect_shape(array, {-1, -1, -1, -1}, "images [B, H, W, C]");
     size = {static_cast<int>(array.shape(1)), static_cast<int>(array.shape(2))};
     count = static_cast<std::size_t>(array.shape(0));
@@ -72,7 +72,7 @@ py::array apply_plan(const PerspectivePlan& plan, const py::array& panoramas, co
                      const std::string& interpolation_name, const py::object& given) {
   const Interpolation interpolation = to_interpolation(interpolation_name);
   return by_type(panoramas, [&]<class T>(T) -> py::array {
-    const Batch<T> batch(panoramas);
+    const ImageBatch<T> batch(panoramas);
     const Size& size = plan.panorama_size();
     bindings::expect_shape(batch.array, {-1, size.height, size.width, -1},
                            ("panoramas [B, " + std::to_string(size.height) + ", " + std::to_string(size.width) +
@@ -94,7 +94,7 @@ py::array apply_plan(const PerspectivePlan& plan, const py::array& panoramas, co
 
 /// Resamples a batch by one table without moving columns; `shape` follows the batch axis of the result.
 template <class T, class Table>
-void remap_batch(const Table& table, const Batch<T>& batch, const Size& source, T* out) {
+void remap_batch(const Table& table, const ImageBatch<T>& batch, const Size& source, T* out) {
   parallel_for(batch.count, [&](std::size_t b) {
     const ImageView<const T> image{batch[b].data, source, batch.channels};
     const RemapTarget<T> target{0, out + b * table.size() * static_cast<std::size_t>(batch.channels)};
@@ -115,7 +115,7 @@ struct CubePlan {
     const Size source = to_cube ? panorama : cube_stack(face_size);
     const Size target = to_cube ? cube_stack(face_size) : panorama;
     return by_type(images, [&]<class T>(T) -> py::array {
-      const Batch<T> batch(images);
+      const ImageBatch<T> batch(images);
       bindings::expect_shape(batch.array, {-1, source.height, source.width, -1}, "images of the plan's size");
       py::array_t<T> out({static_cast<py::ssize_t>(batch.count), static_cast<py::ssize_t>(target.height),
                           static_cast<py::ssize_t>(target.width), static_cast<py::ssize_t>(batch.channels)});
@@ -142,7 +142,7 @@ struct CubePlan {
 py::array rotate_batch(const py::array& panoramas, double yaw_deg, const std::string& interpolation_name) {
   const Interpolation interpolation = to_interpolation(interpolation_name);
   return by_type(panoramas, [&]<class T>(T) -> py::array {
-    const Batch<T> batch(panoramas);
+    const ImageBatch<T> batch(panoramas);
     py::array_t<T> out(std::vector<py::ssize_t>(panoramas.shape(), panoramas.shape() + 4));
     T* to = out.mutable_data();
     const py::gil_scoped_release release;
@@ -160,7 +160,7 @@ py::array resize_batch(const py::array& images, const Pair& size_pair) {
     if constexpr (std::is_same_v<T, std::uint32_t>) {
       throw ArgumentError("resize: uint32 images hold ids, which have no mean; expected uint8 or float32");
     } else {
-      const Batch<T> batch(images);
+      const ImageBatch<T> batch(images);
       if (size.height < 1 || size.width < 1) throw ArgumentError("resize: expected a size (H, W) of at least 1 x 1");
       py::array_t<T> out({static_cast<py::ssize_t>(batch.count), static_cast<py::ssize_t>(size.height),
                           static_cast<py::ssize_t>(size.width), static_cast<py::ssize_t>(batch.channels)});

@@ -56,7 +56,7 @@ py::array rows(const std::vector<Row>& values) {
 }
 
 py::dict read_surface(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link) {
-  const Surface surface = [&] {
+  const VisualMesh surface = [&] {
     const py::gil_scoped_release release;
     return surface_of_file(path, scale, link);
   }();

@@ -10,6 +10,7 @@
 
 namespace py = pybind11;
 using namespace wiw;
+using namespace wiw::planner;
 using namespace wiw::bindings;
 
 namespace {
@@ -61,31 +62,31 @@ py::array_t<std::int64_t> integers(const std::vector<int>& values) {
 }
 
 /// Start of each row of a part as (part, index, frame) into the rollouts made so far.
-py::array_t<std::int64_t> start_places(const Batch& batch, const Part& part) {
+py::array_t<std::int64_t> start_places(const Batch& batch, const ModelCall& part) {
   py::array_t<std::int64_t> array({static_cast<py::ssize_t>(part.start.size()), py::ssize_t{3}});
   std::int64_t* out = array.mutable_data();
   for (const Source& source : part.start) {
-    const Batch::Place place = batch.place(source);
-    *out++ = place.part;
+    const Batch::FrameAddress place = batch.place(source);
+    *out++ = place.call;
     *out++ = place.index;
     *out++ = place.frame;
   }
   return array;
 }
 
-py::object part_object(const py::object& type, const Batch& batch, const Part& part) {
+py::object part_object(const py::object& type, const Batch& batch, const ModelCall& part) {
   const auto rows = static_cast<py::ssize_t>(part.rows.size());
   const auto steps = static_cast<py::ssize_t>(part.steps);
-  ActionSequence actions;
-  std::vector<PlanarPose> trajectories;
-  for (const ActionSequence& row : part.actions) {
+  action::ActionSequence actions;
+  std::vector<action::PlanarPose> trajectories;
+  for (const action::ActionSequence& row : part.actions) {
     actions.insert(actions.end(), row.begin(), row.end());
-    const auto trajectory = to_trajectory(row, batch.spec().space);
+    const auto trajectory = action::to_trajectory(row, batch.spec().space);
     trajectories.insert(trajectories.end(), trajectory.begin(), trajectory.end());
   }
   std::vector<Pose> viewpoints;
   viewpoints.reserve(trajectories.size());
-  for (const PlanarPose& pose : trajectories) viewpoints.push_back(to_viewpoint(pose));
+  for (const action::PlanarPose& pose : trajectories) viewpoints.push_back(action::to_viewpoint(pose));
   return type(part.first, part.steps, integers(part.rows), to_ids(actions).reshape({rows, steps}),
               planar_array(trajectories).reshape({rows, steps, py::ssize_t{3}}),
               matrix_array(viewpoints).reshape({rows, steps, py::ssize_t{4}, py::ssize_t{4}}), integers(part.length),
@@ -254,11 +255,11 @@ py::array_t<std::int64_t> owners(const Batch& batch) {
 void bind_spec(py::module_& module) {
   py::class_<ModelSpec>(module, "ModelSpec", "What the planner has to know about a world model.")
       .def(py::init([](bool causal, int frames, const std::string& padding, const std::string& leading, int max_rows,
-                       const ActionSpace& space) {
+                       const action::ActionSpace& space) {
              ModelSpec spec{
                  .causal = causal,
                  .frames = frames,
-                 .padding = to_padding(padding),
+                 .padding = action::to_padding(padding),
                  .leading = choose<Leading>(
                      leading,
                      {{"none", Leading::kNone}, {"same_direction", Leading::kSameDirection}, {"any", Leading::kAny}},
@@ -269,7 +270,7 @@ void bind_spec(py::module_& module) {
              return spec;
            }),
            py::arg("causal") = false, py::arg("frames") = 0, py::arg("padding") = "forward",
-           py::arg("leading") = "same_direction", py::arg("max_rows") = 0, py::arg("space") = ActionSpace{},
+           py::arg("leading") = "same_direction", py::arg("max_rows") = 0, py::arg("space") = action::ActionSpace{},
            "frames: length of a rollout with the observation, 0 any. leading: turns answered by the real panorama, "
            "'same_direction' (up to the first forward or reversing turn), 'any' or 'none'. max_rows: rows a call, 0 "
            "any.")
@@ -366,7 +367,7 @@ void bind_batch(py::module_& module) {
           "parts",
           [type = py::object(module.attr("Part"))](const BoundBatch& self) {
             py::list parts;
-            for (const Part& part : self.batch.parts()) {
+            for (const ModelCall& part : self.batch.calls()) {
               parts.append(part_object(type, self.batch, part));
             }
             return parts;

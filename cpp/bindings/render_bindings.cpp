@@ -12,13 +12,13 @@ namespace py = pybind11;
 
 namespace {
 
-using wiw::Renderer;
 using wiw::bindings::Array;
+using wiw::render::Renderer;
 
-wiw::Backend backend_from(const std::string& name) {
-  if (name == "auto") return wiw::Backend::kAuto;
-  if (name == "cpu") return wiw::Backend::kCpu;
-  if (name == "gpu") return wiw::Backend::kGpu;
+wiw::render::Backend backend_from(const std::string& name) {
+  if (name == "auto") return wiw::render::Backend::kAuto;
+  if (name == "cpu") return wiw::render::Backend::kCpu;
+  if (name == "gpu") return wiw::render::Backend::kGpu;
   throw wiw::ArgumentError("Renderer: expected backend 'auto', 'cpu' or 'gpu', got '" + name + "'");
 }
 
@@ -40,13 +40,13 @@ T* target(const py::object& array, std::initializer_list<py::ssize_t> shape, con
   return typed.mutable_data();
 }
 
-void render(Renderer& renderer, const Array<double>& T_world_camera, const wiw::Camera& camera, const py::object& color,
-            const py::object& depth, const py::object& instance) {
+void render(Renderer& renderer, const Array<double>& T_world_camera, const wiw::render::Camera& camera,
+            const py::object& color, const py::object& depth, const py::object& instance) {
   const auto poses = wiw::bindings::to_poses(T_world_camera, "T_world_camera");
   const auto batch = static_cast<py::ssize_t>(poses.size());
   const py::ssize_t height = camera.size.height;
   const py::ssize_t width = camera.size.width;
-  wiw::RenderTargets targets;
+  wiw::render::RenderTargets targets;
   targets.color = target<std::uint8_t>(color, {batch, height, width, 3}, "color uint8 [B, H, W, 3]");
   targets.depth = target<float>(depth, {batch, height, width}, "depth float32 [B, H, W]");
   targets.instance = target<std::uint32_t>(instance, {batch, height, width}, "instance uint32 [B, H, W]");
@@ -72,13 +72,13 @@ void set_poses(Renderer& renderer, const Array<std::uint32_t>& ids, const Array<
 }
 
 py::list egl_devices() {
-  std::vector<wiw::EglDeviceReport> reports;
+  std::vector<wiw::render::EglDeviceReport> reports;
   {
     const py::gil_scoped_release release;
-    reports = wiw::report_egl_devices();
+    reports = wiw::render::report_egl_devices();
   }
   py::list devices;
-  for (const wiw::EglDeviceReport& report : reports) {
+  for (const wiw::render::EglDeviceReport& report : reports) {
     py::dict device;
     device["index"] = report.index;
     device["vendor"] = report.vendor;
@@ -95,10 +95,10 @@ py::list egl_devices() {
 
 void bind_render(py::module_& module) {
   py::class_<Renderer, std::shared_ptr<Renderer>>(module, "Renderer", "Draws one scene; see wiw.render.Renderer.")
-      .def(py::init([](const std::shared_ptr<wiw::Scene>& scene, const std::string& backend, int samples) {
-             const wiw::Backend chosen = backend_from(backend);
+      .def(py::init([](const std::shared_ptr<wiw::scene::Scene>& scene, const std::string& backend, int samples) {
+             const wiw::render::Backend chosen = backend_from(backend);
              const py::gil_scoped_release release;
-             return wiw::make_renderer(scene, chosen, {.samples = samples});
+             return wiw::render::make_renderer(scene, chosen, {.samples = samples});
            }),
            py::arg("scene"), py::arg("backend"), py::arg("samples"))
       .def(
@@ -106,8 +106,8 @@ void bind_render(py::module_& module) {
           [](Renderer& renderer, const Array<double>& T_world_camera, std::pair<int, int> size, double hfov_deg,
              const py::object& color, const py::object& depth, const py::object& instance) {
             render(renderer, T_world_camera,
-                   {wiw::Projection::kPerspective, {size.first, size.second}, wiw::radians(hfov_deg)}, color, depth,
-                   instance);
+                   {wiw::render::Projection::kPerspective, {size.first, size.second}, wiw::radians(hfov_deg)}, color,
+                   depth, instance);
           },
           py::arg("T_world_camera"), py::arg("size"), py::arg("hfov_deg"), py::arg("color"), py::arg("depth"),
           py::arg("instance"))
@@ -115,8 +115,8 @@ void bind_render(py::module_& module) {
           "panorama",
           [](Renderer& renderer, const Array<double>& T_world_camera, std::pair<int, int> size, const py::object& color,
              const py::object& depth, const py::object& instance) {
-            render(renderer, T_world_camera, {wiw::Projection::kEquirectangular, {size.first, size.second}}, color,
-                   depth, instance);
+            render(renderer, T_world_camera, {wiw::render::Projection::kEquirectangular, {size.first, size.second}},
+                   color, depth, instance);
           },
           py::arg("T_world_camera"), py::arg("size"), py::arg("color"), py::arg("depth"), py::arg("instance"))
       .def("set_poses", &set_poses, py::arg("instance_ids"), py::arg("T_world_instance"))

@@ -20,8 +20,8 @@ namespace py = pybind11;
 
 namespace {
 
-using wiw::Scene;
-using wiw::ScenePtr;
+using wiw::scene::Scene;
+using wiw::scene::ScenePtr;
 
 template <class T, int N>
 py::array_t<T> rows_to_array(const std::vector<Eigen::Matrix<T, N, 1>>& rows) {
@@ -47,29 +47,29 @@ py::array_t<float> matrix_to_array(const Eigen::Matrix4f& matrix) {
   return array;
 }
 
-py::dict instance_to_dict(const Scene& scene, const wiw::Instance& instance) {
+py::dict instance_to_dict(const Scene& scene, const wiw::scene::Instance& instance) {
   std::size_t triangles = 0;
   for (const std::uint32_t mesh : instance.meshes) triangles += scene.meshes[mesh].triangles.size();
   py::dict result;
   result["id"] = instance.id;
   result["name"] = instance.name;
-  result["category"] = instance.category == wiw::kNone ? std::string() : scene.categories[instance.category];
+  result["category"] = instance.category == wiw::scene::kNone ? std::string() : scene.categories[instance.category];
   result["attributes"] = instance.attributes;
   result["T_world_instance"] = matrix_to_array(instance.T_world_instance.matrix());
-  result["bounds"] = box_to_array(wiw::instance_bounds(scene, instance));
+  result["bounds"] = box_to_array(wiw::scene::instance_bounds(scene, instance));
   result["triangle_count"] = triangles;
   return result;
 }
 
 py::list instances_to_list(const Scene& scene) {
   py::list result;
-  for (const wiw::Instance& instance : scene.instances) result.append(instance_to_dict(scene, instance));
+  for (const wiw::scene::Instance& instance : scene.instances) result.append(instance_to_dict(scene, instance));
   return result;
 }
 
 py::list rooms_to_list(const Scene& scene) {
   py::list result;
-  for (const wiw::Room& room : scene.rooms) {
+  for (const wiw::scene::Room& room : scene.rooms) {
     py::dict entry;
     entry["name"] = room.name;
     entry["type"] = room.type;
@@ -89,24 +89,24 @@ py::object sun_to_dict(const Scene& scene) {
 }
 
 py::tuple triangles_to_arrays(const Scene& scene) {
-  wiw::TriangleSoup soup;
+  wiw::scene::TriangleSoup soup;
   {
     const py::gil_scoped_release release;
-    soup = wiw::world_triangles(scene);
+    soup = wiw::scene::world_triangles(scene);
   }
   py::array_t<std::uint32_t> instance(static_cast<py::ssize_t>(soup.instance.size()));
   std::ranges::copy(soup.instance, instance.mutable_data());
   return py::make_tuple(rows_to_array(soup.vertices), rows_to_array(soup.triangles), instance);
 }
 
-wiw::Up up_from_text(const std::optional<std::string>& up) {
-  if (!up || *up == "auto") return wiw::Up::kAuto;
-  if (*up == "y") return wiw::Up::kY;
-  if (*up == "z") return wiw::Up::kZ;
+wiw::scene::Up up_from_text(const std::optional<std::string>& up) {
+  if (!up || *up == "auto") return wiw::scene::Up::kAuto;
+  if (*up == "y") return wiw::scene::Up::kY;
+  if (*up == "z") return wiw::scene::Up::kZ;
   throw wiw::ArgumentError("up must be 'auto', 'y' or 'z', got '" + *up + "'");
 }
 
-void set_limits(const py::dict& values, wiw::ImportLimits& limits) {
+void set_limits(const py::dict& values, wiw::scene::ImportLimits& limits) {
   for (const auto& [key, value] : values) {
     const auto name = key.cast<std::string>();
     const auto figure = value.cast<std::size_t>();
@@ -131,8 +131,8 @@ using Paths = std::vector<std::filesystem::path>;
 py::tuple import_scene(const std::filesystem::path& path, const std::optional<std::string>& up,
                        const std::optional<float> ceiling, const py::dict& limits, const Paths& texture_folders,
                        const Paths& model_folders) {
-  wiw::ImportTrace trace;
-  wiw::ImportOptions options;
+  wiw::scene::ImportTrace trace;
+  wiw::scene::ImportOptions options;
   options.up = up_from_text(up);
   options.ceiling_height = ceiling;
   options.texture_folders = texture_folders;
@@ -144,7 +144,7 @@ py::tuple import_scene(const std::filesystem::path& path, const std::optional<st
     const py::gil_scoped_release release;
     const std::string extension = path.extension().string();
     const bool world = extension == ".world" || extension == ".sdf";
-    scene = world ? wiw::load_sdf_world(path, options) : wiw::load_mesh(path, options);
+    scene = world ? wiw::scene::load_sdf_world(path, options) : wiw::scene::load_mesh(path, options);
   }
   return py::make_tuple(std::const_pointer_cast<Scene>(scene), trace.read, trace.absent);
 }
@@ -180,10 +180,10 @@ void bind_scene_class(py::module_& module) {
           "mesh_count", [](const Scene& scene) { return scene.meshes.size(); }, "Meshes; placements share them.")
       .def_property_readonly("material_count", [](const Scene& scene) { return scene.materials.size(); })
       .def_property_readonly("texture_count", [](const Scene& scene) { return scene.textures.size(); })
-      .def_property_readonly("texture_bytes", &wiw::texture_bytes, "Decoded textures in bytes.")
-      .def_property_readonly("mesh_bytes", &wiw::mesh_bytes, "Vertex and triangle arrays in bytes.")
-      .def("__repr__", [](const Scene& scene) { return "<" + wiw::summary(scene) + ">"; })
-      .def("describe", &wiw::describe, "Several lines for a person: size, categories, memory, warnings.")
+      .def_property_readonly("texture_bytes", &wiw::scene::texture_bytes, "Decoded textures in bytes.")
+      .def_property_readonly("mesh_bytes", &wiw::scene::mesh_bytes, "Vertex and triangle arrays in bytes.")
+      .def("__repr__", [](const Scene& scene) { return "<" + wiw::scene::summary(scene) + ">"; })
+      .def("describe", &wiw::scene::describe, "Several lines for a person: size, categories, memory, warnings.")
       .def("world_triangles", &triangles_to_arrays,
            "All placements in the world: vertices float32 [V, 3], triangles uint32 [T, 3], instance id uint32 [T].");
 }
@@ -199,13 +199,15 @@ void bind_scene(py::module_& module) {
              py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
              py::arg("model_folders") = Paths{},
              "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
-  module.attr("IMPORTER_VERSION") = wiw::importer_version();
-  module.def("write_cache", &wiw::write_scene_cache, py::arg("scene"), py::arg("path"),
+  module.attr("IMPORTER_VERSION") = wiw::scene::importer_version();
+  module.def("write_cache", &wiw::scene::write_scene_cache, py::arg("scene"), py::arg("path"),
              py::call_guard<py::gil_scoped_release>(),
              "Writes a scene to a cache file, which appears whole or not at all.");
   module.def(
       "map_cache",
-      [](const std::filesystem::path& path) { return std::const_pointer_cast<Scene>(wiw::map_scene_cache(path)); },
+      [](const std::filesystem::path& path) {
+        return std::const_pointer_cast<Scene>(wiw::scene::map_scene_cache(path));
+      },
       py::arg("path"), py::call_guard<py::gil_scoped_release>(),
       "Maps a cache file: a scene whose arrays lie in the file. Raises FileError if it is damaged or of another "
       "version.");

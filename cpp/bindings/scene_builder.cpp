@@ -41,7 +41,7 @@ void check_keys(const py::dict& dict, std::initializer_list<const char*> known, 
   }
 }
 
-Texture texture_from(const py::handle& value, std::size_t index) {
+scene::Texture texture_from(const py::handle& value, std::size_t index) {
   const auto array = value.cast<Array<std::uint8_t>>();
   expect_shape(array, {-1, -1, 4}, "a texture uint8 [H, W, 4]");
   const Size size{static_cast<int>(array.shape(0)), static_cast<int>(array.shape(1))};
@@ -49,32 +49,32 @@ Texture texture_from(const py::handle& value, std::size_t index) {
   return {"texture " + std::to_string(index), size, std::move(rgba)};
 }
 
-Material material_from(const py::dict& dict) {
+scene::Material material_from(const py::dict& dict) {
   check_keys(dict, {"name", "base_color", "texture", "alpha_cutoff", "emissive"}, "material");
-  Material material;
+  scene::Material material;
   material.name = value_or<std::string>(dict, "name", "");
   const auto color = value_or<std::array<float, 4>>(dict, "base_color", {1.f, 1.f, 1.f, 1.f});
   material.base_color = {color[0], color[1], color[2], color[3]};
-  material.texture = value_or(dict, "texture", kNone);
+  material.texture = value_or(dict, "texture", scene::kNone);
   material.alpha_cutoff = value_or(dict, "alpha_cutoff", -1.f);
   material.emissive = value_or(dict, "emissive", false);
   return material;
 }
 
-Mesh mesh_from(const py::dict& dict) {
+scene::Mesh mesh_from(const py::dict& dict) {
   check_keys(dict,
              {"positions", "triangles", "normals", "uv", "lightmap_uv", "colors", "material", "lightmap", "name",
               "category", "attributes", "T_world_instance"},
              "mesh");
-  Mesh mesh;
+  scene::Mesh mesh;
   mesh.positions = rows<float, 3>(dict, "positions", "positions float32 [V, 3]");
   mesh.triangles = rows<std::uint32_t, 3>(dict, "triangles", "triangles uint32 [T, 3]");
   mesh.normals = rows<float, 3>(dict, "normals", "normals float32 [V, 3]");
   mesh.uv = rows<float, 2>(dict, "uv", "uv float32 [V, 2]");
   mesh.lightmap_uv = rows<float, 2>(dict, "lightmap_uv", "lightmap_uv float32 [V, 2]");
   mesh.colors = rows<std::uint8_t, 4>(dict, "colors", "colors uint8 [V, 4]");
-  mesh.material = value_or(dict, "material", kNone);
-  mesh.lightmap = value_or(dict, "lightmap", kNone);
+  mesh.material = value_or(dict, "material", scene::kNone);
+  mesh.lightmap = value_or(dict, "lightmap", scene::kNone);
   return mesh;
 }
 
@@ -88,13 +88,13 @@ std::vector<Eigen::Affine3f> placements(const py::dict& dict) {
   return result;
 }
 
-void add_instances(const py::dict& dict, Scene& scene) {
+void add_instances(const py::dict& dict, scene::Scene& scene) {
   const auto mesh = static_cast<std::uint32_t>(scene.meshes.size() - 1);
   for (const Eigen::Affine3f& T_world_instance : placements(dict)) {
-    Instance instance;
+    scene::Instance instance;
     instance.id = static_cast<std::uint32_t>(scene.instances.size() + 1);
     instance.name = value_or<std::string>(dict, "name", "mesh " + std::to_string(mesh));
-    instance.category = category_index(scene, value_or<std::string>(dict, "category", ""));
+    instance.category = scene::category_index(scene, value_or<std::string>(dict, "category", ""));
     instance.attributes = value_or<std::map<std::string, std::string>>(dict, "attributes", {});
     instance.meshes = {mesh};
     instance.T_world_instance = T_world_instance;
@@ -102,9 +102,9 @@ void add_instances(const py::dict& dict, Scene& scene) {
   }
 }
 
-Sun sun_from(const py::dict& dict) {
+scene::Sun sun_from(const py::dict& dict) {
   check_keys(dict, {"direction", "strength", "ambient"}, "sun");
-  Sun sun;
+  scene::Sun sun;
   if (dict.contains("direction")) {
     const auto array = dict["direction"].cast<Array<double>>();
     expect_shape(array, {3}, "the sun's direction [3]");
@@ -121,9 +121,10 @@ Sun sun_from(const py::dict& dict) {
 
 }  // namespace
 
-std::shared_ptr<Scene> scene_from_arrays(const py::list& meshes, const std::string& name, const py::list& textures,
-                                         const py::list& materials, const std::optional<py::dict>& sun) {
-  auto scene = std::make_shared<Scene>();
+std::shared_ptr<scene::Scene> scene_from_arrays(const py::list& meshes, const std::string& name,
+                                                const py::list& textures, const py::list& materials,
+                                                const std::optional<py::dict>& sun) {
+  auto scene = std::make_shared<scene::Scene>();
   scene->name = name;
   scene->attributes["up"] = "Y (given as arrays)";
   for (const py::handle& texture : textures) scene->textures.push_back(texture_from(texture, scene->textures.size()));

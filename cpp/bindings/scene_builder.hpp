@@ -25,8 +25,8 @@ inline constexpr const char* kFromArraysDoc =
     "ambient light), both in [0, 1]; keys left out keep their defaults. "
     "Raises ArgumentError for shapes that do not fit and values out of range.";
 
-std::shared_ptr<Scene> scene_from_arrays(const pybind11::list& meshes, const std::string& name,
-                                         const pybind11::list& textures, const pybind11::list& materials,
-                                         const std::optional<pybind11::dict>& sun);
+std::shared_ptr<scene::Scene> scene_from_arrays(const pybind11::list& meshes, const std::string& name,
+                                                const pybind11::list& textures, const pybind11::list& materials,
+                                                const std::optional<pybind11::dict>& sun);
 
 }  // namespace wiw::bindings

@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 CPP_ROWS = [
     {"core"},
     {"panorama", "scene", "action", "metrics"},
-    {"render", "nav", "physics", "planner", "reproject", "annotate"},
+    {"apartment", "render", "nav", "physics", "planner", "reproject", "annotate"},
     {"env"},
 ]
 FACES = {
@@ -124,6 +124,42 @@ def reachable(start: str, edges: dict[str, set[str]]) -> set[str]:
 @pytest.mark.parametrize("edge", sorted(cpp_edges()), ids="->".join)
 def test_cpp_edges_point_down(edge: tuple[str, str]) -> None:
     assert row_of(edge[0], CPP_ROWS) > row_of(edge[1], CPP_ROWS)
+
+
+def cpp_files() -> list[tuple[str, Path]]:
+    """The C++ files of the core, each with the room it is in."""
+    folder = ROOT / "cpp/wiw"
+    return [(file.relative_to(folder).parts[0], file) for file in sorted(folder.rglob("*.[ch]pp"))]
+
+
+def type_names(text: str) -> set[str]:
+    """Return the types that a C++ text defines: classes, structs and enumerations, and aliases at namespace scope."""
+    text = re.sub(r"//[^\n]*", "", text)
+    definition = r"^\s*(?:class|struct|enum(?: class)?)\s+(?:alignas\(\w+\)\s+)?(\w+)[^;{()]*\{"
+    defined = re.findall(definition, text, re.MULTILINE)
+    return {*defined, *re.findall(r"^using (\w+) =", text, re.MULTILINE)}
+
+
+def test_type_names_are_found() -> None:
+    text = (
+        "struct A;\nclass alignas(64) B final : public C {\n  enum class D { kE };\n};\nusing F = int;\nstruct G* g();"
+    )
+    assert type_names(text) == {"B", "D", "F"}
+
+
+def test_each_room_has_its_namespace() -> None:
+    for room, file in cpp_files():
+        own = "wiw" if room == "core" else f"wiw::{room}"
+        names = set(re.findall(r"^namespace (wiw[\w:]*) \{", file.read_text(), re.MULTILINE))
+        assert all(name == own or (room != "core" and name.startswith(own + "::")) for name in names), (file, names)
+
+
+def test_no_type_name_is_in_two_rooms() -> None:
+    rooms: dict[str, set[str]] = {}
+    for room, file in cpp_files():
+        for name in type_names(file.read_text()):
+            rooms.setdefault(name, set()).add(room)
+    assert {name: found for name, found in rooms.items() if len(found) > 1} == {}
 
 
 @pytest.mark.parametrize("edge", sorted(python_edges()), ids="->".join)

@@ -6,6 +6,7 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::action;
 using enum Action;
 
 TEST_CASE("padding fills up, never cuts") {

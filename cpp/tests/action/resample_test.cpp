@@ -6,6 +6,7 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::action;
 
 TEST_CASE("longer: linear, both ends kept") {
   const std::vector<PlanarPose> poses = {{0, 0, 0}, {1, 2, 1}};

@@ -6,6 +6,7 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::action;
 using enum Action;
 
 TEST_CASE("a left turn then a step moves forward and to the left") {

@@ -8,6 +8,7 @@
 #include "wiw/core/intrinsics.hpp"
 
 using namespace wiw;
+using namespace wiw::action;
 using enum Action;
 
 TEST_CASE("ids and vectors of a model") {

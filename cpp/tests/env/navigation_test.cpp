@@ -6,13 +6,14 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::env;
 using namespace wiw::testing;
 using Eigen::Vector3d;
 
 namespace {
 
-const World& world() {
-  static const World world = make_world(0.5f);
+const NavigationWorld& world() {
+  static const NavigationWorld world = make_world(0.5f);
   return world;
 }
 
@@ -22,18 +23,19 @@ NavigationEnv env_at(double x, double z, double yaw, Motion motion = Motion::kRe
   return env;
 }
 
-const ActionSequence kWalk{Action::kForward,   Action::kTurnLeft, Action::kForward,   Action::kTurnRight,
-                           Action::kTurnRight, Action::kForward,  Action::kTurnRight, Action::kForward};
+const action::ActionSequence kWalk{action::Action::kForward,   action::Action::kTurnLeft,  action::Action::kForward,
+                                   action::Action::kTurnRight, action::Action::kTurnRight, action::Action::kForward,
+                                   action::Action::kTurnRight, action::Action::kForward};
 
 }  // namespace
 
 TEST_CASE("a forward step is 0.2 m along the heading and keeps the floor's height") {
   NavigationEnv env = env_at(1, 1, -kPi / 2);  // towards +x
   const Vector3d before = env.position();
-  CHECK(env.step(Action::kForward));
+  CHECK(env.step(action::Action::kForward));
   CHECK((env.position() - before - Vector3d(0.2, 0, 0)).norm() < 1e-5);
-  CHECK(!env.step(Action::kStop));
-  CHECK(!env.step(Action::kNull));
+  CHECK(!env.step(action::Action::kStop));
+  CHECK(!env.step(action::Action::kNull));
 }
 
 TEST_CASE("refuse: a step whose end is not navigable leaves the agent where it is") {
@@ -43,7 +45,7 @@ TEST_CASE("refuse: a step whose end is not navigable leaves the agent where it i
     const Vector3d before = env.position();
     const Vector3d end = before + 0.2 * Vector3d(-std::sin(env.yaw()), 0, -std::cos(env.yaw()));
     const bool free = world().navmesh->is_navigable(end.cast<float>());
-    CHECK(env.step(Action::kForward) == free);
+    CHECK(env.step(action::Action::kForward) == free);
     CHECK((env.position() - (free ? end : before)).norm() < 1e-5);
     refused += !free;
   }
@@ -55,8 +57,8 @@ TEST_CASE("slide: the agent goes on along the block") {
   NavigationEnv sliding = env_at(1, 3.5, -kPi / 2 + 0.4, Motion::kSlide);
   NavigationEnv refusing = env_at(1, 3.5, -kPi / 2 + 0.4);
   for (int i = 0; i < 24; ++i) {
-    sliding.step(Action::kForward);
-    refusing.step(Action::kForward);
+    sliding.step(action::Action::kForward);
+    refusing.step(action::Action::kForward);
     CHECK(world().navmesh->is_navigable(sliding.position().cast<float>()));
   }
   CHECK(refusing.position().z() > 2);   // stuck beside the block
@@ -68,7 +70,7 @@ TEST_CASE("odometry is the way in the frame of the reset, as the action API comp
   for (const double yaw : {0.0, 1.1, -2.9}) {
     NavigationEnv env = env_at(1.2, 1.2, yaw);
     CHECK(env.odometry().norm() == 0);
-    const auto expected = to_trajectory(kWalk, env.config().actions);
+    const auto expected = action::to_trajectory(kWalk, env.config().actions);
     for (std::size_t k = 0; k < kWalk.size(); ++k) {
       REQUIRE(env.step(kWalk[k]));
       const Vector3d odometry = env.odometry();
@@ -81,7 +83,7 @@ TEST_CASE("odometry is the way in the frame of the reset, as the action API comp
 
 TEST_CASE("sixteen turns are a circle to the last bit") {
   NavigationEnv env = env_at(1, 1, 0.3);
-  for (int i = 0; i < 16; ++i) env.step(Action::kTurnRight);
+  for (int i = 0; i < 16; ++i) env.step(action::Action::kTurnRight);
   CHECK(env.yaw() == 0.3);
   CHECK(env.odometry().z() == 0);
 }
@@ -89,18 +91,18 @@ TEST_CASE("sixteen turns are a circle to the last bit") {
 TEST_CASE("a copy is a fork: neither moves the other") {
   NavigationEnv env = env_at(1, 1, 0);
   NavigationEnv fork = env;
-  fork.step(Action::kTurnRight);
-  fork.step(Action::kForward);
+  fork.step(action::Action::kTurnRight);
+  fork.step(action::Action::kForward);
   CHECK(env.position() == env_at(1, 1, 0).position());
   CHECK(env.yaw() == 0);
   const Pose forked = fork.T_world_camera();
-  env.step(Action::kTurnLeft);
+  env.step(action::Action::kTurnLeft);
   CHECK(fork.T_world_camera().matrix() == forked.matrix());
 }
 
 TEST_CASE("camera_poses_after is what stepping leads to, blocked steps included") {
-  ActionSequence plan = kWalk;
-  plan.insert(plan.end(), 12, Action::kForward);
+  action::ActionSequence plan = kWalk;
+  plan.insert(plan.end(), 12, action::Action::kForward);
   for (const Motion motion : {Motion::kRefuse, Motion::kSlide}) {
     NavigationEnv env = env_at(1.5, 2.5, -1.2, motion);
     const std::vector<Pose> poses = env.camera_poses_after(plan);

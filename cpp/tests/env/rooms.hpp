@@ -9,15 +9,15 @@ namespace wiw::testing {
 
 /// A floor of 6 x 4 m, x and z from 0, with a block over x in [2.5, 3.5] and z in [2, 4], and coloured boards around.
 /// `shade` tells worlds apart.
-World make_world(float shade);
+env::NavigationWorld make_world(float shade);
 
 /// Small pictures, so that drawing takes no time.
-NavigationConfig small_pictures(Motion motion = Motion::kRefuse);
+env::NavigationConfig small_pictures(env::Motion motion = env::Motion::kRefuse);
 
 /// Everything that one observation, or N of them, is written into.
 struct Pictures {
-  explicit Pictures(const NavigationConfig& config, std::size_t count = 1);
-  ObservationTargets targets();
+  explicit Pictures(const env::NavigationConfig& config, std::size_t count = 1);
+  env::ObservationTargets targets();
   bool operator==(const Pictures&) const = default;
 
   std::vector<std::uint8_t> panorama, front;

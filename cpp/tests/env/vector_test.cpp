@@ -9,6 +9,7 @@
 #include "wiw/env/vector_env.hpp"
 
 using namespace wiw;
+using namespace wiw::env;
 using namespace wiw::testing;
 
 namespace {
@@ -32,11 +33,11 @@ TEST_CASE("a vector of environments moves and sees as its members do one by one"
   REQUIRE(vector.size() == 4);
   const NavigationConfig& config = singles[0].config();
   for (int step = 0; step < 25; ++step) {
-    std::array<Action, 4> actions{};
+    std::array<action::Action, 4> actions{};
     std::array<bool, 4> moved{}, expected{};
     Pictures together(config, 4);
     for (std::size_t i = 0; i < 4; ++i) {
-      actions[i] = to_action((step * 7 + static_cast<int>(i) * 3 + step / 5) % kActionCount);
+      actions[i] = action::to_action((step * 7 + static_cast<int>(i) * 3 + step / 5) % action::kActionCount);
       expected[i] = singles[i].step(actions[i]);
     }
     vector.step(actions, moved);
@@ -80,6 +81,6 @@ TEST_CASE("environments that see differently, or a wrong number of actions, are 
   }
   CHECK_THROWS_AS(VectorEnv({}), ArgumentError);
   std::array<bool, 4> moved{};
-  const std::array three{Action::kStop, Action::kStop, Action::kStop};
+  const std::array three{action::Action::kStop, action::Action::kStop, action::Action::kStop};
   CHECK_THROWS_AS(VectorEnv(envs).step(three, moved), ArgumentError);
 }

@@ -8,6 +8,7 @@
 #include "wiw/metrics/ssim.hpp"
 
 using namespace wiw;
+using namespace wiw::metrics;
 
 namespace {
 struct Image {

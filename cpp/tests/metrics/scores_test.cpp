@@ -9,6 +9,7 @@
 #include "wiw/metrics/pose_error.hpp"
 
 using namespace wiw;
+using namespace wiw::metrics;
 using List = std::vector<double>;
 
 TEST_CASE("detours cost, shortcuts do not pay") {

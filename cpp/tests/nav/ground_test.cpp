@@ -12,15 +12,15 @@ using Eigen::Vector3f;
 
 namespace {
 
-void add_quad(TriangleSoup& soup, const Vector3f& a, const Vector3f& b, const Vector3f& c, const Vector3f& d) {
+void add_quad(scene::TriangleSoup& soup, const Vector3f& a, const Vector3f& b, const Vector3f& c, const Vector3f& d) {
   const auto base = static_cast<std::uint32_t>(soup.vertices.size());
   soup.vertices.insert(soup.vertices.end(), {a, b, c, d});
   soup.triangles.insert(soup.triangles.end(), {{base, base + 1, base + 2}, {base, base + 2, base + 3}});
 }
 
 /// A floor at `height` over [0, 4] x [0, 4], a rug of 1 cm over [1, 2] x [1, 2], a table top 0.7 m above.
-TriangleSoup room(float height) {
-  TriangleSoup soup;
+scene::TriangleSoup room(float height) {
+  scene::TriangleSoup soup;
   add_quad(soup, {0, height, 0}, {0, height, 4}, {4, height, 4}, {4, height, 0});
   add_quad(soup, {1, height + 0.01f, 1}, {1, height + 0.01f, 2}, {2, height + 0.01f, 2}, {2, height + 0.01f, 1});
   add_quad(soup, {0, height + 0.7f, 0}, {0, height + 0.7f, 4}, {4, height + 0.7f, 4}, {4, height + 0.7f, 0});
@@ -42,13 +42,13 @@ TEST_CASE("the ground is the floor below a point that Recast has lifted") {
     CHECK(ground.height({9, 5, 9}) == 5);  // nothing there
     CHECK(ground.height({0.5, height - 1, 0.5}) == height - 1);
   }
-  CHECK(nav::Ground(TriangleSoup{}).height({1, 2, 3}) == 2);
+  CHECK(nav::Ground(scene::TriangleSoup{}).height({1, 2, 3}) == 2);
 }
 
 TEST_CASE("heights on a bumpy sheet are those of every triangle looked at") {
   std::mt19937 random(7);
   std::uniform_real_distribution<float> bump(0.f, 0.08f);
-  TriangleSoup soup;
+  scene::TriangleSoup soup;
   constexpr int kSide = 24;
   for (int z = 0; z <= kSide; ++z) {
     for (int x = 0; x <= kSide; ++x)

@@ -8,7 +8,8 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
-using enum Action;
+using namespace wiw::planner;
+using enum action::Action;
 
 namespace {
 constexpr Size kSize{.height = 4, .width = 16};

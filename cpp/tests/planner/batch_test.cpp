@@ -6,7 +6,8 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
-using enum Action;
+using namespace wiw::planner;
+using enum action::Action;
 
 namespace {
 constexpr auto F = kForward;
@@ -39,51 +40,51 @@ TEST_CASE("a causal model answers a plan that another begins with, and marks com
   CHECK(batch.sources(2) == std::vector<Source>{{0, 1}, {0, 2}, {1, 3}});
   CHECK(batch.rows()[1].shared == 2);
   CHECK(batch.rows()[2].shared == 1);
-  REQUIRE(batch.parts().size() == 1);
-  CHECK(batch.parts()[0].steps == 4);
-  CHECK(batch.parts()[0].shared == std::vector<int>{0, 2, 1});
-  CHECK(batch.parts()[0].length == std::vector<int>{4, 3, 2});
+  REQUIRE(batch.calls().size() == 1);
+  CHECK(batch.calls()[0].steps == 4);
+  CHECK(batch.calls()[0].shared == std::vector<int>{0, 2, 1});
+  CHECK(batch.calls()[0].length == std::vector<int>{4, 3, 2});
 }
 
 TEST_CASE("a model that looks ahead is asked for each length, unless padding makes plans equal") {
   const Plans plans = {{{F}, {F, F}, {F, L}}};
   const Batch any(plans, {});
   CHECK(any.rows().size() == 3);
-  REQUIRE(any.parts().size() == 2);
-  CHECK(any.parts()[0].steps == 2);
-  CHECK(any.parts()[1].rows == std::vector<int>{0});
+  REQUIRE(any.calls().size() == 2);
+  CHECK(any.calls()[0].steps == 2);
+  CHECK(any.calls()[1].rows == std::vector<int>{0});
   const Batch padded(plans, {.frames = 5});
   REQUIRE(padded.rows().size() == 2);
-  CHECK(padded.rows()[0].actions == ActionSequence{F, F});
-  CHECK(padded.parts()[0].actions[1] == ActionSequence{F, L, F, F});
+  CHECK(padded.rows()[0].actions == action::ActionSequence{F, F});
+  CHECK(padded.calls()[0].actions[1] == action::ActionSequence{F, L, F, F});
 }
 
 TEST_CASE("long plans are rolled out in calls, and a first call that is the same is made once") {
-  const Batch batch({{{F, F, F, L, L}, {F, F, F, R}}}, {.frames = 4, .padding = Padding::kNull});
-  REQUIRE(batch.parts().size() == 2);
-  CHECK(batch.parts()[0].rows == std::vector<int>{0});
-  const Part& second = batch.parts()[1];
+  const Batch batch({{{F, F, F, L, L}, {F, F, F, R}}}, {.frames = 4, .padding = action::Padding::kNull});
+  REQUIRE(batch.calls().size() == 2);
+  CHECK(batch.calls()[0].rows == std::vector<int>{0});
+  const ModelCall& second = batch.calls()[1];
   CHECK(second.rows == std::vector<int>{0, 1});
   CHECK(second.first == 3);
   CHECK(second.start == std::vector<Source>{{0, 3}, {0, 3}});
-  CHECK(second.actions[1] == ActionSequence{R, kNull, kNull});
+  CHECK(second.actions[1] == action::ActionSequence{R, kNull, kNull});
   CHECK(batch.sources(1) == std::vector<Source>{{0, 1}, {0, 2}, {0, 3}, {1, 4}});
-  const Batch::Place place = batch.place({1, 4});
-  CHECK(place.part == 1);
+  const Batch::FrameAddress place = batch.place({1, 4});
+  CHECK(place.call == 1);
   CHECK(place.index == 1);
   CHECK(place.frame == 1);
 }
 
 TEST_CASE("calls are no larger than asked") {
   const Batch batch({{{F, L}, {F, R}, {F, F}}, {{F}}}, {.causal = true, .max_rows = 2});
-  REQUIRE(batch.parts().size() == 2);
-  CHECK(batch.parts()[0].rows == std::vector<int>{0, 1});
-  CHECK(batch.parts()[1].rows == std::vector<int>{2, 3});
-  CHECK(batch.parts()[1].shared == std::vector<int>{0, 0});  // the row it shares with is in another call
+  REQUIRE(batch.calls().size() == 2);
+  CHECK(batch.calls()[0].rows == std::vector<int>{0, 1});
+  CHECK(batch.calls()[1].rows == std::vector<int>{2, 3});
+  CHECK(batch.calls()[1].shared == std::vector<int>{0, 0});  // the row it shares with is in another call
 }
 
 TEST_CASE("impossible models are refused") {
   CHECK_THROWS_AS(Batch({}, {.frames = 1}), ArgumentError);
   CHECK_THROWS_AS(Batch({}, {.max_rows = -1}), ArgumentError);
-  CHECK(Batch({}, {}).parts().empty());
+  CHECK(Batch({}, {}).calls().empty());
 }

@@ -8,6 +8,7 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::planner;
 
 namespace {
 std::vector<std::uint8_t> ramp(Size size) {

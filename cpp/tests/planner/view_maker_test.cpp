@@ -6,6 +6,7 @@
 #include "wiw/core/error.hpp"
 
 using namespace wiw;
+using namespace wiw::planner;
 
 namespace {
 constexpr Size kPanorama{.height = 32, .width = 64};

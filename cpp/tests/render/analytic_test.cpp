@@ -8,6 +8,7 @@
 #include "wiw/render/shading.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -46,7 +47,7 @@ Exit leave_room(const Eigen::Vector3d& origin, const Eigen::Vector3d& ray) {
 }  // namespace
 
 TEST_CASE("a box room: depth to a tenth of a millimetre, ids exact away from edges, in every projection and set") {
-  const ScenePtr room = make_room(kLow.cast<float>(), kHigh.cast<float>());
+  const scene::ScenePtr room = make_room(kLow.cast<float>(), kHigh.cast<float>());
   for (const Isa isa : {Isa::kScalar, Isa::kAvx2, Isa::kAvx512}) {
     if (isa > native_isa()) continue;
     const auto renderer = make_cpu_renderer(room, {}, isa);
@@ -74,7 +75,7 @@ TEST_CASE("plain white walls show the ambient light of the side that faces the v
   const Eigen::Vector3f normals[] = {{1, 0, 0}, {-1, 0, 0}, {0, 1, 0}, {0, -1, 0}, {0, 0, 1}, {0, 0, -1}};
   for (std::size_t i = 0; i < camera.size.pixels(); ++i) {
     const Eigen::Vector3f& n = normals[picture.instance[i] - 1];
-    const auto light = std::lround(255 * shading::ambient_light(n.x(), n.y(), n.z()));
+    const auto light = std::lround(255 * render::shading::ambient_light(n.x(), n.y(), n.z()));
     for (std::size_t c = 0; c < 3; ++c) REQUIRE(picture.color[3 * i + c] == light);
   }
 }

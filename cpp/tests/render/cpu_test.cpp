@@ -10,6 +10,7 @@
 #include "wiw/render/cpu/cpu_renderer.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -25,7 +26,7 @@ bool identical(const Picture& a, const Picture& b) {
 }  // namespace
 
 TEST_CASE("instruction sets agree: colour to a level, depth to 1e-6, ids but for silhouettes") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   for (const Camera& camera : {kView, kPanorama}) {
     const Picture scalar = draw(*make_cpu_renderer(scene, {}, Isa::kScalar), kPose, camera);
     for (const Isa isa : {Isa::kAvx2, Isa::kAvx512}) {
@@ -46,7 +47,7 @@ TEST_CASE("instruction sets agree: colour to a level, depth to 1e-6, ids but for
 }
 
 TEST_CASE("a panorama's pixels equal a perspective's along the same rays") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   const auto renderer = make_cpu_renderer(scene, {});
   const Picture panorama = draw(*renderer, kPose, kPanorama);
   // One view of one pixel along each ray, as wide as the panorama's pixel, so that filtering is the same as well.
@@ -83,9 +84,9 @@ TEST_CASE("a panorama's pixels equal a perspective's along the same rays") {
 
 TEST_CASE("distant checks melt into their mean instead of aliasing") {
   SceneBuilder builder;
-  Material material;
+  scene::Material material;
   material.texture = builder.add_texture({256, 256}, checkerboard(256, 8));
-  Mesh floor = make_quad({-60, 0, 60}, {120, 0, 0}, {0, 0, -120}, 60.f);
+  scene::Mesh floor = make_quad({-60, 0, 60}, {120, 0, 0}, {0, 0, -120}, 60.f);
   floor.material = builder.add_material(material);
   builder.add_instance(floor);
   builder.scene.materials[0].emissive = true;
@@ -118,7 +119,7 @@ TEST_CASE("distant checks melt into their mean instead of aliasing") {
 }
 
 TEST_CASE("several samples a pixel approach the mean over the pixel; depth and ids stay the centre's") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   constexpr int kFine = 8;
   const Camera camera{Projection::kPerspective, {60, 80}, radians(90)};
   const Camera fine{Projection::kPerspective, {60 * kFine, 80 * kFine}, radians(90)};
@@ -145,8 +146,8 @@ TEST_CASE("several samples a pixel approach the mean over the pixel; depth and i
 }
 
 TEST_CASE("moved instances look as in a scene built that way, and back again") {
-  const ScenePtr scene = make_furnished();
-  Scene changed = *scene;
+  const scene::ScenePtr scene = make_furnished();
+  scene::Scene changed = *scene;
   const std::vector<std::uint32_t> ids{5, kFurnishedSphere, 8, 9};
   std::vector<Eigen::Affine3f> poses;
   for (const std::uint32_t id : ids) {
@@ -157,7 +158,7 @@ TEST_CASE("moved instances look as in a scene built that way, and back again") {
     poses.push_back(pose);
   }
   const auto renderer = make_cpu_renderer(scene, {});
-  const auto rebuilt = make_cpu_renderer(std::make_shared<const Scene>(changed), {});
+  const auto rebuilt = make_cpu_renderer(std::make_shared<const scene::Scene>(changed), {});
   for (const Camera& camera : {kView, kPanorama}) {
     const Picture before = draw(*renderer, kPose, camera);
     const Picture wanted = draw(*rebuilt, kPose, camera);
@@ -199,9 +200,9 @@ TEST_CASE("a batch equals its views one by one, subsets equal the whole, and not
 
 TEST_CASE("texture coordinates that are not numbers, and triangles without area, are survived") {
   SceneBuilder builder;
-  Material material;
+  scene::Material material;
   material.texture = builder.add_texture({8, 8}, checkerboard(8, 2));
-  Mesh quad = make_quad({-1, -1, -2}, {2, 0, 0}, {0, 2, 0});
+  scene::Mesh quad = make_quad({-1, -1, -2}, {2, 0, 0}, {0, 2, 0});
   std::vector<Eigen::Vector2f> uv(quad.uv.begin(), quad.uv.end());
   uv[0].x() = std::numeric_limits<float>::quiet_NaN();
   uv[1].y() = std::numeric_limits<float>::infinity();
@@ -209,7 +210,7 @@ TEST_CASE("texture coordinates that are not numbers, and triangles without area,
   quad.uv = uv;
   quad.material = builder.add_material(material);
   builder.add_instance(quad);
-  Mesh flat = make_quad({0, 0, -1}, {1, 0, 0}, {2, 0, 0});
+  scene::Mesh flat = make_quad({0, 0, -1}, {1, 0, 0}, {2, 0, 0});
   flat.material = quad.material;
   builder.add_instance(flat);
   for (const Isa isa : {Isa::kScalar, Isa::kAvx2, Isa::kAvx512}) {
@@ -220,7 +221,7 @@ TEST_CASE("texture coordinates that are not numbers, and triangles without area,
 }
 
 TEST_CASE("what cannot be drawn is refused with a typed error") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   const auto renderer = make_cpu_renderer(scene, {});
   std::vector<float> depth(kView.size.pixels());
   const auto render = [&](const Pose& pose, const Camera& camera) {

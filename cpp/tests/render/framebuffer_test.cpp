@@ -7,7 +7,8 @@
 #include <utility>
 
 using namespace wiw;
-using namespace wiw::gpu;
+using namespace wiw::render;
+using namespace wiw::render::gpu;
 
 namespace {
 

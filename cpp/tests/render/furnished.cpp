@@ -26,14 +26,14 @@ std::vector<std::uint8_t> blobs(Size size, std::uint8_t alpha_outside) {
   return rgba;
 }
 
-Mesh with(Mesh mesh, std::int32_t material, std::int32_t lightmap = kNone) {
+scene::Mesh with(scene::Mesh mesh, std::int32_t material, std::int32_t lightmap = scene::kNone) {
   mesh.material = material;
   mesh.lightmap = lightmap;
   return mesh;
 }
 
-Mesh colored_box() {
-  Mesh mesh = make_box({-0.3f, 0.f, -0.3f}, {0.3f, 0.7f, 0.3f});
+scene::Mesh colored_box() {
+  scene::Mesh mesh = make_box({-0.3f, 0.f, -0.3f}, {0.3f, 0.7f, 0.3f});
   std::vector<Eigen::Matrix<std::uint8_t, 4, 1>> colors;
   for (std::size_t i = 0; i < mesh.positions.size(); ++i) {
     colors.emplace_back(static_cast<std::uint8_t>(60 + 40 * (i % 4)), static_cast<std::uint8_t>(250 - 9 * i),
@@ -45,7 +45,7 @@ Mesh colored_box() {
 
 }  // namespace
 
-ScenePtr make_furnished() {
+scene::ScenePtr make_furnished() {
   SceneBuilder builder;
   const std::int32_t smooth = builder.add_texture({48, 65}, blobs({48, 65}, 255));
   const std::int32_t checks = builder.add_texture({128, 128}, checkerboard(128, 16));
@@ -71,12 +71,12 @@ ScenePtr make_furnished() {
   return builder.build();
 }
 
-ScenePtr make_sunny() {
-  Scene scene = *make_furnished();
+scene::ScenePtr make_sunny() {
+  scene::Scene scene = *make_furnished();
   scene.sun = {Eigen::Vector3f(0.48f, 0.8f, 0.36f), 0.7f, 0.5f};
   // The floor's light is the sun's as well, or it would show no shadows.
-  scene.meshes[0].lightmap = kNone;
-  return std::make_shared<const Scene>(scene);
+  scene.meshes[0].lightmap = scene::kNone;
+  return std::make_shared<const scene::Scene>(scene);
 }
 
 }  // namespace wiw::testing

@@ -7,11 +7,11 @@ namespace wiw::testing {
 
 /// A room without a ceiling that has one of every kind of surface: textured floor and walls, a lightmap, a smooth
 /// sphere, a box with vertex colours, an emissive panel, a cutout screen, a mesh of many chunks, a scaled placement.
-ScenePtr make_furnished();
+scene::ScenePtr make_furnished();
 
 constexpr std::uint32_t kFurnishedSphere = 6;
 
 /// The same under a sun that reaches the floor over the open ceiling.
-ScenePtr make_sunny();
+scene::ScenePtr make_sunny();
 
 }  // namespace wiw::testing

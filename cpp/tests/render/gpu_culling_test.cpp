@@ -11,7 +11,8 @@
 #include "wiw/render/gpu/frustum.hpp"
 
 using namespace wiw;
-using namespace wiw::gpu;
+using namespace wiw::render;
+using namespace wiw::render::gpu;
 using namespace wiw::testing;
 
 namespace {
@@ -22,7 +23,7 @@ Eigen::Vector3f random_point(Rng& rng, double reach) {
 }
 
 /// Whether the view's own projection puts a point into the picture.
-bool in_picture(const View& view, const Eigen::Vector3f& point) {
+bool in_picture(const ViewBlock& view, const Eigen::Vector3f& point) {
   const Eigen::Vector3f offset = point - view.eye.head<3>();
   const float depth = -view.back.head<3>().dot(offset);
   const float x = view.projection[0] * view.right.head<3>().dot(offset) - depth * view.projection[2];
@@ -36,8 +37,8 @@ TEST_CASE("chunks hold every triangle of a mesh once, are small, and their boxes
   SceneBuilder builder;
   builder.add_instance(make_sphere(1.f, 120));
   builder.add_instance(make_box({0, 0, 0}, {1, 2, 3}));
-  const ScenePtr scene = builder.build();
-  const Geometry geometry = build_geometry(*scene);
+  const scene::ScenePtr scene = builder.build();
+  const SceneGeometry geometry = build_geometry(*scene);
   REQUIRE(geometry.meshes.size() == 2);
   CHECK(geometry.meshes[0].chunk_count > 5);
   CHECK(geometry.meshes[1].chunk_count == 1);
@@ -45,7 +46,7 @@ TEST_CASE("chunks hold every triangle of a mesh once, are small, and their boxes
   for (std::size_t m = 0; m < 2; ++m) {
     std::vector<std::array<std::uint32_t, 3>> found;
     for (std::size_t k = 0; k < geometry.meshes[m].chunk_count; ++k) {
-      const Chunk& chunk = geometry.chunks[geometry.meshes[m].first_chunk + k];
+      const MeshChunk& chunk = geometry.chunks[geometry.meshes[m].first_chunk + k];
       CHECK(chunk.index_count <= 3 * kChunkTriangles);
       CHECK(geometry.meshes[m].box.contains(chunk.box));
       for (std::size_t i = chunk.first_index; i < chunk.first_index + chunk.index_count; i += 3) {
@@ -74,8 +75,8 @@ TEST_CASE("culling keeps every box with a point in the picture and drops most ot
   for (int i = 0; i < kTrials; ++i) {
     const Pose pose = look(random_point(rng, 3).cast<double>(), rng.uniform(-3, 3), rng.uniform(-1, 1));
     const Camera camera{Projection::kPerspective, {20, 30}, rng.uniform(0.5, 2.0)};
-    const View view = i % 2 == 0 ? perspective_view(pose, camera, Eigen::Vector2f(0.4f, -0.4f), 4)
-                                 : face_view(pose, i % kFaces, {64, 128}, 1);
+    const ViewBlock view = i % 2 == 0 ? perspective_view(pose, camera, Eigen::Vector2f(0.4f, -0.4f), 4)
+                                      : face_view(pose, i % kFaces, {64, 128}, 1);
     const Eigen::Affine3f placed = Eigen::Translation3f(random_point(rng, 2)) *
                                    Eigen::AngleAxisf(1.f, random_point(rng, 1).normalized()) *
                                    Eigen::Scaling(0.5f, 1.f, 2.f);
@@ -98,10 +99,10 @@ TEST_CASE("culling keeps every box with a point in the picture and drops most ot
 }
 
 TEST_CASE("draws come near before far, cutouts last") {
-  const ScenePtr scene = make_furnished();
-  const Geometry geometry = build_geometry(*scene);
+  const scene::ScenePtr scene = make_furnished();
+  const SceneGeometry geometry = build_geometry(*scene);
   std::vector<Eigen::Affine3f> poses;
-  for (const Instance& instance : scene->instances) poses.push_back(instance.T_world_instance);
+  for (const scene::Instance& instance : scene->instances) poses.push_back(instance.T_world_instance);
   DrawList list;
   list.gather(face_view(look({0, 1, 6}, 0, 0), 0, {64, 128}, 1), *scene, geometry.meshes, geometry.chunks, poses);
   REQUIRE(list.draws().size() > 8);

@@ -10,6 +10,7 @@
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -20,7 +21,7 @@ const Pose kAway = look({1.5, 0.8, 1.0}, 2.5, 0.3);
 
 bool available() {
   try {
-    gpu::GlContext::shared();
+    render::gpu::GlContext::shared();
     return true;
   } catch (const BackendError& error) {
     MESSAGE("skipped: " << error.what());
@@ -31,7 +32,7 @@ bool available() {
 /// For its life, the shared context's driver has no memory for more than so many layers, as one that is nearly full.
 class NearlyFull {
  public:
-  explicit NearlyFull(int layers) : gl_(const_cast<gpu::Gl&>(context_->gl())), before_(gl_) {
+  explicit NearlyFull(int layers) : gl_(const_cast<render::gpu::Gl&>(context_->gl())), before_(gl_) {
     real_ = before_;
     most_ = layers;
     gl_.TexImage3D = [](GLenum target, GLint level, GLint internal, GLsizei width, GLsizei height, GLsizei count,
@@ -52,12 +53,12 @@ class NearlyFull {
   NearlyFull& operator=(const NearlyFull&) = delete;
 
  private:
-  static inline gpu::Gl real_;
+  static inline render::gpu::Gl real_;
   static inline int most_ = 0;
   static inline GLenum error_ = GL_NO_ERROR;
-  std::shared_ptr<gpu::GlContext> context_ = gpu::GlContext::shared();
-  gpu::Gl& gl_;
-  gpu::Gl before_;
+  std::shared_ptr<render::gpu::GlContext> context_ = render::gpu::GlContext::shared();
+  render::gpu::Gl& gl_;
+  render::gpu::Gl before_;
 };
 
 }  // namespace

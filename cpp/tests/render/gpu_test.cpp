@@ -15,6 +15,7 @@
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -24,7 +25,7 @@ const Camera kPanorama{Projection::kEquirectangular, {144, 256}, 0.0};
 const std::vector<Pose> kPoses{look({0, 1.2, 0}, 0.4, 0.0), look({-1.2, 1.6, 1.4}, -0.8, -0.4),
                                look({1.5, 0.8, 1.0}, 2.5, 0.3)};
 
-std::shared_ptr<Renderer> gpu(const ScenePtr& scene, int samples = 1) {
+std::shared_ptr<Renderer> gpu(const scene::ScenePtr& scene, int samples = 1) {
   return make_gpu_renderer(scene, {.samples = samples});
 }
 
@@ -125,7 +126,7 @@ TEST_CASE("gpu: depth and ids of a box room are exact in both projections") {
 
 TEST_CASE("gpu: pictures agree with the ray caster's") {
   if (!available()) return;
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   for (const int samples : {1, 4}) {
     const auto renderer = gpu(scene, samples);
     const auto reference = make_cpu_renderer(scene, {.samples = samples});
@@ -205,10 +206,10 @@ TEST_CASE("gpu: moved instances are drawn where a scene built that way has them"
   const auto renderer = gpu(make_furnished());
   const Picture before = draw(*renderer, kPoses[0], kView);
   renderer->set_poses(std::span(&id, 1), std::span(&moved, 1));
-  Scene rebuilt = *make_furnished();
+  scene::Scene rebuilt = *make_furnished();
   rebuilt.instances[id - 1].T_world_instance = moved;
   const Picture after = draw(*renderer, kPoses[0], kView);
-  CHECK(equal(after, draw(*gpu(std::make_shared<const Scene>(rebuilt)), kPoses[0], kView)));
+  CHECK(equal(after, draw(*gpu(std::make_shared<const scene::Scene>(rebuilt)), kPoses[0], kView)));
   CHECK_FALSE(equal(after, before));
 
   const std::uint32_t unknown = 999;

@@ -15,8 +15,8 @@ namespace {
 using Vector = Eigen::Vector3d;
 
 template <class T, int N>
-Eigen::Matrix<double, N, 1> blend(const Buffer<Eigen::Matrix<T, N, 1>>& values, const Mesh& mesh, std::size_t triangle,
-                                  double b1, double b2) {
+Eigen::Matrix<double, N, 1> blend(const Buffer<Eigen::Matrix<T, N, 1>>& values, const scene::Mesh& mesh,
+                                  std::size_t triangle, double b1, double b2) {
   const auto& corner = mesh.triangles[triangle];
   return (1 - b1 - b2) * values[corner[0]].template cast<double>() + b1 * values[corner[1]].template cast<double>() +
          b2 * values[corner[2]].template cast<double>();
@@ -32,9 +32,9 @@ int wrap(int i, int size, bool repeat) { return repeat ? ((i % size) + size) % s
 
 }  // namespace
 
-Reference::Reference(const Scene& scene) : scene_(scene) {
-  for (const Texture& texture : scene.textures) mips_.push_back(build_mips(texture));
-  for (const Instance& instance : scene.instances) {
+Reference::Reference(const scene::Scene& scene) : scene_(scene) {
+  for (const scene::Texture& texture : scene.textures) mips_.push_back(render::build_mips(texture));
+  for (const scene::Instance& instance : scene.instances) {
     Eigen::AlignedBox3d box;
     for (const std::uint32_t mesh : instance.meshes) {
       for (const auto& position : scene.meshes[mesh].positions) {
@@ -50,10 +50,10 @@ Reference::Reference(const Scene& scene) : scene_(scene) {
 std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vector& ray, double slack,
                                                 double nearest) const {
   std::vector<Hit> hits;
-  for (const Instance& instance : scene_.instances) {
+  for (const scene::Instance& instance : scene_.instances) {
     if (!meets(bounds_[instance.id - 1], origin, ray)) continue;
     for (const std::uint32_t index : instance.meshes) {
-      const Mesh& mesh = scene_.meshes[index];
+      const scene::Mesh& mesh = scene_.meshes[index];
       for (std::size_t i = 0; i < mesh.triangles.size(); ++i) {
         const auto corner = [&](int k) -> Vector {
           return (instance.T_world_instance * mesh.positions[mesh.triangles[i][k]]).cast<double>();
@@ -76,7 +76,7 @@ std::vector<Reference::Hit> Reference::all_hits(const Vector& origin, const Vect
 
 Eigen::Vector4d Reference::bilinear(std::int32_t number, int level, const Eigen::Vector2d& uv, bool repeat) const {
   const auto index = static_cast<std::size_t>(number);
-  const Texture& texture = scene_.textures[index];
+  const scene::Texture& texture = scene_.textures[index];
   const Size size = level == 0 ? texture.size : mips_[index][static_cast<std::size_t>(level) - 1].size;
   const std::uint8_t* texels =
       level == 0 ? texture.rgba.data() : mips_[index][static_cast<std::size_t>(level) - 1].rgba.data();
@@ -98,11 +98,11 @@ Eigen::Vector4d Reference::bilinear(std::int32_t number, int level, const Eigen:
 }
 
 bool Reference::is_hole(const Hit& hit, bool& doubtful) const {
-  if (hit.mesh->material == kNone) return false;
-  const Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
+  if (hit.mesh->material == scene::kNone) return false;
+  const scene::Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
   if (material.alpha_cutoff < 0) return false;
   double alpha = material.base_color[3];
-  if (material.texture != kNone && !hit.mesh->uv.empty()) {
+  if (material.texture != scene::kNone && !hit.mesh->uv.empty()) {
     alpha *= bilinear(material.texture, 0, blend(hit.mesh->uv, *hit.mesh, hit.triangle, hit.b1, hit.b2), true)[3];
   }
   doubtful = doubtful || std::abs(alpha - material.alpha_cutoff) < 1e-3;
@@ -110,7 +110,7 @@ bool Reference::is_hole(const Hit& hit, bool& doubtful) const {
 }
 
 double Reference::level(const Hit& hit, const Vector& ray, double spread) const {
-  const Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
+  const scene::Material& material = scene_.materials[static_cast<std::size_t>(hit.mesh->material)];
   const Size size = scene_.textures[static_cast<std::size_t>(material.texture)].size;
   const auto& corner = hit.mesh->triangles[hit.triangle];
   Eigen::Matrix2d texels;
@@ -168,29 +168,31 @@ double Reference::light(const Hit& hit, const Vector& ray, bool& doubtful) const
         corners[k] = hit.instance->T_world_instance * hit.mesh->positions[vertex];
         normals[k] = turned[vertex];
       }
-      lift = shading::shadow_lift(static_cast<double>(triangle_bulge(corners, normals)), hit.b1, hit.b2);
+      lift =
+          render::shading::shadow_lift(static_cast<double>(render::triangle_bulge(corners, normals)), hit.b1, hit.b2);
     }
   }
-  const double ambient = shading::ambient_light(normal.x(), normal.y(), normal.z());
+  const double ambient = render::shading::ambient_light(normal.x(), normal.y(), normal.z());
   if (!scene_.sun) return ambient;
-  const Sun& sun = *scene_.sun;
+  const scene::Sun& sun = *scene_.sun;
   const Vector direction = sun.direction.cast<double>();
   const double cosine = normal.dot(direction);
   double visibility = 0;
   if (cosine > 0) {
     const Vector sunward = geometric.dot(direction) < 0 ? -geometric : geometric;
-    const Vector start = hit.point + lift * normal + shading::shadow_offset(hit.t) * sunward;
+    const Vector start = hit.point + lift * normal + render::shading::shadow_offset(hit.t) * sunward;
     visibility = sees_sun(start, direction, doubtful) ? 1 : 0;
   }
-  return shading::sun_light(ambient, cosine, visibility, sun.ambient, sun.strength);
+  return render::shading::sun_light(ambient, cosine, visibility, sun.ambient, sun.strength);
 }
 
 Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& doubtful) const {
-  static const Material plain;
-  const Mesh& mesh = *hit.mesh;
-  const Material& material = mesh.material == kNone ? plain : scene_.materials[static_cast<std::size_t>(mesh.material)];
+  static const scene::Material plain;
+  const scene::Mesh& mesh = *hit.mesh;
+  const scene::Material& material =
+      mesh.material == scene::kNone ? plain : scene_.materials[static_cast<std::size_t>(mesh.material)];
   Vector color = material.base_color.head<3>().cast<double>();
-  if (material.texture != kNone && !mesh.uv.empty()) {
+  if (material.texture != scene::kNone && !mesh.uv.empty()) {
     const auto last = static_cast<double>(mips_[static_cast<std::size_t>(material.texture)].size());
     const double lod = std::clamp(level(hit, ray, spread), 0.0, last);
     const Eigen::Vector2d uv = blend(mesh.uv, mesh, hit.triangle, hit.b1, hit.b2);
@@ -204,7 +206,7 @@ Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& 
     color = color.cwiseProduct(blend(mesh.colors, mesh, hit.triangle, hit.b1, hit.b2).head<3>()) / 255.0;
   }
   if (!material.emissive) {
-    if (mesh.lightmap != kNone) {
+    if (mesh.lightmap != scene::kNone) {
       const Eigen::Vector2d uv = blend(mesh.lightmap_uv, mesh, hit.triangle, hit.b1, hit.b2);
       color = 2.0 * color.cwiseProduct(bilinear(mesh.lightmap, 0, uv, false).head<3>());
     } else {
@@ -217,10 +219,10 @@ Vector Reference::shade(const Hit& hit, const Vector& ray, double spread, bool& 
 Reference::Sample Reference::cast(const Vector& origin, const Vector& ray, double spread) const {
   constexpr double kSlack = 1e-4;
   Sample sample;
-  const double zenith = shading::sky_weight(ray.normalized().y());
+  const double zenith = render::shading::sky_weight(ray.normalized().y());
   sample.color = 255.0 * (zenith * scene_.sky.zenith + (1 - zenith) * scene_.sky.horizon).cast<double>();
   double nearest = -1;
-  for (const Hit& hit : all_hits(origin, ray, kSlack, shading::kNearClip)) {
+  for (const Hit& hit : all_hits(origin, ray, kSlack, render::shading::kNearClip)) {
     const bool first = nearest < 0;
     if (!first && hit.t > nearest + 1e-3) break;
     const double least = std::min({hit.b1, hit.b2, 1 - hit.b1 - hit.b2});

@@ -11,7 +11,7 @@ namespace wiw::testing {
 /// Slow twin of the renderer: every ray against every triangle, in double precision, shaded by the documented formulas.
 class Reference {
  public:
-  explicit Reference(const Scene& scene);
+  explicit Reference(const scene::Scene& scene);
 
   struct Sample {
     double depth = 0;
@@ -24,8 +24,8 @@ class Reference {
 
  private:
   struct Hit {
-    const Mesh* mesh = nullptr;
-    const Instance* instance = nullptr;
+    const scene::Mesh* mesh = nullptr;
+    const scene::Instance* instance = nullptr;
     std::size_t triangle = 0;
     double t = 0, b1 = 0, b2 = 0;
     Eigen::Vector3d point, edge_1, edge_2;
@@ -39,9 +39,9 @@ class Reference {
   [[nodiscard]] bool sees_sun(const Eigen::Vector3d& point, const Eigen::Vector3d& direction, bool& doubtful) const;
   [[nodiscard]] Eigen::Vector4d bilinear(std::int32_t texture, int level, const Eigen::Vector2d& uv, bool repeat) const;
 
-  const Scene& scene_;
-  std::vector<std::vector<MipLevel>> mips_;  // by texture
-  std::vector<Eigen::AlignedBox3d> bounds_;  // by instance, in the world
+  const scene::Scene& scene_;
+  std::vector<std::vector<render::MipLevel>> mips_;  // by texture
+  std::vector<Eigen::AlignedBox3d> bounds_;          // by instance, in the world
 };
 
 }  // namespace wiw::testing

@@ -10,6 +10,7 @@
 #include "wiw/render/cpu/cpu_renderer.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -49,7 +50,7 @@ double compare(const Picture& picture, const std::vector<Reference::Sample>& tru
   return static_cast<double>(compared) / static_cast<double>(truth.size());
 }
 
-void check_all_sets(const ScenePtr& scene, const Reference& reference, const Pose& pose, const Camera& camera) {
+void check_all_sets(const scene::ScenePtr& scene, const Reference& reference, const Pose& pose, const Camera& camera) {
   const auto truth = truth_of(reference, pose, camera);
   for (const Isa isa : {Isa::kScalar, Isa::kAvx2, Isa::kAvx512}) {
     if (isa > native_isa()) continue;
@@ -60,7 +61,7 @@ void check_all_sets(const ScenePtr& scene, const Reference& reference, const Pos
 }  // namespace
 
 TEST_CASE("every kind of surface is shaded as the slow twin shades it, with every instruction set") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   const Reference reference(*scene);
   for (const Camera& camera : kCameras) {
     for (const Pose& pose : {look({0, 1.2, 0}, 0.4, 0.0), look({0.6, 1.0, 0.4}, 3.3, -0.5)}) {
@@ -71,18 +72,18 @@ TEST_CASE("every kind of surface is shaded as the slow twin shades it, with ever
 
 TEST_CASE("light and shadows of a sun are those of the slow twin, from high, and grazing") {
   for (const Eigen::Vector3f& direction : {Eigen::Vector3f(0.48f, 0.8f, 0.36f), Eigen::Vector3f(0.8f, 0.08f, 0.6f)}) {
-    Scene changed = *make_sunny();
+    scene::Scene changed = *make_sunny();
     changed.sun->direction = direction.normalized();
-    const auto scene = std::make_shared<const Scene>(changed);
+    const auto scene = std::make_shared<const scene::Scene>(changed);
     const Reference reference(*scene);
     for (const Camera& camera : kCameras) check_all_sets(scene, reference, look({0, 1.2, 0}, 0.4, -0.2), camera);
   }
 }
 
 TEST_CASE("a stamp of every kind of surface, small enough for an emulated processor") {
-  const ScenePtr scene = make_furnished();
+  const scene::ScenePtr scene = make_furnished();
   const Camera camera{Projection::kPerspective, {9, 14}, 1.7};
   check_all_sets(scene, Reference(*scene), look({0, 1.2, 0}, 0.4, 0.0), camera);
-  const ScenePtr sunny = make_sunny();
+  const scene::ScenePtr sunny = make_sunny();
   check_all_sets(sunny, Reference(*sunny), look({0, 1.2, 0}, 0.4, 0.0), camera);
 }

@@ -15,13 +15,13 @@ std::int32_t SceneBuilder::add_texture(Size size, const std::vector<std::uint8_t
   return static_cast<std::int32_t>(scene.textures.size()) - 1;
 }
 
-std::int32_t SceneBuilder::add_material(const Material& material) {
+std::int32_t SceneBuilder::add_material(const scene::Material& material) {
   scene.materials.push_back(material);
   return static_cast<std::int32_t>(scene.materials.size()) - 1;
 }
 
-std::uint32_t SceneBuilder::add_instance(Mesh mesh, const Eigen::Affine3f& T_world_instance) {
-  Instance instance;
+std::uint32_t SceneBuilder::add_instance(scene::Mesh mesh, const Eigen::Affine3f& T_world_instance) {
+  scene::Instance instance;
   instance.id = static_cast<std::uint32_t>(scene.instances.size()) + 1;
   instance.name = "instance " + std::to_string(instance.id);
   instance.meshes = {static_cast<std::uint32_t>(scene.meshes.size())};
@@ -31,7 +31,7 @@ std::uint32_t SceneBuilder::add_instance(Mesh mesh, const Eigen::Affine3f& T_wor
   return instance.id;
 }
 
-ScenePtr SceneBuilder::build() const { return std::make_shared<const Scene>(scene); }
+scene::ScenePtr SceneBuilder::build() const { return std::make_shared<const scene::Scene>(scene); }
 
 namespace {
 
@@ -53,10 +53,10 @@ struct Quads {
 
 }  // namespace
 
-Mesh make_quad(const Vector& corner, const Vector& across, const Vector& along, float repeats) {
+scene::Mesh make_quad(const Vector& corner, const Vector& across, const Vector& along, float repeats) {
   Quads quads;
   quads.add(corner, across, along);
-  Mesh mesh;
+  scene::Mesh mesh;
   mesh.positions = quads.positions;
   mesh.lightmap_uv = quads.uv;
   for (auto& uv : quads.uv) uv *= repeats;
@@ -65,7 +65,7 @@ Mesh make_quad(const Vector& corner, const Vector& across, const Vector& along, 
   return mesh;
 }
 
-Mesh make_box(const Vector& low, const Vector& high) {
+scene::Mesh make_box(const Vector& low, const Vector& high) {
   const Vector x((high - low).x(), 0, 0);
   const Vector y(0, (high - low).y(), 0);
   const Vector z(0, 0, (high - low).z());
@@ -76,14 +76,14 @@ Mesh make_box(const Vector& low, const Vector& high) {
   quads.add(low + y, x, z);
   quads.add(low, x, y);
   quads.add(low + z, y, x);
-  Mesh mesh;
+  scene::Mesh mesh;
   mesh.positions = quads.positions;
   mesh.uv = quads.uv;
   mesh.triangles = quads.triangles;
   return mesh;
 }
 
-Mesh make_sphere(float radius, int rings) {
+scene::Mesh make_sphere(float radius, int rings) {
   std::vector<Vector> normals;
   std::vector<Triangle> triangles;
   const int columns = 2 * rings;
@@ -101,7 +101,7 @@ Mesh make_sphere(float radius, int rings) {
       if (i + 1 < rings) triangles.emplace_back(a + 1, below, below + 1);
     }
   }
-  Mesh mesh;
+  scene::Mesh mesh;
   std::vector<Vector> positions = normals;
   for (auto& position : positions) position *= radius;
   mesh.positions = positions;
@@ -110,7 +110,7 @@ Mesh make_sphere(float radius, int rings) {
   return mesh;
 }
 
-ScenePtr make_room(const Vector& low, const Vector& high) {
+scene::ScenePtr make_room(const Vector& low, const Vector& high) {
   const Vector x((high - low).x(), 0, 0);
   const Vector y(0, (high - low).y(), 0);
   const Vector z(0, 0, (high - low).z());
@@ -135,7 +135,7 @@ std::vector<std::uint8_t> checkerboard(int side, int cells) {
   return rgba;
 }
 
-Picture draw(Renderer& renderer, const Pose& T_world_camera, const Camera& camera) {
+Picture draw(render::Renderer& renderer, const Pose& T_world_camera, const render::Camera& camera) {
   Picture picture;
   picture.size = camera.size;
   picture.color.assign(3 * camera.size.pixels(), 7);
@@ -146,9 +146,9 @@ Picture draw(Renderer& renderer, const Pose& T_world_camera, const Camera& camer
   return picture;
 }
 
-Eigen::Vector3d pixel_ray(const Pose& T_world_camera, const Camera& camera, double x, double y) {
+Eigen::Vector3d pixel_ray(const Pose& T_world_camera, const render::Camera& camera, double x, double y) {
   Eigen::Vector3d ray;
-  if (camera.projection == Projection::kPerspective) {
+  if (camera.projection == render::Projection::kPerspective) {
     const double f = Intrinsics{camera.size, camera.hfov}.focal();
     ray = {(x + 0.5 - camera.size.width / 2.0) / f, -(y + 0.5 - camera.size.height / 2.0) / f, -1.0};
   } else {

@@ -14,27 +14,27 @@ class SceneBuilder {
  public:
   SceneBuilder();
   std::int32_t add_texture(Size size, const std::vector<std::uint8_t>& rgba);
-  std::int32_t add_material(const Material& material);
-  std::uint32_t add_instance(Mesh mesh, const Eigen::Affine3f& T_world_instance = Eigen::Affine3f::Identity());
-  [[nodiscard]] ScenePtr build() const;
+  std::int32_t add_material(const scene::Material& material);
+  std::uint32_t add_instance(scene::Mesh mesh, const Eigen::Affine3f& T_world_instance = Eigen::Affine3f::Identity());
+  [[nodiscard]] scene::ScenePtr build() const;
 
-  Scene scene;
+  scene::Scene scene;
 };
 
 /// Rectangle corner + s * across + t * along with uv = (s, t) * repeats, and the same uv in [0, 1] for a lightmap.
-Mesh make_quad(const Eigen::Vector3f& corner, const Eigen::Vector3f& across, const Eigen::Vector3f& along,
-               float repeats = 1.f);
+scene::Mesh make_quad(const Eigen::Vector3f& corner, const Eigen::Vector3f& across, const Eigen::Vector3f& along,
+                      float repeats = 1.f);
 
 /// Axis-aligned box, all six sides in one mesh.
-Mesh make_box(const Eigen::Vector3f& low, const Eigen::Vector3f& high);
+scene::Mesh make_box(const Eigen::Vector3f& low, const Eigen::Vector3f& high);
 
 /// Latitude-longitude sphere around the origin with smooth normals; chords lie at most radius * (pi / rings)^2 / 2
 /// inside.
-Mesh make_sphere(float radius, int rings);
+scene::Mesh make_sphere(float radius, int rings);
 
 /// A room with a box of its own id for each wall (ids 1-6: x low, x high, floor, ceiling, z low, z high), corner to
 /// corner.
-ScenePtr make_room(const Eigen::Vector3f& low, const Eigen::Vector3f& high);
+scene::ScenePtr make_room(const Eigen::Vector3f& low, const Eigen::Vector3f& high);
 
 /// Square texture of `cells` x `cells` black and white cells.
 std::vector<std::uint8_t> checkerboard(int side, int cells);
@@ -51,10 +51,10 @@ struct Picture {
 };
 
 /// One view with all three outputs.
-Picture draw(Renderer& renderer, const Pose& T_world_camera, const Camera& camera);
+Picture draw(render::Renderer& renderer, const Pose& T_world_camera, const render::Camera& camera);
 
 /// World-space ray of a pixel centre, scaled so that depth times it is the hit: the reference for every projection.
-Eigen::Vector3d pixel_ray(const Pose& T_world_camera, const Camera& camera, double x, double y);
+Eigen::Vector3d pixel_ray(const Pose& T_world_camera, const render::Camera& camera, double x, double y);
 
 Pose look(const Eigen::Vector3d& position, double yaw, double pitch);
 

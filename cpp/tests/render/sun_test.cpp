@@ -11,6 +11,7 @@
 #include "wiw/render/shading.hpp"
 
 using namespace wiw;
+using namespace wiw::render;
 using namespace wiw::testing;
 
 namespace {
@@ -18,7 +19,7 @@ namespace {
 const Camera kView{Projection::kPerspective, {150, 203}, radians(90)};
 const Pose kPose = look({0, 1.2, 0}, 0.4, -0.3);
 
-ScenePtr lone_sphere(int rings, const Sun& sun) {
+scene::ScenePtr lone_sphere(int rings, const scene::Sun& sun) {
   SceneBuilder builder;
   builder.add_instance(make_sphere(1.f, rings));
   builder.scene.sun = sun;
@@ -32,8 +33,8 @@ TEST_CASE("the facets of a ball do not shadow each other, however coarse it is a
   const Pose pose = look({0, 0, 3}, 0, 0);
   for (const int rings : {12, 24, 60}) {
     for (const Eigen::Vector3f& direction : {Eigen::Vector3f(1, 0.3f, 0.1f), Eigen::Vector3f(0.2f, 1, -0.4f)}) {
-      const Sun sun{direction.normalized(), 0.5f, 0.5f};
-      const ScenePtr scene = lone_sphere(rings, sun);
+      const scene::Sun sun{direction.normalized(), 0.5f, 0.5f};
+      const scene::ScenePtr scene = lone_sphere(rings, sun);
       const Picture picture = draw(*make_cpu_renderer(scene, {}), pose, camera);
       std::size_t seen = 0;
       for (int y = 0; y < camera.size.height; ++y) {
@@ -43,8 +44,8 @@ TEST_CASE("the facets of a ball do not shadow each other, however coarse it is a
           const Eigen::Vector3d point = pose.translation() + picture.depth[i] * pixel_ray(pose, camera, x, y);
           const Eigen::Vector3d n = point.normalized();  // of the ball; interpolated ones are close
           const double cosine = n.dot(sun.direction.cast<double>());
-          const double ambient = shading::ambient_light(n.x(), n.y(), n.z());
-          const double light = shading::sun_light(ambient, cosine, 1.0, 0.5f, 0.5f);
+          const double ambient = render::shading::ambient_light(n.x(), n.y(), n.z());
+          const double light = render::shading::sun_light(ambient, cosine, 1.0, 0.5f, 0.5f);
           REQUIRE(std::abs(picture.color[3 * i] - 255 * light) < 5);
           ++seen;
         }
@@ -68,17 +69,17 @@ TEST_CASE("a bulge is the depth below tangent planes: none where flat, hollow or
 }
 
 TEST_CASE("moved instances take their shadows along") {
-  const ScenePtr scene = make_sunny();
+  const scene::ScenePtr scene = make_sunny();
   const std::uint32_t id = kFurnishedSphere;
   const Eigen::Affine3f moved = Eigen::Translation3f(0.1f, 0.9f, -1.3f) * Eigen::Scaling(0.7f);
-  Scene changed = *scene;
+  scene::Scene changed = *scene;
   changed.instances[id - 1].T_world_instance = moved;
   const auto renderer = make_cpu_renderer(scene, {.samples = 4});
   const Picture before = draw(*renderer, kPose, kView);
   renderer->set_poses(std::span(&id, 1), std::span(&moved, 1));
   const Picture after = draw(*renderer, kPose, kView);
   CHECK(after.color ==
-        draw(*make_cpu_renderer(std::make_shared<const Scene>(changed), {.samples = 4}), kPose, kView).color);
+        draw(*make_cpu_renderer(std::make_shared<const scene::Scene>(changed), {.samples = 4}), kPose, kView).color);
   std::size_t floor = 0;  // pixels of the floor that changed their light
   for (std::size_t i = 0; i < before.instance.size(); ++i) {
     floor += before.instance[i] == 1 && after.instance[i] == 1 && before.color[3 * i] != after.color[3 * i];
@@ -87,10 +88,10 @@ TEST_CASE("moved instances take their shadows along") {
 }
 
 TEST_CASE("lightmaps and emissive surfaces have their light already") {
-  Scene scene = *make_furnished();
-  const Picture before = draw(*make_cpu_renderer(std::make_shared<const Scene>(scene), {}), kPose, kView);
+  scene::Scene scene = *make_furnished();
+  const Picture before = draw(*make_cpu_renderer(std::make_shared<const scene::Scene>(scene), {}), kPose, kView);
   scene.sun = {Eigen::Vector3f(0.48f, 0.8f, 0.36f), 0.7f, 0.5f};
-  const Picture after = draw(*make_cpu_renderer(std::make_shared<const Scene>(scene), {}), kPose, kView);
+  const Picture after = draw(*make_cpu_renderer(std::make_shared<const scene::Scene>(scene), {}), kPose, kView);
   CHECK(after.depth == before.depth);
   CHECK(after.instance == before.instance);
   std::size_t lit = 0;
@@ -107,14 +108,14 @@ TEST_CASE("the squares of the sun's map hold the whole scene, and its small inst
   builder.add_instance(make_quad({-5, 0, 5}, {10, 0, 0}, {0, 0, -10}));
   builder.add_instance(make_sphere(0.5f, 12));
   builder.add_instance(make_box({1, 0, 1}, {1.5f, 2, 1.5f}));
-  const ScenePtr scene = builder.build();
-  const gpu::Geometry geometry = gpu::build_geometry(*scene);
+  const scene::ScenePtr scene = builder.build();
+  const render::gpu::SceneGeometry geometry = render::gpu::build_geometry(*scene);
   std::vector<Eigen::Affine3f> poses(3, Eigen::Affine3f::Identity());
   poses[1] = Eigen::Translation3f(-0.7f, 0.4f, 1.2f) * Eigen::Scaling(0.8f);
-  const gpu::SunBlock block = gpu::sun_block({}, *scene, geometry.meshes, poses, 512);
+  const render::gpu::SunBlock block = render::gpu::sun_block({}, *scene, geometry.meshes, poses, 512);
   CHECK(block.grid[1].head<2>().prod() < 0.2f * block.grid[0].head<2>().prod());
-  for (std::size_t square = 0; square < gpu::kSunSquares; ++square) {
-    const gpu::View view = gpu::sun_view(block, square);
+  for (std::size_t square = 0; square < render::gpu::kSunSquares; ++square) {
+    const render::gpu::ViewBlock view = render::gpu::sun_view(block, square);
     for (std::size_t i = square; i < poses.size(); ++i) {
       for (const auto& position : scene->meshes[scene->instances[i].meshes[0]].positions) {
         const Eigen::Vector3f point = poses[i] * position;

@@ -33,7 +33,7 @@ std::vector<Sync> syncs;
 std::filesystem::path watched;
 
 /// Which bytes of a mapped file are geometry; the texture's are the first, behind the header.
-std::vector<bool> bytes_of_geometry(const wiw::Scene& scene, std::size_t file_bytes) {
+std::vector<bool> bytes_of_geometry(const wiw::scene::Scene& scene, std::size_t file_bytes) {
   const std::uint8_t* begin = scene.textures[0].rgba.data() - 64;
   std::vector<bool> inside(file_bytes);
   const auto mark = [&](const auto& buffer) {
@@ -41,7 +41,7 @@ std::vector<bool> bytes_of_geometry(const wiw::Scene& scene, std::size_t file_by
     const auto first = reinterpret_cast<const std::uint8_t*>(bytes.data()) - begin;
     for (std::size_t i = 0; i < bytes.size(); ++i) inside.at(static_cast<std::size_t>(first) + i) = true;
   };
-  const wiw::Mesh& mesh = scene.meshes[0];
+  const wiw::scene::Mesh& mesh = scene.meshes[0];
   mark(mesh.positions);
   mark(mesh.normals);
   mark(mesh.uv);
@@ -52,12 +52,12 @@ std::vector<bool> bytes_of_geometry(const wiw::Scene& scene, std::size_t file_by
 }
 
 /// A scene that uses every field.
-wiw::Scene full_scene() {
-  wiw::Scene scene;
+wiw::scene::Scene full_scene() {
+  wiw::scene::Scene scene;
   scene.name = "full";
   scene.textures = {{"stripes", {1, 2}, std::vector<std::uint8_t>{1, 2, 3, 4, 5, 6, 7, 8}}};
   scene.materials = {{"wood", {0.1f, 0.2f, 0.3f, 0.4f}, 0, 0.5f, true}, {"plain"}};
-  wiw::Mesh mesh;
+  wiw::scene::Mesh mesh;
   mesh.positions = std::vector<Eigen::Vector3f>{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}};
   mesh.normals = std::vector<Eigen::Vector3f>(3, Eigen::Vector3f::UnitZ());
   mesh.uv = std::vector<Eigen::Vector2f>{{0, 0}, {1, 0}, {0, 1}};
@@ -68,7 +68,8 @@ wiw::Scene full_scene() {
   mesh.lightmap = 0;
   scene.meshes = {mesh, {}};
   scene.categories = {"chair"};
-  wiw::Instance instance{1, "a chair", 0, {0, 1}, Eigen::Affine3f(Eigen::Translation3f(1, 2, 3)), {{"color", "red"}}};
+  wiw::scene::Instance instance{
+      1, "a chair", 0, {0, 1}, Eigen::Affine3f(Eigen::Translation3f(1, 2, 3)), {{"color", "red"}}};
   scene.instances = {instance, {2, "none"}};
   scene.rooms = {{"kitchen 1", "kitchen", Eigen::AlignedBox3f(Eigen::Vector3f(0, 1, 2), Eigen::Vector3f(3, 4, 5))}};
   scene.sky.zenith = {1, 0, 0.5f};
@@ -96,10 +97,10 @@ extern "C" int fsync(int file) {
 
 TEST_CASE("a scene comes back from its cache as it was") {
   const Folder folder;
-  const wiw::Scene scene = full_scene();
+  const wiw::scene::Scene scene = full_scene();
   const auto file = folder.path() / "scene.wiwscene";
-  wiw::write_scene_cache(scene, file);
-  const wiw::ScenePtr mapped = wiw::map_scene_cache(file);
+  wiw::scene::write_scene_cache(scene, file);
+  const wiw::scene::ScenePtr mapped = wiw::scene::map_scene_cache(file);
   CHECK(std::distance(std::filesystem::directory_iterator(folder.path()), {}) == 1);  // no draft is left
   std::filesystem::remove(file);                                                      // the mapping lives on
 
@@ -113,7 +114,7 @@ TEST_CASE("a scene comes back from its cache as it was") {
   CHECK(mapped->materials[0].alpha_cutoff == 0.5f);
   CHECK(mapped->materials[0].emissive);
   CHECK(mapped->materials[0].texture == 0);
-  CHECK(mapped->materials[1].texture == wiw::kNone);
+  CHECK(mapped->materials[1].texture == wiw::scene::kNone);
   REQUIRE(mapped->meshes.size() == 2);
   CHECK(same(mapped->meshes[0].positions, scene.meshes[0].positions));
   CHECK(same(mapped->meshes[0].normals, scene.meshes[0].normals));
@@ -135,7 +136,7 @@ TEST_CASE("a scene comes back from its cache as it was") {
   CHECK(mapped->sky.zenith == scene.sky.zenith);
   CHECK(mapped->sky.horizon == scene.sky.horizon);
   CHECK(mapped->sun.has_value());
-  const wiw::Sun sun = mapped->sun.value_or(wiw::Sun{});
+  const wiw::scene::Sun sun = mapped->sun.value_or(wiw::scene::Sun{});
   CHECK(sun.direction == Eigen::Vector3f(0.6f, 0, 0.8f));
   CHECK(sun.strength == 0.25f);
   CHECK(sun.ambient == 0.75f);
@@ -146,17 +147,17 @@ TEST_CASE("a scene comes back from its cache as it was") {
 
 TEST_CASE("a scene without a sun comes back without one") {
   const Folder folder;
-  wiw::Scene scene = full_scene();
+  wiw::scene::Scene scene = full_scene();
   scene.sun.reset();
-  wiw::write_scene_cache(scene, folder.path() / "scene.wiwscene");
-  CHECK_FALSE(wiw::map_scene_cache(folder.path() / "scene.wiwscene")->sun.has_value());
+  wiw::scene::write_scene_cache(scene, folder.path() / "scene.wiwscene");
+  CHECK_FALSE(wiw::scene::map_scene_cache(folder.path() / "scene.wiwscene")->sun.has_value());
 }
 
 TEST_CASE("arrays of a cache are aligned views of one mapping") {
   const Folder folder;
   const auto file = folder.path() / "scene.wiwscene";
-  wiw::write_scene_cache(full_scene(), file);
-  const wiw::ScenePtr mapped = wiw::map_scene_cache(file);
+  wiw::scene::write_scene_cache(full_scene(), file);
+  const wiw::scene::ScenePtr mapped = wiw::scene::map_scene_cache(file);
   const auto address = [](const void* pointer) { return reinterpret_cast<std::uintptr_t>(pointer); };
   const std::uintptr_t first = address(mapped->textures[0].rgba.data());
   for (const std::uintptr_t array :
@@ -169,31 +170,31 @@ TEST_CASE("arrays of a cache are aligned views of one mapping") {
 TEST_CASE("damaged, cut and foreign caches are refused") {
   const Folder folder;
   const auto file = folder.path() / "scene.wiwscene";
-  wiw::write_scene_cache(full_scene(), file);
+  wiw::scene::write_scene_cache(full_scene(), file);
   const std::string whole = bytes_of(file);
-  CHECK_THROWS_AS(wiw::map_scene_cache(folder.path() / "none"), wiw::FileError);
-  CHECK_THROWS_AS(wiw::map_scene_cache(folder.write("empty", "")), wiw::FileError);
-  CHECK_THROWS_WITH_AS(wiw::map_scene_cache(folder.write("text", std::string(500, 'x'))),
+  CHECK_THROWS_AS(wiw::scene::map_scene_cache(folder.path() / "none"), wiw::FileError);
+  CHECK_THROWS_AS(wiw::scene::map_scene_cache(folder.write("empty", "")), wiw::FileError);
+  CHECK_THROWS_WITH_AS(wiw::scene::map_scene_cache(folder.write("text", std::string(500, 'x'))),
                        doctest::Contains("no scene cache"), wiw::FileError);
   std::string older = whole;
   older[8] = 0;
-  CHECK_THROWS_WITH_AS(wiw::map_scene_cache(folder.write("older", older)),
+  CHECK_THROWS_WITH_AS(wiw::scene::map_scene_cache(folder.write("older", older)),
                        doctest::Contains("has version 0, expected 3"), wiw::FileError);
   for (std::size_t length = 1; length < whole.size(); length += 7) {
-    CHECK_THROWS_AS(wiw::map_scene_cache(folder.write("cut", whole.substr(0, length))), wiw::FileError);
+    CHECK_THROWS_AS(wiw::scene::map_scene_cache(folder.write("cut", whole.substr(0, length))), wiw::FileError);
   }
   std::uint64_t table = 0;
   std::memcpy(&table, whole.data() + 24, sizeof(table));
-  const std::vector<bool> geometry = bytes_of_geometry(*wiw::map_scene_cache(file), whole.size());
+  const std::vector<bool> geometry = bytes_of_geometry(*wiw::scene::map_scene_cache(file), whole.size());
   for (std::size_t bit = 0; bit < 8 * whole.size(); bit += 37) {
     const std::size_t at = bit / 8;
     std::string flipped = whole;
     flipped[at] = static_cast<char>(flipped[at] ^ (1 << (bit % 8)));
     const auto damaged = folder.write("flipped", flipped);
     if (at < 64 || at >= table || geometry[at]) {
-      CHECK_THROWS_WITH_AS(wiw::map_scene_cache(damaged), doctest::Contains("flipped"), wiw::FileError);
+      CHECK_THROWS_WITH_AS(wiw::scene::map_scene_cache(damaged), doctest::Contains("flipped"), wiw::FileError);
     } else {  // texels, and what fills up to the next 64 bytes
-      CHECK_NOTHROW(wiw::map_scene_cache(damaged));
+      CHECK_NOTHROW(wiw::scene::map_scene_cache(damaged));
     }
   }
 }
@@ -203,17 +204,17 @@ TEST_CASE("the checksum of an array sees every bit, the length and the order") {
   for (std::size_t i = 0; i < bytes.size(); ++i) bytes[i] = static_cast<std::uint8_t>(i * i);
   std::set<std::uint64_t> seen;
   for (std::size_t length = 0; length < bytes.size(); ++length) {
-    seen.insert(wiw::cache::array_checksum(std::span(bytes).first(length)));
+    seen.insert(wiw::scene::cache::array_checksum(std::span(bytes).first(length)));
   }
   for (std::size_t bit = 0; bit < 8 * bytes.size(); ++bit) {
     bytes[bit / 8] ^= static_cast<std::uint8_t>(1U << (bit % 8));
-    seen.insert(wiw::cache::array_checksum(bytes));
+    seen.insert(wiw::scene::cache::array_checksum(bytes));
     bytes[bit / 8] ^= static_cast<std::uint8_t>(1U << (bit % 8));
   }
   std::swap_ranges(bytes.begin(), bytes.begin() + 64, bytes.begin() + 64);
-  seen.insert(wiw::cache::array_checksum(bytes));
+  seen.insert(wiw::scene::cache::array_checksum(bytes));
   CHECK(seen.size() == 200 + 8 * 200 + 1);
-  CHECK(wiw::cache::array_checksum({}) != wiw::cache::array_checksum(std::vector<std::uint8_t>(64)));
+  CHECK(wiw::scene::cache::array_checksum({}) != wiw::scene::cache::array_checksum(std::vector<std::uint8_t>(64)));
 }
 
 TEST_CASE("a cache is on the disk before it has its name, and its name after") {
@@ -221,7 +222,7 @@ TEST_CASE("a cache is on the disk before it has its name, and its name after") {
   const auto file = folder.path() / "scene.wiwscene";
   syncs.clear();
   watched = file;
-  wiw::write_scene_cache(full_scene(), file);
+  wiw::scene::write_scene_cache(full_scene(), file);
   REQUIRE(syncs.size() == 2);
   CHECK(syncs[0].path.starts_with(file.string() + "."));
   CHECK_FALSE(syncs[0].named);
@@ -231,5 +232,5 @@ TEST_CASE("a cache is on the disk before it has its name, and its name after") {
 }
 
 TEST_CASE("a cache that cannot be written says so") {
-  CHECK_THROWS_AS(wiw::write_scene_cache(full_scene(), "/nonexistent/folder/scene.wiwscene"), wiw::FileError);
+  CHECK_THROWS_AS(wiw::scene::write_scene_cache(full_scene(), "/nonexistent/folder/scene.wiwscene"), wiw::FileError);
 }

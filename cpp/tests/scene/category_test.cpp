@@ -3,7 +3,7 @@
 
 #include <doctest/doctest.h>
 
-using wiw::category_from_name;
+using wiw::scene::category_from_name;
 
 TEST_CASE("a category is read from a model's name") {
   CHECK(category_from_name("aws_robomaker_residential_ChairA_01") == "chair");
@@ -24,9 +24,9 @@ TEST_CASE("names that say nothing give no category") {
 }
 
 TEST_CASE("categories of a scene are unique") {
-  wiw::Scene scene;
-  CHECK(wiw::category_index(scene, "chair") == 0);
-  CHECK(wiw::category_index(scene, "table") == 1);
-  CHECK(wiw::category_index(scene, "chair") == 0);
-  CHECK(wiw::category_index(scene, "") == wiw::kNone);
+  wiw::scene::Scene scene;
+  CHECK(wiw::scene::category_index(scene, "chair") == 0);
+  CHECK(wiw::scene::category_index(scene, "table") == 1);
+  CHECK(wiw::scene::category_index(scene, "chair") == 0);
+  CHECK(wiw::scene::category_index(scene, "") == wiw::scene::kNone);
 }

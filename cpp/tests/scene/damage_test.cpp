@@ -19,7 +19,7 @@ int rounds() {
 /// Loads, or is refused with a typed error that names the file. Anything else fails the test, a crash included.
 void load_or_refuse(const std::filesystem::path& file) {
   try {
-    wiw::load_mesh(file)->validate();
+    wiw::scene::load_mesh(file)->validate();
   } catch (const wiw::FileError& error) {
     CHECK(std::string(error.what()).find(file.filename().string()) != std::string::npos);
   }

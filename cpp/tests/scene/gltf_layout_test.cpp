@@ -26,7 +26,9 @@ struct Gltf {
   }
 };
 
-void check_layout(const Gltf& gltf) { wiw::check_gltf_layout(wiw::Json::parse(gltf.text()), std::nullopt, "a.gltf"); }
+void check_layout(const Gltf& gltf) {
+  wiw::scene::check_gltf_layout(wiw::scene::Json::parse(gltf.text()), std::nullopt, "a.gltf");
+}
 
 void refused(const Gltf& gltf, const char* cause) {
   CAPTURE(gltf.text());
@@ -44,7 +46,7 @@ void write_triangle(const Folder& folder) {
 }  // namespace
 
 TEST_CASE("JSON is read as it is written") {
-  const wiw::Json json = wiw::Json::parse(
+  const wiw::scene::Json json = wiw::scene::Json::parse(
       " {\"a\": [1, -2, 3.5, 1e3, 18446744073709551615, true, null], \"b\\u0041\\n\": \"\\ud83d\\ude00\\\\\","
       "\"a\": 2, \"c\": {}, \"d\": []} ");
   const auto& a = json["a"].items();
@@ -58,22 +60,22 @@ TEST_CASE("JSON is read as it is written") {
   CHECK(json["c"].is_object());
   CHECK(json["none"].is_null());
   CHECK(json["a"]["b"].is_null());
-  CHECK(wiw::Json::parse(std::string("1\0 junk", 7)).whole() == 1U);
+  CHECK(wiw::scene::Json::parse(std::string("1\0 junk", 7)).whole() == 1U);
   for (const char* text : {"", "{", "[1,]", "{\"a\"}", "\"a", "\"\\x\"", "\"\\u12\"", "\"\\ud800\"", "tru", "1 2"}) {
     CAPTURE(text);
-    CHECK_THROWS_WITH_AS(wiw::Json::parse(text), doctest::Contains("is no valid JSON"), wiw::Error);
+    CHECK_THROWS_WITH_AS(wiw::scene::Json::parse(text), doctest::Contains("is no valid JSON"), wiw::Error);
   }
-  CHECK_THROWS_WITH_AS(wiw::Json::parse(std::string(100'000, '[')), doctest::Contains("nested"), wiw::Error);
+  CHECK_THROWS_WITH_AS(wiw::scene::Json::parse(std::string(100'000, '[')), doctest::Contains("nested"), wiw::Error);
 }
 
 TEST_CASE("JSON is changed and written") {
   const std::string text = R"({"a":[1,-2.50,true,false,null,"\\\"\u0007é"],"b":{"c":{}},"d":[]})";
-  wiw::Json json = wiw::Json::parse(text);
+  wiw::scene::Json json = wiw::scene::Json::parse(text);
   CHECK(json.write() == text);
   CHECK(json["a"].items()[1].number() == -2.5);
   CHECK(json["a"].items()[2].is_true());
-  json.member("b").member("e").member("f") = wiw::Json::from(std::size_t{7});
-  json.member("d").list().push_back(wiw::Json::from(0.1));
+  json.member("b").member("e").member("f") = wiw::scene::Json::from(std::size_t{7});
+  json.member("d").list().push_back(wiw::scene::Json::from(0.1));
   json.erase("a");
   json.erase("a");
   CHECK(json.write() == R"({"b":{"c":{},"e":{"f":7}},"d":[0.1]})");
@@ -135,12 +137,12 @@ TEST_CASE("glTF accessors that are read side by side are as long as each other")
 TEST_CASE("glTF files with accessors beyond their views are refused before they are read") {
   const Folder folder;
   write_triangle(folder);
-  CHECK(wiw::load_mesh(folder.write("whole.gltf", Gltf{}.text()))->triangle_count() == 1);
+  CHECK(wiw::scene::load_mesh(folder.write("whole.gltf", Gltf{}.text()))->triangle_count() == 1);
   const Gltf beyond{.accessors = accessor(R"("bufferView":0,"count":3,"byteOffset":24)")};
-  CHECK_THROWS_WITH_AS(wiw::load_mesh(folder.write("beyond.gltf", beyond.text())),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_mesh(folder.write("beyond.gltf", beyond.text())),
                        doctest::Contains("beyond.gltf: accessor 0 reads 3 elements"), wiw::FileError);
   const Gltf older{.version = R"("1.0")"};
-  CHECK_THROWS_WITH_AS(wiw::load_mesh(folder.write("older.gltf", older.text())),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_mesh(folder.write("older.gltf", older.text())),
                        doctest::Contains("only version 2 is supported"), wiw::FileError);
 
   const std::string whole = sample_glb();
@@ -149,7 +151,7 @@ TEST_CASE("glTF files with accessors beyond their views are refused before they 
   const std::size_t at = beyond_body.find(view);
   REQUIRE(at != std::string::npos);
   beyond_body.replace(at, view.size(), R"("byteOffset":99,"byteLength":99)");
-  CHECK_THROWS_WITH_AS(wiw::load_mesh(folder.write("body.glb", beyond_body)),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_mesh(folder.write("body.glb", beyond_body)),
                        doctest::Contains("bufferView 1 has 99 bytes"), wiw::FileError);
 }
 
@@ -159,5 +161,5 @@ TEST_CASE("accessors without any data are refused, not followed") {
   const Gltf empty{.primitive = R"({"attributes":{"POSITION":0},"indices":1})",
                    .accessors = R"([{"bufferView":0,"componentType":5126,"count":3,"type":"VEC3"},)"
                                 R"({"componentType":5125,"count":3,"type":"SCALAR"}])"};
-  CHECK_THROWS_AS(wiw::load_mesh(folder.write("empty.gltf", empty.text())), wiw::FileError);
+  CHECK_THROWS_AS(wiw::scene::load_mesh(folder.write("empty.gltf", empty.text())), wiw::FileError);
 }

@@ -12,12 +12,12 @@
 #include "wiw/scene/measure.hpp"
 
 using wiw::FileError;
-using wiw::load_mesh;
-using wiw::Up;
+using wiw::scene::load_mesh;
+using wiw::scene::Up;
 
 namespace {
 
-const wiw::Material& material_of(const wiw::Scene& scene, std::size_t mesh = 0) {
+const wiw::scene::Material& material_of(const wiw::scene::Scene& scene, std::size_t mesh = 0) {
   return scene.materials.at(static_cast<std::size_t>(scene.meshes.at(mesh).material));
 }
 
@@ -39,12 +39,12 @@ TEST_CASE("GLB: geometry, embedded texture, category and the Y-up rule") {
   CHECK(same_box(scene->bounds(), {0, 0, 0}, {1, 1, 0}));
 
   REQUIRE(scene->textures.size() == 1);
-  const wiw::Texture& texture = scene->textures[0];
+  const wiw::scene::Texture& texture = scene->textures[0];
   CHECK(texture.size == wiw::Size{2, 2});
   const std::vector<int> expected{255, 0, 0, 255, 0, 255, 0, 255, 0, 0, 255, 255, 255, 255, 255, 255};
   CHECK(std::ranges::equal(texture.rgba, expected));
   // glTF counts v from the top, as the scene does: the vertex at the origin was written with (0, 1).
-  const wiw::Mesh& mesh = scene->meshes[0];
+  const wiw::scene::Mesh& mesh = scene->meshes[0];
   for (std::size_t i = 0; i < mesh.positions.size(); ++i) {
     CHECK((mesh.uv[i] - Eigen::Vector2f(mesh.positions[i].x(), 1.f - mesh.positions[i].y())).norm() < 1e-6f);
   }
@@ -82,12 +82,12 @@ TEST_CASE("node transforms: rigid part in the pose, the rest in the vertices, me
   CHECK(same_box(instance_bounds(*scene, scene->instances[0]), {10, 2, 0}, {11, 3, 0}));
   CHECK(same_box(instance_bounds(*scene, scene->instances[1]), {10, 0, -1}, {10, 1, 0}));  // x turns to -z
   CHECK(same_box(instance_bounds(*scene, scene->instances[2]), {10, -3, 0}, {12, 0, 0}));
-  for (const wiw::Instance& instance : scene->instances) {
+  for (const wiw::scene::Instance& instance : scene->instances) {
     const Eigen::Matrix3f rotation = instance.T_world_instance.linear();
     CHECK((rotation * rotation.transpose()).isIdentity(1e-5f));
     CHECK(rotation.determinant() > 0.f);
     // A mirrored mesh keeps facing the way the mirror image of the square faces.
-    const wiw::Mesh& mesh = scene->meshes[instance.meshes[0]];
+    const wiw::scene::Mesh& mesh = scene->meshes[instance.meshes[0]];
     const auto& t = mesh.triangles[0];
     const Eigen::Vector3f normal =
         (mesh.positions[t[1]] - mesh.positions[t[0]]).cross(mesh.positions[t[2]] - mesh.positions[t[0]]);
@@ -106,7 +106,7 @@ TEST_CASE("colours: glTF factors are linear, OBJ and PLY are display-encoded") {
   GlbParts parts;
   parts.material = R"({"pbrMetallicRoughness":{"baseColorFactor":[0.5,0,1,1]}})";
   const auto plain = load_mesh(folder.write("plain.glb", sample_glb(parts)));
-  CHECK(material_of(*plain).texture == wiw::kNone);
+  CHECK(material_of(*plain).texture == wiw::scene::kNone);
   CHECK(material_of(*plain).base_color.isApprox(Eigen::Vector4f(std::pow(0.5f, 1 / 2.2f), 0, 1, 1), 1e-5f));
 
   folder.write("sample.mtl", "newmtl wood\nKd 0.5 0.25 1\n");
@@ -139,7 +139,7 @@ TEST_CASE("external textures: beside the file, by base name, missing, undecodabl
   const Folder folder;
   const auto file = folder.write("meshes/sample.obj", sample_obj());
   folder.write("meshes/sample.mtl", "newmtl wood\nKd 0.5 0.25 1\nmap_Kd C:\\art\\my%20photo.bmp\n");
-  wiw::ImportTrace trace;
+  wiw::scene::ImportTrace trace;
   const auto missing = load_mesh(file, {.trace = &trace});
   REQUIRE(missing->warnings.size() == 1);
   CHECK(missing->warnings[0].find("my%20photo.bmp' of sample.obj was not found") != std::string::npos);
@@ -265,13 +265,13 @@ TEST_CASE("a node flattened to a plane is drawn, one squeezed to a line is named
 }
 
 TEST_CASE("normals survive every scale, and are left to the triangles where there is no inverse") {
-  wiw::Mesh mesh;
+  wiw::scene::Mesh mesh;
   mesh.positions = std::vector<Eigen::Vector3f>{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}};
   mesh.normals = std::vector<Eigen::Vector3f>(3, Eigen::Vector3f(0.6f, 0, 0.8f));
   mesh.triangles = std::vector<Eigen::Matrix<std::uint32_t, 3, 1>>{{0, 1, 2}};
   const auto baked = [&](const Eigen::Vector3f& scale) {
-    wiw::Scene scene;
-    wiw::MeshBaker(scene).bake(mesh, Eigen::Affine3f(Eigen::Scaling(scale)), 0);
+    wiw::scene::Scene scene;
+    wiw::scene::MeshBaker(scene).bake(mesh, Eigen::Affine3f(Eigen::Scaling(scale)), 0);
     return scene.meshes[0];
   };
   CHECK(baked({1, 1, 0}).normals.empty());
@@ -292,7 +292,7 @@ TEST_CASE("textures are summed by their headers before any is decoded") {
 TEST_CASE("limits are enforced by figure and name") {
   const Folder folder;
   const auto file = folder.write("a.glb", sample_glb());
-  const auto refused = [&](const wiw::ImportLimits& limits, const char* text) {
+  const auto refused = [&](const wiw::scene::ImportLimits& limits, const char* text) {
     CHECK_THROWS_WITH_AS(load_mesh(file, {.limits = limits}), doctest::Contains(text), FileError);
   };
   refused({.file_bytes = 100}, "more than the limit of 100 (raise limits.file_bytes");
@@ -309,11 +309,11 @@ TEST_CASE("a ceiling closes a scene and faces down") {
   const auto scene = load_mesh(folder.write("a.obj", "o floor\nv 0 1 0\nv 4 1 0\nv 4 1 3\nv 0 1 3\nf 4 3 2 1\n"),
                                {.ceiling_height = 2.5f});
   REQUIRE(scene->instances.size() == 2);
-  const wiw::Instance& ceiling = scene->instances[1];
+  const wiw::scene::Instance& ceiling = scene->instances[1];
   CHECK(ceiling.name == "ceiling");
   CHECK(scene->categories[static_cast<std::size_t>(ceiling.category)] == "ceiling");
   CHECK(same_box(instance_bounds(*scene, ceiling), {0, 3.5f, 0}, {4, 3.5f, 3}));
-  const wiw::Mesh& mesh = scene->meshes[ceiling.meshes[0]];
+  const wiw::scene::Mesh& mesh = scene->meshes[ceiling.meshes[0]];
   for (const auto& t : mesh.triangles) {
     CHECK((mesh.positions[t[1]] - mesh.positions[t[0]]).cross(mesh.positions[t[2]] - mesh.positions[t[0]]).y() < 0.f);
   }

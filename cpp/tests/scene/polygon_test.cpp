@@ -13,7 +13,7 @@
 
 namespace {
 
-Eigen::Vector3f area_vector(const wiw::Triangle& t, const std::vector<Eigen::Vector3f>& p) {
+Eigen::Vector3f area_vector(const wiw::scene::Triangle& t, const std::vector<Eigen::Vector3f>& p) {
   return 0.5f * (p[t[1]] - p[t[0]]).cross(p[t[2]] - p[t[0]]);
 }
 
@@ -39,11 +39,11 @@ TEST_CASE("polygons of any shape are cut into triangles that cover them once and
     std::vector<unsigned> polygon(corners);
     std::iota(polygon.begin(), polygon.end(), 0U);
 
-    std::vector<wiw::Triangle> triangles;
-    wiw::triangulate(polygon, positions, triangles);
+    std::vector<wiw::scene::Triangle> triangles;
+    wiw::scene::triangulate(polygon, positions, triangles);
     CHECK(triangles.size() == corners - 2);
     float area = 0.f;
-    for (const wiw::Triangle& triangle : triangles) {
+    for (const wiw::scene::Triangle& triangle : triangles) {
       CHECK(area_vector(triangle, positions).dot(expected) > 0.f);
       area += area_vector(triangle, positions).norm();
     }
@@ -55,19 +55,19 @@ TEST_CASE("what has no area gives no triangles") {
   const std::vector<Eigen::Vector3f> line{{0, 0, 0}, {1, 0, 0}, {2, 0, 0}, {3, 0, 0}};
   const unsigned polygon[] = {0, 1, 2, 3};
   for (const std::size_t corners : {0U, 1U, 2U, 3U, 4U}) {
-    std::vector<wiw::Triangle> triangles;
-    wiw::triangulate({polygon, corners}, line, triangles);
+    std::vector<wiw::scene::Triangle> triangles;
+    wiw::scene::triangulate({polygon, corners}, line, triangles);
     CHECK(triangles.empty());
   }
 }
 
 TEST_CASE("welding merges equal vertices only") {
-  wiw::Mesh mesh;
+  wiw::scene::Mesh mesh;
   mesh.positions =
       std::vector<Eigen::Vector3f>{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}, {-0.f, 0, 0}, {1, 0, 0}, {5, 5, 5}, {0, 0, 1}};
   mesh.uv = std::vector<Eigen::Vector2f>{{0, 0}, {1, 0}, {0, 1}, {0, 0}, {0.5f, 0}, {9, 9}, {0, 0}};
-  mesh.triangles = std::vector<wiw::Triangle>{{0, 1, 2}, {3, 4, 6}};
-  const wiw::Mesh welded = wiw::weld(mesh);
+  mesh.triangles = std::vector<wiw::scene::Triangle>{{0, 1, 2}, {3, 4, 6}};
+  const wiw::scene::Mesh welded = wiw::scene::weld(mesh);
   CHECK(welded.positions.size() == 5);  // 0 and 3 are one, 1 and 4 differ in uv, 5 is not used
   for (std::size_t t = 0; t < 2; ++t) {
     for (int corner = 0; corner < 3; ++corner) {

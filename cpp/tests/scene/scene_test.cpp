@@ -9,20 +9,20 @@
 
 namespace {
 
-wiw::Scene one_triangle() {
-  wiw::Scene scene;
-  wiw::Mesh mesh;
+wiw::scene::Scene one_triangle() {
+  wiw::scene::Scene scene;
+  wiw::scene::Mesh mesh;
   mesh.positions = std::vector<Eigen::Vector3f>{{0, 0, 0}, {1, 0, 0}, {0, 1, 0}};
   mesh.triangles = std::vector<Eigen::Matrix<std::uint32_t, 3, 1>>{{0, 1, 2}};
   scene.meshes = {mesh};
-  scene.instances = {{1, "thing", wiw::kNone, {0}}};
+  scene.instances = {{1, "thing", wiw::scene::kNone, {0}}};
   return scene;
 }
 
 }  // namespace
 
 TEST_CASE("an instance names meshes that are there, the greatest index included") {
-  wiw::Scene scene = one_triangle();
+  wiw::scene::Scene scene = one_triangle();
   CHECK_NOTHROW(scene.validate());
   for (const std::uint32_t mesh : {1U, 0x7FFFFFFFU, 0x80000000U, 0xFFFFFFFFU}) {
     scene.instances[0].meshes = {mesh};
@@ -33,14 +33,14 @@ TEST_CASE("an instance names meshes that are there, the greatest index included"
 
 TEST_CASE("a pose is finite") {
   for (const float value : {std::numeric_limits<float>::infinity(), std::numeric_limits<float>::quiet_NaN()}) {
-    wiw::Scene scene = one_triangle();
+    wiw::scene::Scene scene = one_triangle();
     scene.instances[0].T_world_instance.translation().y() = value;
     CHECK_THROWS_WITH_AS(scene.validate(), doctest::Contains("the pose of 'thing' is not finite"), wiw::ArgumentError);
   }
 }
 
 TEST_CASE("a sun has a direction of length 1, and strengths in [0, 1]") {
-  wiw::Scene scene = one_triangle();
+  wiw::scene::Scene scene = one_triangle();
   scene.sun.emplace();
   CHECK_NOTHROW(scene.validate());
   constexpr float kNan = std::numeric_limits<float>::quiet_NaN();

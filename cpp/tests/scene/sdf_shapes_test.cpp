@@ -17,7 +17,7 @@
 namespace {
 
 /// Volume enclosed, by the divergence theorem: positive if all triangles face outwards.
-double volume(const wiw::Mesh& mesh) {
+double volume(const wiw::scene::Mesh& mesh) {
   double sum = 0.;
   for (const auto& t : mesh.triangles) {
     const Eigen::Vector3d a = mesh.positions[t[0]].cast<double>();
@@ -42,12 +42,12 @@ std::string model(const std::string& content, const std::string& name = "m") {
 
 const std::string kUnitBox = "<visual name=\"v\"><geometry><box><size>1 1 1</size></box></geometry></visual>";
 
-wiw::ScenePtr load(const Folder& folder, const std::string& content) {
-  return wiw::load_sdf_world(folder.write("w.sdf", world(content)));
+wiw::scene::ScenePtr load(const Folder& folder, const std::string& content) {
+  return wiw::scene::load_sdf_world(folder.write("w.sdf", world(content)));
 }
 
 /// Centre of an instance in the file's axes: (x, y, z) from (x, z, -y).
-Eigen::Vector3f centre(const wiw::Scene& scene, std::size_t i = 0) {
+Eigen::Vector3f centre(const wiw::scene::Scene& scene, std::size_t i = 0) {
   const Eigen::Vector3f c = instance_bounds(scene, scene.instances.at(i)).center();
   return {c.x(), -c.z(), c.y()};
 }
@@ -55,25 +55,25 @@ Eigen::Vector3f centre(const wiw::Scene& scene, std::size_t i = 0) {
 }  // namespace
 
 TEST_CASE("primitives are closed, face outwards and have the right volume") {
-  using wiw::sdf::Geometry;
-  using wiw::sdf::primitive_mesh;
-  using wiw::sdf::Shape;
+  using wiw::scene::sdf::Geometry;
+  using wiw::scene::sdf::primitive_mesh;
+  using wiw::scene::sdf::ShapeKind;
   const double pi = std::numbers::pi;
-  CHECK(volume(primitive_mesh({.shape = Shape::kBox, .size = {2, 3, 4}})) == doctest::Approx(24.));
-  CHECK(volume(primitive_mesh({.shape = Shape::kSphere, .size = {2, 2, 2}})) ==
+  CHECK(volume(primitive_mesh({.shape = ShapeKind::kBox, .size = {2, 3, 4}})) == doctest::Approx(24.));
+  CHECK(volume(primitive_mesh({.shape = ShapeKind::kSphere, .size = {2, 2, 2}})) ==
         doctest::Approx(32. * pi / 3.).epsilon(0.02));
-  CHECK(volume(primitive_mesh({.shape = Shape::kCylinder, .size = {2, 2, 3}})) ==
+  CHECK(volume(primitive_mesh({.shape = ShapeKind::kCylinder, .size = {2, 2, 3}})) ==
         doctest::Approx(12. * pi).epsilon(0.01));
-  for (const Shape shape : {Shape::kBox, Shape::kSphere, Shape::kCylinder}) {
-    const wiw::Mesh mesh = primitive_mesh({.shape = shape, .size = {1, 1, 2}});
+  for (const ShapeKind shape : {ShapeKind::kBox, ShapeKind::kSphere, ShapeKind::kCylinder}) {
+    const wiw::scene::Mesh mesh = primitive_mesh({.shape = shape, .size = {1, 1, 2}});
     for (const auto& t : mesh.triangles) {  // vertex normals point to the side that the triangle faces
       const Eigen::Vector3f face =
           (mesh.positions[t[1]] - mesh.positions[t[0]]).cross(mesh.positions[t[2]] - mesh.positions[t[0]]);
       for (int corner = 0; corner < 3; ++corner) CHECK(face.dot(mesh.normals[t[corner]]) > 0.f);
     }
   }
-  const wiw::Mesh plane =
-      primitive_mesh({.shape = Shape::kPlane, .size = {2, 4, 1}, .normal = Eigen::Vector3d::UnitX()});
+  const wiw::scene::Mesh plane =
+      primitive_mesh({.shape = ShapeKind::kPlane, .size = {2, 4, 1}, .normal = Eigen::Vector3d::UnitX()});
   CHECK(plane.triangles.size() == 2);
   for (std::size_t i = 0; i < 4; ++i) {
     CHECK(plane.positions[i].x() == doctest::Approx(0.));
@@ -95,7 +95,7 @@ TEST_CASE("a pose is Rz(yaw) Ry(pitch) Rx(roll), in radians, degrees or as a qua
     const auto parse = [](const std::string& pose) {
       pugi::xml_document document;
       document.load_string(("<link>" + pose + "</link>").c_str());
-      return wiw::sdf::own_pose(document.child("link"), "test.sdf");
+      return wiw::scene::sdf::own_pose(document.child("link"), "test.sdf");
     };
     std::string radians = "<pose>";
     std::string degrees = "<pose degrees=\"true\">";
@@ -134,7 +134,7 @@ TEST_CASE("poses chain from world to visual and follow relative_to") {
 TEST_CASE("relative_to finds every kind of frame of its model") {
   const Folder folder;
   const auto place = [&](const std::string& content) {
-    return centre(*wiw::load_sdf_world(folder.write("f.sdf", world(content))));
+    return centre(*wiw::scene::load_sdf_world(folder.write("f.sdf", world(content))));
   };
   const auto is = [](const Eigen::Vector3f& found, float x, float y, float z) {
     CAPTURE(found.transpose());
@@ -281,10 +281,10 @@ TEST_CASE("includes that multiply are counted and read once") {
     folder.write(std::string{'f', level} + ".sdf", sdf(model(includes)));
   }
   const auto file = folder.write("w.sdf", world("<include><uri>f0.sdf</uri></include>"));
-  wiw::ImportTrace trace;
-  CHECK(wiw::load_sdf_world(file, {.trace = &trace})->instances.size() == 625);
+  wiw::scene::ImportTrace trace;
+  CHECK(wiw::scene::load_sdf_world(file, {.trace = &trace})->instances.size() == 625);
   CHECK(trace.read.size() == 6);
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.nodes = 1000}}),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(file, {.limits = {.nodes = 1000}}),
                        doctest::Contains("has 1001 placed models and visuals, more than the limit of 1000"),
                        wiw::FileError);
 }
@@ -299,19 +299,19 @@ TEST_CASE("a model.config that is missing or unusable is followed") {
   thing("model.sdf", "1 1 1");
   thing("model2.sdf", "2 2 2");
   const auto config = folder.path() / "models/thing/model.config";
-  wiw::ImportTrace without;
-  CHECK(wiw::load_sdf_world(file, {.trace = &without})->bounds().sizes().isApproxToConstant(1.f));
+  wiw::scene::ImportTrace without;
+  CHECK(wiw::scene::load_sdf_world(file, {.trace = &without})->bounds().sizes().isApproxToConstant(1.f));
   CHECK(std::ranges::find(without.absent, config) != without.absent.end());
 
   folder.write("models/thing/model.config", "<model><sdf>model2.sdf</sdf></model>");
-  wiw::ImportTrace with;
-  CHECK(wiw::load_sdf_world(file, {.trace = &with})->bounds().sizes().isApproxToConstant(2.f));
+  wiw::scene::ImportTrace with;
+  CHECK(wiw::scene::load_sdf_world(file, {.trace = &with})->bounds().sizes().isApproxToConstant(2.f));
   CHECK(std::ranges::find(with.read, config) != with.read.end());
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.file_bytes = 35}}),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(file, {.limits = {.file_bytes = 35}}),
                        doctest::Contains("limits.file_bytes"), wiw::FileError);
 
   folder.write("models/thing/model.config", "<model><sdf>");
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file), doctest::Contains("model.config: is not well-formed XML"),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(file), doctest::Contains("model.config: is not well-formed XML"),
                        wiw::FileError);
 }
 
@@ -327,8 +327,8 @@ TEST_CASE("the meshes of a world share one texture budget") {
                      name);
   }
   const auto file = folder.write("w.sdf", world(content));
-  CHECK(wiw::load_sdf_world(file, {.limits = {.texture_bytes = 3 << 20}})->instances.size() == 3);
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.texture_bytes = (3 << 20) - 1}}),
+  CHECK(wiw::scene::load_sdf_world(file, {.limits = {.texture_bytes = 3 << 20}})->instances.size() == 3);
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(file, {.limits = {.texture_bytes = (3 << 20) - 1}}),
                        doctest::Contains("has 3145728 bytes of decoded textures with other models'"), wiw::FileError);
 }
 
@@ -336,7 +336,7 @@ TEST_CASE("limits hold over all placements of a world") {
   const Folder folder;
   const auto file = folder.write("w.world", world(model("<link name=\"a\">" + kUnitBox + "</link>") +
                                                   model("<link name=\"b\">" + kUnitBox + "</link>", "n")));
-  CHECK(wiw::load_sdf_world(file)->triangle_count() == 24);
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(file, {.limits = {.triangles = 23}}), doctest::Contains("has 24 triangles"),
-                       wiw::FileError);
+  CHECK(wiw::scene::load_sdf_world(file)->triangle_count() == 24);
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(file, {.limits = {.triangles = 23}}),
+                       doctest::Contains("has 24 triangles"), wiw::FileError);
 }

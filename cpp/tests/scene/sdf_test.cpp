@@ -25,9 +25,9 @@ const char* kBox = R"(<sdf version="1.6"><model name="BoxA_01"><link name="link"
   <material><ambient>0.1 0.1 0.1 1</ambient><diffuse>0.2 0.4 0.6 1</diffuse></material></visual>
 </link></model></sdf>)";
 
-wiw::ScenePtr two_boxes(const Folder& folder) {
+wiw::scene::ScenePtr two_boxes(const Folder& folder) {
   folder.write("models/BoxA_01/model.sdf", kBox);
-  return wiw::load_sdf_world(folder.write("worlds/w.world", kTwoBoxes));
+  return wiw::scene::load_sdf_world(folder.write("worlds/w.world", kTwoBoxes));
 }
 
 bool mentions(const std::vector<std::string>& warnings, const std::string& text) {
@@ -38,7 +38,7 @@ bool mentions(const std::vector<std::string>& warnings, const std::string& text)
 
 TEST_CASE("a world places models, shares their meshes and turns Z up to Y up") {
   const Folder folder;
-  const wiw::ScenePtr scene = two_boxes(folder);
+  const wiw::scene::ScenePtr scene = two_boxes(folder);
   REQUIRE(scene->instances.size() == 2);
   CHECK(scene->instances[0].name == "left");
   CHECK(scene->instances[1].name == "right");
@@ -49,10 +49,10 @@ TEST_CASE("a world places models, shares their meshes and turns Z up to Y up") {
             .base_color.isApprox(Eigen::Vector4f(0.2f, 0.4f, 0.6f, 1.f)));
 
   // The left box is 2 x 4 x 6, turned by 90 degrees about z: 4 x 2 x 6 about (1, 2, 4); y becomes -z.
-  const Eigen::AlignedBox3f left = wiw::instance_bounds(*scene, scene->instances[0]);
+  const Eigen::AlignedBox3f left = wiw::scene::instance_bounds(*scene, scene->instances[0]);
   CHECK(left.min().isApprox(Eigen::Vector3f(-1, 1, -3), 1e-5f));
   CHECK(left.max().isApprox(Eigen::Vector3f(3, 7, -1), 1e-5f));
-  CHECK(wiw::instance_bounds(*scene, scene->instances[1]).center().isApprox(Eigen::Vector3f(4, 1, 0), 1e-5f));
+  CHECK(wiw::scene::instance_bounds(*scene, scene->instances[1]).center().isApprox(Eigen::Vector3f(4, 1, 0), 1e-5f));
 
   CHECK(mentions(scene->warnings, "model://nowhere"));
   CHECK_FALSE(mentions(scene->warnings, "sun"));
@@ -65,12 +65,13 @@ TEST_CASE("the real house loads whole") {
     MESSAGE("skipped: WIW_TEST_DATA is not set and ../shared/data does not exist");
     return;
   }
-  wiw::ImportTrace trace;
-  const wiw::ScenePtr scene = wiw::load_sdf_world(data / "small_house/worlds/small_house.world", {.trace = &trace});
+  wiw::scene::ImportTrace trace;
+  const wiw::scene::ScenePtr scene =
+      wiw::scene::load_sdf_world(data / "small_house/worlds/small_house.world", {.trace = &trace});
   CHECK(scene->instances.size() == 87);
   std::size_t of_meshes = 0;
   std::set<std::uint32_t> shared;
-  for (const wiw::Instance& instance : scene->instances) {
+  for (const wiw::scene::Instance& instance : scene->instances) {
     shared.insert(instance.meshes.begin(), instance.meshes.end());
     if (scene->categories[static_cast<std::size_t>(instance.category)] == "ball") continue;
     for (const std::uint32_t mesh : instance.meshes) of_meshes += scene->meshes[mesh].triangles.size();
@@ -89,18 +90,18 @@ TEST_CASE("the real house loads whole") {
 
 TEST_CASE("damaged worlds are refused by name and cause") {
   const Folder folder;
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(folder.path() / "none.world"), doctest::Contains("no such file"),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(folder.path() / "none.world"), doctest::Contains("no such file"),
                        wiw::FileError);
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(folder.write("cut.world", "<sdf><world>")),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(folder.write("cut.world", "<sdf><world>")),
                        doctest::Contains("not well-formed XML"), wiw::FileError);
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(folder.write("html.world", "<html/>")),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(folder.write("html.world", "<html/>")),
                        doctest::Contains("no <sdf> element"), wiw::FileError);
   const char* bad_pose = R"(<sdf><world><model name="m"><pose>1 2 x</pose><link/></model></world></sdf>)";
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(folder.write("pose.world", bad_pose)),
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(folder.write("pose.world", bad_pose)),
                        doctest::Contains("should hold 6 numbers"), wiw::FileError);
   folder.write("models/loop/model.sdf",
                R"(<sdf><model name="loop"><include><uri>model://loop</uri></include></model></sdf>)");
   const char* loop = R"(<sdf><world><include><uri>model://loop</uri></include></world></sdf>)";
-  CHECK_THROWS_WITH_AS(wiw::load_sdf_world(folder.write("loop.world", loop)), doctest::Contains("nested more than"),
-                       wiw::FileError);
+  CHECK_THROWS_WITH_AS(wiw::scene::load_sdf_world(folder.write("loop.world", loop)),
+                       doctest::Contains("nested more than"), wiw::FileError);
 }

@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 namespace {
 constexpr std::array<const char*, kActionCount> kNames = {"null", "forward", "turn_left", "turn_right", "stop"};
@@ -42,4 +42,4 @@ int ActionSpace::turns_per_circle() const {
   return std::abs(turns - std::round(turns)) < 1e-9 * turns ? static_cast<int>(std::lround(turns)) : 0;
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

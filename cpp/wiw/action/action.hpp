@@ -8,7 +8,7 @@
 
 #include "wiw/core/intrinsics.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// Navigation primitives, in the numbering of action-conditioned world models. `kNull` is no action: it stands in front
 /// of the first frame, which no action precedes, where a model wants one token a frame.
@@ -42,4 +42,4 @@ struct ActionSpace {
   [[nodiscard]] int turns_per_circle() const;
 };
 
-}  // namespace wiw
+}  // namespace wiw::action

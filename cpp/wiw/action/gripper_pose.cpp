@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 Eigen::Quaterniond to_quaternion(const Eigen::Vector3d& rpy) {
   return Eigen::AngleAxisd(rpy.z(), Eigen::Vector3d::UnitZ()) * Eigen::AngleAxisd(rpy.y(), Eigen::Vector3d::UnitY()) *
@@ -64,4 +64,4 @@ void GripperVocabulary::encode(const GripperPose& pose, std::vector<double>& val
   values.push_back(pose.gripper);
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

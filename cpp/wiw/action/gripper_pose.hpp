@@ -5,7 +5,7 @@
 #include <optional>
 #include <vector>
 
-namespace wiw {
+namespace wiw::action {
 
 /// Continuous 7-DoF action: where the end effector shall be. Rotation is Rz(yaw) Ry(pitch) Rx(roll), radians;
 /// gripper 1 is open, 0 is closed.
@@ -38,4 +38,4 @@ struct GripperVocabulary {
   void encode(const GripperPose& pose, std::vector<double>& values) const;
 };
 
-}  // namespace wiw
+}  // namespace wiw::action

@@ -5,7 +5,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 Padding to_padding(const std::string& name) {
   if (name == "forward") return Padding::kForward;
@@ -63,4 +63,4 @@ std::vector<FrameIndex> frames_of_actions(std::size_t count, std::size_t frames,
   return found;
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

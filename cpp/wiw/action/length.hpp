@@ -8,7 +8,7 @@
 
 #include "wiw/action/action.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// What fills a discrete plan that is shorter than a model's length: forward steps (models saw motion in training),
 /// the plan's last action again, or the null token.
@@ -37,4 +37,4 @@ struct FrameIndex {
 /// chunk answers `frames` - 1 actions. Throws ArgumentError if frames < 2 or a padded plan does not fit.
 std::vector<FrameIndex> frames_of_actions(std::size_t count, std::size_t frames, Fit fit);
 
-}  // namespace wiw
+}  // namespace wiw::action

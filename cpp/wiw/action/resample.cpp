@@ -5,7 +5,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 namespace {
 
@@ -73,4 +73,4 @@ std::vector<GripperPose> resample(std::span<const GripperPose> poses, std::size_
   });
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

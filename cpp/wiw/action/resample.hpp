@@ -9,7 +9,7 @@
 #include "wiw/action/gripper_pose.hpp"
 #include "wiw/action/trajectory.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// When the gripper changes between two waypoints: on reaching the second, or half-way.
 enum class GripperRule { kStep, kNearest };
@@ -24,4 +24,4 @@ std::vector<Pose> resample(std::span<const Pose> poses, std::size_t length, cons
 std::vector<GripperPose> resample(std::span<const GripperPose> poses, std::size_t length,
                                   const std::optional<GripperPose>& start = {}, GripperRule rule = GripperRule::kStep);
 
-}  // namespace wiw
+}  // namespace wiw::action

@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 namespace {
 
@@ -83,4 +83,4 @@ std::string to_text(std::span<const GripperPose> poses, const GripperTextTemplat
   return fill(words.prompt, {{"actions", joined}});
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

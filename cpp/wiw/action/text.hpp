@@ -8,7 +8,7 @@
 #include "wiw/action/action.hpp"
 #include "wiw/action/gripper_pose.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// How a navigation plan is put into words for models steered by a prompt. `{actions}` in the prompt is replaced by the
 /// phrases joined with the separator; `{metres}`, `{degrees}` and `{count}` in a phrase by what the phrase covers.
@@ -34,4 +34,4 @@ struct GripperTextTemplate {
 std::string to_text(std::span<const Action> actions, const TextTemplate& words, const ActionSpace& space);
 std::string to_text(std::span<const GripperPose> poses, const GripperTextTemplate& words);
 
-}  // namespace wiw
+}  // namespace wiw::action

@@ -3,7 +3,7 @@
 
 #include <cmath>
 
-namespace wiw {
+namespace wiw::action {
 
 std::vector<PlanarPose> to_trajectory(std::span<const Action> actions, const ActionSpace& space) {
   space.check();
@@ -33,4 +33,4 @@ PlanarPose relative_to(const PlanarPose& start, const PlanarPose& pose) {
 
 Pose to_viewpoint(const PlanarPose& pose) { return pose_from_yaw({-pose.y, 0, -pose.x}, pose.azimuth); }
 
-}  // namespace wiw
+}  // namespace wiw::action

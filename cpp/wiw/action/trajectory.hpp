@@ -7,7 +7,7 @@
 #include "wiw/action/action.hpp"
 #include "wiw/core/pose.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// Pose on the floor, relative to where a plan starts: x metres forward, y metres left, azimuth radians to the left.
 /// The azimuth counts full circles (sixteen left turns give 2 pi), so that it can be interpolated.
@@ -26,4 +26,4 @@ PlanarPose relative_to(const PlanarPose& start, const PlanarPose& pose);
 /// Camera pose T_start_camera in the camera convention (right +X, up +Y, looks down -Z).
 Pose to_viewpoint(const PlanarPose& pose);
 
-}  // namespace wiw
+}  // namespace wiw::action

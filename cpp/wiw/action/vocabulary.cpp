@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 Vocabulary::Vocabulary(const std::map<Action, std::vector<double>>& entries) {
   if (entries.empty()) throw ArgumentError("vocabulary: expected at least one action, got none");
@@ -43,4 +43,4 @@ std::vector<double> Vocabulary::encode(std::span<const Action> actions) const {
   return encoded;
 }
 
-}  // namespace wiw
+}  // namespace wiw::action

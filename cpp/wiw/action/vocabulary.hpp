@@ -8,7 +8,7 @@
 
 #include "wiw/action/action.hpp"
 
-namespace wiw {
+namespace wiw::action {
 
 /// A model's own words for the primitives: each known action has one id or one vector, all of the same width.
 class Vocabulary {
@@ -26,4 +26,4 @@ class Vocabulary {
   std::array<std::vector<double>, kActionCount> entries_;  // empty: unknown to the model
 };
 
-}  // namespace wiw
+}  // namespace wiw::action

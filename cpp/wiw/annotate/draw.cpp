@@ -48,7 +48,7 @@ int pixel(double coordinate, int limit) {
   return static_cast<int>(std::clamp(std::floor(coordinate), -1.0e6, 1.0e6 + limit));
 }
 
-void fill(const Image& image, const Box& box, const Color& color) {
+void fill(const Image& image, const ImageBox& box, const Color& color) {
   const int left = pixel(box.left, image.size.width);
   const int top = pixel(box.top, image.size.height);
   const int right = pixel(box.right - 1e-9, image.size.width);
@@ -71,12 +71,12 @@ void draw_label(const Image& image, const Point& corner, const std::string& labe
   const double width = plate_width(image, label);
   const double left = std::clamp(corner.x, 0.0, std::max(0.0, image.size.width - width));
   const double top = std::clamp(corner.y, 0.0, std::max(0.0, double(image.size.height) - height));
-  const Box area{left, top, left + width, top + height};
+  const ImageBox area{left, top, left + width, top + height};
   fill(image, area, plate);
   draw_text(image, area, label, contrast(plate), height - 4);
 }
 
-void outline(const Image& image, const Box& box, const Color& color, int thickness) {
+void outline(const Image& image, const ImageBox& box, const Color& color, int thickness) {
   const double inset = std::min<double>(thickness, std::min(box.right - box.left, box.bottom - box.top));
   fill(image, {box.left, box.top, box.right, box.top + inset}, color);
   fill(image, {box.left, box.bottom - inset, box.right, box.bottom}, color);
@@ -102,7 +102,7 @@ void check_image(const Image& image) {
   }
 }
 
-void draw_box(Image image, const Box& box, const Color& color, int thickness, const std::string& label) {
+void draw_box(Image image, const ImageBox& box, const Color& color, int thickness, const std::string& label) {
   check_image(image);
   check_thickness(thickness);
   check_finite({box.left, box.top, box.right, box.bottom});
@@ -148,7 +148,7 @@ void draw_axes(Image image, const Point& origin, const std::array<Point, 3>& end
   }
 }
 
-void draw_text(Image image, const Box& area, const std::string& text, const Color& color, int height) {
+void draw_text(Image image, const ImageBox& area, const std::string& text, const Color& color, int height) {
   check_image(image);
   std::string shown = printable(text);
   if (shown.empty()) return;

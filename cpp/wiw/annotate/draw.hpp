@@ -18,13 +18,13 @@ struct Point {
 };
 
 /// Rectangle between pixel edges. left > right means that it crosses the seam of a panorama and is drawn in two parts.
-struct Box {
+struct ImageBox {
   double left, top, right, bottom;
 };
 
 /// Outline `thickness` pixels wide inside the box, with a label on a plate of the same colour at its upper left corner,
 /// moved into the image where it would stick out; an empty label draws none.
-void draw_box(Image image, const Box& box, const Color& color, int thickness, const std::string& label);
+void draw_box(Image image, const ImageBox& box, const Color& color, int thickness, const std::string& label);
 
 /// Disc with a light rim, and a label on a dark plate (numbered candidates, the goal), with a line to it: `gap` pixels
 /// to its right, or to its left where negative.
@@ -35,7 +35,7 @@ void draw_axes(Image image, const Point& origin, const std::array<Point, 3>& end
 
 /// Text centred in an area, as large as fits but no higher than `height` pixels; cut with "..." where even the
 /// smallest readable size is too wide. Characters beyond ASCII are shown as '?': the built-in font has no others.
-void draw_text(Image image, const Box& area, const std::string& text, const Color& color, int height);
+void draw_text(Image image, const ImageBox& area, const std::string& text, const Color& color, int height);
 
 /// Throws ArgumentError unless the image has three channels and at least one pixel.
 void check_image(const Image& image);

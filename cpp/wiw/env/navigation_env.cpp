@@ -5,7 +5,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::env {
 
 namespace {
 
@@ -21,7 +21,8 @@ std::string text_of(const Eigen::Vector3d& point) {
 
 }  // namespace
 
-NavigationEnv::NavigationEnv(World world, const NavigationConfig& config) : world_(std::move(world)), config_(config) {
+NavigationEnv::NavigationEnv(NavigationWorld world, const NavigationConfig& config)
+    : world_(std::move(world)), config_(config) {
   config_.actions.check();
   if (world_.renderer == nullptr || world_.navmesh == nullptr || world_.ground == nullptr) {
     throw ArgumentError("NavigationEnv: expected a renderer, a navigation mesh and a ground");
@@ -46,13 +47,13 @@ void NavigationEnv::reset(const Eigen::Vector3d& position, double yaw, double to
   turns_ = 0;
 }
 
-bool NavigationEnv::step(Action action) {
-  if (const int sign = turn_sign(action); sign != 0) {
+bool NavigationEnv::step(action::Action action) {
+  if (const int sign = action::turn_sign(action); sign != 0) {
     turns_ += sign;
     if (const int circle = config_.actions.turns_per_circle(); circle != 0) turns_ %= circle;
     return true;
   }
-  if (action != Action::kForward) return false;
+  if (action != action::Action::kForward) return false;
   const Eigen::Vector3d heading(-std::sin(yaw()), 0, -std::cos(yaw()));
   const Eigen::Vector3d end = on_mesh_ + config_.actions.forward_m * heading;
   const Eigen::Vector3d before = on_mesh_;
@@ -81,18 +82,18 @@ Eigen::Vector3d NavigationEnv::odometry() const {
   return {-moved.z(), -moved.x(), wrapped(turns_ * config_.actions.turn_rad)};
 }
 
-std::vector<Pose> NavigationEnv::camera_poses_after(std::span<const Action> actions) const {
+std::vector<Pose> NavigationEnv::camera_poses_after(std::span<const action::Action> actions) const {
   NavigationEnv fork = *this;
   std::vector<Pose> poses;
   poses.reserve(actions.size());
-  for (const Action action : actions) {
+  for (const action::Action action : actions) {
     fork.step(action);
     poses.push_back(fork.T_world_camera());
   }
   return poses;
 }
 
-void NavigationEnv::observe(const ObservationTargets& targets) const { wiw::observe({this, 1}, targets); }
+void NavigationEnv::observe(const ObservationTargets& targets) const { env::observe({this, 1}, targets); }
 
 void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targets) {
   if (envs.empty()) return;
@@ -100,9 +101,9 @@ void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targ
   poses.reserve(envs.size());
   for (const NavigationEnv& env : envs) poses.push_back(env.T_world_camera());
   const NavigationConfig& config = envs[0].config();
-  Renderer& renderer = *envs[0].world().renderer;
+  render::Renderer& renderer = *envs[0].world().renderer;
   if (targets.panorama != nullptr || targets.depth != nullptr || targets.panorama_ids != nullptr) {
-    renderer.render(poses, {.projection = Projection::kEquirectangular, .size = config.panorama},
+    renderer.render(poses, {.projection = render::Projection::kEquirectangular, .size = config.panorama},
                     {.color = targets.panorama, .depth = targets.depth, .instance = targets.panorama_ids});
   }
   if (targets.front != nullptr || targets.front_ids != nullptr) {
@@ -111,4 +112,4 @@ void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targ
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::env

@@ -10,7 +10,7 @@
 #include "wiw/nav/nav_mesh.hpp"
 #include "wiw/render/renderer.hpp"
 
-namespace wiw {
+namespace wiw::env {
 
 /// What happens to a forward step whose end is not navigable.
 enum class Motion {
@@ -19,7 +19,7 @@ enum class Motion {
 };
 
 struct NavigationConfig {
-  ActionSpace actions;
+  action::ActionSpace actions;
   Motion motion = Motion::kRefuse;
   double camera_height = 1.0;  // metres above the floor that is drawn
   Size panorama{576, 1024};
@@ -28,8 +28,8 @@ struct NavigationConfig {
 };
 
 /// A scene with what is needed to see it and to walk in it; shared by all environments in that scene.
-struct World {
-  std::shared_ptr<Renderer> renderer;
+struct NavigationWorld {
+  std::shared_ptr<render::Renderer> renderer;
   std::shared_ptr<const nav::NavMesh> navmesh;
   std::shared_ptr<const nav::Ground> ground;
 };
@@ -48,14 +48,14 @@ struct ObservationTargets {
 /// to the last bit.
 class NavigationEnv {
  public:
-  NavigationEnv(World world, const NavigationConfig& config);
+  NavigationEnv(NavigationWorld world, const NavigationConfig& config);
 
   /// Puts the agent on the mesh. Throws NavigationError when `position` is more than `tolerance` metres beside it or
   /// more than kMaxLift above or below, ArgumentError when a number is not finite.
   void reset(const Eigen::Vector3d& position, double yaw, double tolerance = 0.3);
 
   /// Carries out one primitive; true if the pose changed. kNull and kStop change nothing.
-  bool step(Action action);
+  bool step(action::Action action);
 
   /// Where the agent stands, on the floor.
   [[nodiscard]] const Eigen::Vector3d& position() const { return position_; }
@@ -67,17 +67,17 @@ class NavigationEnv {
   [[nodiscard]] Eigen::Vector3d odometry() const;
 
   /// Camera poses after each of `actions`, carried out by a fork; this environment stays as it is.
-  [[nodiscard]] std::vector<Pose> camera_poses_after(std::span<const Action> actions) const;
+  [[nodiscard]] std::vector<Pose> camera_poses_after(std::span<const action::Action> actions) const;
 
   void observe(const ObservationTargets& targets) const;
 
-  [[nodiscard]] const World& world() const { return world_; }
+  [[nodiscard]] const NavigationWorld& world() const { return world_; }
   [[nodiscard]] const NavigationConfig& config() const { return config_; }
 
  private:
   void stand_at(const Eigen::Vector3f& on_mesh);
 
-  World world_;
+  NavigationWorld world_;
   NavigationConfig config_;
   Eigen::Vector3d on_mesh_ = Eigen::Vector3d::Zero();   // the point that walks: Recast's heights, above the floor
   Eigen::Vector3d position_ = Eigen::Vector3d::Zero();  // the same on the floor
@@ -89,4 +89,4 @@ class NavigationEnv {
 /// Observations of several agents in one scene, rendered as one batch: members of `targets` are [N, ...].
 void observe(std::span<const NavigationEnv> envs, const ObservationTargets& targets);
 
-}  // namespace wiw
+}  // namespace wiw::env

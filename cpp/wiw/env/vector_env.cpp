@@ -4,7 +4,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
 
-namespace wiw {
+namespace wiw::env {
 
 namespace {
 
@@ -27,7 +27,7 @@ void VectorEnv::replace(std::size_t i, const NavigationEnv& env) {
   place = env;
 }
 
-void VectorEnv::step(std::span<const Action> actions, std::span<bool> moved) {
+void VectorEnv::step(std::span<const action::Action> actions, std::span<bool> moved) {
   if (actions.size() != envs_.size() || moved.size() != envs_.size()) {
     throw ArgumentError("VectorEnv.step: expected " + std::to_string(envs_.size()) + " actions, got " +
                         std::to_string(actions.size()));
@@ -42,7 +42,7 @@ void VectorEnv::observe(const ObservationTargets& targets) const {
   for (std::size_t first = 0, last; first < envs_.size(); first = last) {
     last = first + 1;
     while (last < envs_.size() && envs_[last].world().renderer == envs_[first].world().renderer) ++last;
-    wiw::observe(std::span(envs_).subspan(first, last - first),
+    env::observe(std::span(envs_).subspan(first, last - first),
                  {.panorama = at(targets.panorama, first * panorama * 3),
                   .front = at(targets.front, first * front * 3),
                   .depth = at(targets.depth, first * panorama),
@@ -51,4 +51,4 @@ void VectorEnv::observe(const ObservationTargets& targets) const {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::env

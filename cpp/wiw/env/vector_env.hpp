@@ -6,7 +6,7 @@
 
 #include "wiw/env/navigation_env.hpp"
 
-namespace wiw {
+namespace wiw::env {
 
 /// Several environments stepped and observed together. They may be in different scenes; those of one scene share its
 /// renderer and navigation mesh.
@@ -23,7 +23,7 @@ class VectorEnv {
   void replace(std::size_t i, const NavigationEnv& env);
 
   /// One primitive each; moved[i] tells whether environment i changed its pose. kNull leaves an environment as it is.
-  void step(std::span<const Action> actions, std::span<bool> moved);
+  void step(std::span<const action::Action> actions, std::span<bool> moved);
 
   /// Writes batch-major observations: members of `targets` are [N, ...]. Neighbours in one scene are one batch for its
   /// renderer.
@@ -33,4 +33,4 @@ class VectorEnv {
   std::vector<NavigationEnv> envs_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::env

@@ -6,7 +6,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/core/image.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 template <class T>
 void check_pair(const ImageView<const T>& a, const ImageView<const T>& b, int smallest) {
@@ -23,4 +23,4 @@ void check_pair(const ImageView<const T>& a, const ImageView<const T>& b, int sm
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/metrics/pose_error.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 PoseError pose_error(const Pose& a, const Pose& b) {
   const Eigen::Quaterniond from(a.linear());
@@ -9,4 +9,4 @@ PoseError pose_error(const Pose& a, const Pose& b) {
   return {(a.translation() - b.translation()).norm(), from.angularDistance(to)};
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

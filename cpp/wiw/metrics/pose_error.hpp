@@ -3,7 +3,7 @@
 
 #include "wiw/core/pose.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 struct PoseError {
   double translation_m = 0;
@@ -12,4 +12,4 @@ struct PoseError {
 
 PoseError pose_error(const Pose& a, const Pose& b);
 
-}  // namespace wiw
+}  // namespace wiw::metrics

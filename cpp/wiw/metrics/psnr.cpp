@@ -6,7 +6,7 @@
 
 #include "wiw/metrics/image_pair.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 namespace {
 
@@ -54,4 +54,4 @@ double psnr(ImageView<const float> a, ImageView<const float> b, double range, We
   return psnr_of(a, b, range, weighting);
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

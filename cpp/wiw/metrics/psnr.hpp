@@ -6,7 +6,7 @@
 #include "wiw/core/image.hpp"
 #include "wiw/metrics/weighting.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 /// Images that agree have no error to measure; they get this value, so that means stay finite.
 constexpr double kPsnrCap = 100.0;
@@ -16,4 +16,4 @@ constexpr double kPsnrCap = 100.0;
 double psnr(ImageView<const std::uint8_t> a, ImageView<const std::uint8_t> b, double range, Weighting weighting);
 double psnr(ImageView<const float> a, ImageView<const float> b, double range, Weighting weighting);
 
-}  // namespace wiw
+}  // namespace wiw::metrics

@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 namespace {
 
@@ -60,4 +60,4 @@ double mean(std::span<const double> values) {
   return sum / static_cast<double>(values.size());
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

@@ -4,7 +4,7 @@
 #include <span>
 #include <vector>
 
-namespace wiw {
+namespace wiw::metrics {
 
 /// Share of an episode's success kept for the way taken: S * L' / max(L, L') with shortest length L' and travelled
 /// length L (Anderson et al. 2018, and the paper's ImageNav appendix). Credit S is in [0, 1]. Where L' is 0 the agent
@@ -19,4 +19,4 @@ std::vector<double> answer_credit(std::span<const double> raw);
 /// Throws ArgumentError for an empty list, which has no mean, and for values that are not finite.
 double mean(std::span<const double> values);
 
-}  // namespace wiw
+}  // namespace wiw::metrics

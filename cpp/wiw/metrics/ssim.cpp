@@ -7,7 +7,7 @@
 
 #include "wiw/metrics/image_pair.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 namespace {
 
@@ -141,4 +141,4 @@ double ssim(ImageView<const float> a, ImageView<const float> b, double range, We
   return ssim_of(a, b, range, weighting);
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

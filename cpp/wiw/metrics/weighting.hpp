@@ -5,7 +5,7 @@
 
 #include "wiw/core/intrinsics.hpp"
 
-namespace wiw {
+namespace wiw::metrics {
 
 /// How much a pixel counts. In an equirectangular image the rows near the poles show little of the sphere; kLatitude
 /// weighs each row with the cosine of its latitude (rows cover 180 degrees), which makes the mean one over the sphere.
@@ -15,4 +15,4 @@ inline double row_weight(Weighting weighting, double row_centre, int height) {
   return weighting == Weighting::kUniform ? 1.0 : std::cos(kPi * (row_centre / height - 0.5));
 }
 
-}  // namespace wiw
+}  // namespace wiw::metrics

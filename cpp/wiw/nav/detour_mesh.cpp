@@ -22,7 +22,7 @@ std::unique_ptr<dtNavMeshQuery> DetourMesh::make_query(int max_nodes) const {
   return query;
 }
 
-std::optional<Projection> DetourMesh::project(const Eigen::Vector3f& point) const {
+std::optional<MeshPoint> DetourMesh::project(const Eigen::Vector3f& point) const {
   static const Eigen::Vector3f half_extents(2.f, 4.f, 2.f);
   const dtMeshHeader& header = *tile().header;
   // Also keeps Detour's conversion of coordinates to integers in range; false for NaN.
@@ -31,7 +31,7 @@ std::optional<Projection> DetourMesh::project(const Eigen::Vector3f& point) cons
         point[axis] >= header.bmin[axis] - half_extents[axis] && point[axis] <= header.bmax[axis] + half_extents[axis];
     if (!near) return std::nullopt;
   }
-  Projection result;
+  MeshPoint result;
   const dtStatus status =
       nearest_->findNearestPoly(point.data(), half_extents.data(), &filter_, &result.ref, result.point.data());
   if (dtStatusFailed(status) || result.ref == 0) return std::nullopt;

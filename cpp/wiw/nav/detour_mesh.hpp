@@ -15,7 +15,7 @@
 namespace wiw::nav {
 
 /// Where a point meets the mesh.
-struct Projection {
+struct MeshPoint {
   dtPolyRef ref = 0;
   int polygon = -1;
   Eigen::Vector3f point;
@@ -38,7 +38,7 @@ class DetourMesh {
   void set_flags(int polygon, unsigned short flags) { mesh_->setPolyFlags(polygon_ref(polygon), flags); }
 
   /// Nearest point of the mesh within 2 m sideways and 4 m up or down; empty if there is none.
-  [[nodiscard]] std::optional<Projection> project(const Eigen::Vector3f& point) const;
+  [[nodiscard]] std::optional<MeshPoint> project(const Eigen::Vector3f& point) const;
 
   /// A query object for one caller at a time; goes back when the lease ends.
   class Lease {

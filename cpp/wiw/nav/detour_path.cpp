@@ -8,8 +8,8 @@ namespace {
 
 constexpr int kMaxPolygons = 256;
 
-std::vector<Eigen::Vector3f> search(const dtNavMeshQuery& query, const dtQueryFilter& filter, const Projection& start,
-                                    const Projection& end, int max_polygons) {
+std::vector<Eigen::Vector3f> search(const dtNavMeshQuery& query, const dtQueryFilter& filter, const MeshPoint& start,
+                                    const MeshPoint& end, int max_polygons) {
   std::vector<dtPolyRef> corridor(static_cast<std::size_t>(max_polygons));
   int length = 0;
   // Any detail bit (partial result, buffer too small, out of nodes) counts as failure, as in Habitat.
@@ -31,7 +31,7 @@ std::vector<Eigen::Vector3f> search(const dtNavMeshQuery& query, const dtQueryFi
 
 }  // namespace
 
-std::vector<Eigen::Vector3f> detour_path(const DetourMesh& mesh, const Projection& start, const Projection& end,
+std::vector<Eigen::Vector3f> detour_path(const DetourMesh& mesh, const MeshPoint& start, const MeshPoint& end,
                                          bool capped) {
   if (capped) {
     const DetourMesh::Lease query(mesh);

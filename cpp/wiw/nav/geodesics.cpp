@@ -15,7 +15,7 @@ constexpr auto kIgnoreCones = [](const Cone&) {};
 Geodesics::Geodesics(const PolygonGraph& graph)
     : graph_(graph), corners_(find_corners(graph)), corner_graph_(graph, corners_) {}
 
-Site Geodesics::site(const Projection& projection) const {
+Site Geodesics::site(const MeshPoint& projection) const {
   constexpr double kMargin = 2e-4;  // units: above the single-precision error of a coordinate 100 m out
   const Point2 at = graph_.to_plane(projection.point);
   return {projection.polygon, at, graph_.inside(projection.polygon, at, kMargin)};

@@ -21,7 +21,7 @@ class Geodesics {
   [[nodiscard]] const Corners& corners() const { return corners_; }
   [[nodiscard]] const CornerGraph& corner_graph() const { return corner_graph_; }
 
-  [[nodiscard]] Site site(const Projection& projection) const;
+  [[nodiscard]] Site site(const MeshPoint& projection) const;
   [[nodiscard]] double metres(Point2 a, Point2 b) const { return graph_.scale() * length(b - a); }
   [[nodiscard]] Leg leg(int corner, Point2 from) const { return {corner, metres(from, corners_.list[corner].at)}; }
 

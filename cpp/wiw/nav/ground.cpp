@@ -34,10 +34,10 @@ bool level(const Eigen::Matrix3f& corners) {
 
 }  // namespace
 
-Ground::Ground(const TriangleSoup& soup) {
+Ground::Ground(const scene::TriangleSoup& soup) {
   Eigen::AlignedBox2f box;
   for (const auto& triangle : soup.triangles) {
-    Triangle corners;
+    TriangleCorners corners;
     for (int k = 0; k < 3; ++k) corners.col(k) = soup.vertices[triangle[k]];
     if (!level(corners)) continue;
     triangles_.push_back(corners);
@@ -51,14 +51,15 @@ Ground::Ground(const TriangleSoup& soup) {
 
   // Counting sort: first how many triangles touch each cell, then where they go.
   first_.assign(static_cast<std::size_t>(cells_.prod()) + 1, 0);
-  const auto for_cells = [this](const Triangle& corners, auto&& visit) {
+  const auto for_cells = [this](const TriangleCorners& corners, auto&& visit) {
     const Eigen::Vector3f low = corners.rowwise().minCoeff(), high = corners.rowwise().maxCoeff();
     const Eigen::Vector2i from = cell_of(low.x(), low.z()), to = cell_of(high.x(), high.z());
     for (int row = from.y(); row <= to.y(); ++row) {
       for (int column = from.x(); column <= to.x(); ++column) visit(slot(column, row));
     }
   };
-  for (const Triangle& corners : triangles_) for_cells(corners, [this](std::size_t cell) { ++first_[cell + 1]; });
+  for (const TriangleCorners& corners : triangles_)
+    for_cells(corners, [this](std::size_t cell) { ++first_[cell + 1]; });
   std::partial_sum(first_.begin(), first_.end(), first_.begin());
   entries_.resize(first_.back());
   std::vector<std::uint32_t> next(first_.begin(), first_.end() - 1);

@@ -16,20 +16,20 @@ namespace wiw::nav {
 class Ground {
  public:
   /// Level enough triangles of the scene, sorted into columns of 0.25 m; a scene without any has no ground anywhere.
-  explicit Ground(const Scene& scene) : Ground(world_triangles(scene)) {}
-  explicit Ground(const TriangleSoup& soup);
+  explicit Ground(const scene::Scene& scene) : Ground(scene::world_triangles(scene)) {}
+  explicit Ground(const scene::TriangleSoup& soup);
 
   /// The highest surface at (x, z) from 0.45 m below to 0.1 m above the point, which lies on a navigation mesh:
   /// rounding and Recast's detail error lift that by up to two cells. The point's own y where there is no such surface.
   [[nodiscard]] double height(const Eigen::Vector3d& point) const;
 
  private:
-  using Triangle = Eigen::Matrix3f;  // columns are corners
+  using TriangleCorners = Eigen::Matrix3f;  // columns are corners
 
   [[nodiscard]] Eigen::Vector2i cell_of(double x, double z) const;
   [[nodiscard]] std::size_t slot(int column, int row) const;
 
-  std::vector<Triangle> triangles_;
+  std::vector<TriangleCorners> triangles_;
   Eigen::Vector2f origin_ = Eigen::Vector2f::Zero();  // least x and z
   double cell_ = 0.25;                                // metres
   Eigen::Vector2i cells_ = Eigen::Vector2i::Zero();

@@ -40,8 +40,8 @@ std::shared_ptr<NavMesh> NavMesh::from_triangles(std::span<const Eigen::Vector3f
   return mesh;
 }
 
-std::shared_ptr<NavMesh> NavMesh::build(const Scene& scene, const NavMeshSettings& settings) {
-  const TriangleSoup soup = world_triangles(scene);
+std::shared_ptr<NavMesh> NavMesh::build(const scene::Scene& scene, const NavMeshSettings& settings) {
+  const scene::TriangleSoup soup = scene::world_triangles(scene);
   return from_triangles(soup.vertices, soup.triangles, settings);
 }
 
@@ -134,7 +134,7 @@ Distance NavMesh::geodesic_distance(const Eigen::Vector3f& start, const Eigen::V
   return {path.length, path.reason};
 }
 
-Path NavMesh::exact_path(const Projection& start, const Projection& end) const {
+Path NavMesh::exact_path(const MeshPoint& start, const MeshPoint& end) const {
   const Geodesics& exact = geodesics();
   const Geodesics::Way way = exact.way(exact.site(start), exact.site(end));
   Path path{.points = {start.point}, .length = way.metres};

@@ -44,7 +44,7 @@ struct Path {
 class NavMesh {
  public:
   /// Throws ArgumentError if nothing is walkable.
-  static std::shared_ptr<NavMesh> build(const Scene& scene, const NavMeshSettings& settings = {});
+  static std::shared_ptr<NavMesh> build(const scene::Scene& scene, const NavMeshSettings& settings = {});
   static std::shared_ptr<NavMesh> from_triangles(std::span<const Eigen::Vector3f> vertices,
                                                  std::span<const Eigen::Matrix<std::uint32_t, 3, 1>> triangles,
                                                  const NavMeshSettings& settings = {});
@@ -85,18 +85,18 @@ class NavMesh {
   /// Points and lines are projected, so a line that leaves the mesh is measured along its edge.
   [[nodiscard]] double surface_length(std::span<const Eigen::Vector3f> points, float step = 0.05f) const;
 
-  [[nodiscard]] std::optional<Projection> project(const Eigen::Vector3f& point) const { return mesh_.project(point); }
+  [[nodiscard]] std::optional<MeshPoint> project(const Eigen::Vector3f& point) const { return mesh_.project(point); }
   /// The exact metric's visibility graph, made at the first call.
   [[nodiscard]] const Geodesics& geodesics() const;
 
  private:
   struct Ends {
-    Projection start, end;
+    MeshPoint start, end;
     Reason reason = Reason::kNone;
   };
   NavMesh(std::vector<std::uint8_t> tile, const NavMeshSettings& settings);
   [[nodiscard]] Ends project_ends(const Eigen::Vector3f& start, const Eigen::Vector3f& end) const;
-  [[nodiscard]] Path exact_path(const Projection& start, const Projection& end) const;
+  [[nodiscard]] Path exact_path(const MeshPoint& start, const MeshPoint& end) const;
 
   NavMeshSettings settings_;
   DetourMesh mesh_;

@@ -69,9 +69,9 @@ NavMeshSettings unpack(const StoredSettings& stored) {
   return s;
 }
 
-class Reader {
+class NavMeshReader {
  public:
-  Reader(std::string path, std::vector<std::uint8_t> bytes) : path_(std::move(path)), bytes_(std::move(bytes)) {}
+  NavMeshReader(std::string path, std::vector<std::uint8_t> bytes) : path_(std::move(path)), bytes_(std::move(bytes)) {}
 
   template <class T>
   T read(const char* what) {
@@ -114,7 +114,7 @@ std::vector<std::uint8_t> read_bytes(const std::string& path) {
   return bytes;
 }
 
-FileHeader read_header(Reader& reader) {
+FileHeader read_header(NavMeshReader& reader) {
   const auto header = reader.read<FileHeader>("the header");
   if (header.magic != kMagic) reader.fail("does not begin with 'TESM', the mark of a Habitat navigation mesh");
   if (header.version != 1 && header.version != 2) {
@@ -140,7 +140,7 @@ NavMeshSettings settings_of_tile(const std::vector<std::uint8_t>& tile) {
 }  // namespace
 
 NavMeshFile read_navmesh(const std::string& path) {
-  Reader reader(path, read_bytes(path));
+  NavMeshReader reader(path, read_bytes(path));
   NavMeshFile file;
   file.version = read_header(reader).version;
   StoredSettings stored;

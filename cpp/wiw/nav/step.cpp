@@ -15,7 +15,7 @@ struct Reached {
   dtPolyRef ref = 0;  // 0: nothing was walked
 };
 
-Reached slide(const dtNavMeshQuery& query, const dtQueryFilter& filter, const Projection& start,
+Reached slide(const dtNavMeshQuery& query, const dtQueryFilter& filter, const MeshPoint& start,
               const Eigen::Vector3f& end) {
   std::array<dtPolyRef, kMaxPolygons> visited{};
   int count = 0;
@@ -27,7 +27,7 @@ Reached slide(const dtNavMeshQuery& query, const dtQueryFilter& filter, const Pr
 }
 
 // Detour's raycast now and then passes a corner; the plane's own test does not.
-Reached stop_at_wall(const DetourMesh& mesh, const PolygonGraph& graph, const Projection& start,
+Reached stop_at_wall(const DetourMesh& mesh, const PolygonGraph& graph, const MeshPoint& start,
                      const Eigen::Vector3f& end) {
   const Point2 from = graph.inside(start.polygon, graph.to_plane(start.point), kMargin);
   const Stop stop = walk_straight(graph, start.polygon, from, graph.to_plane(end));
@@ -72,7 +72,7 @@ Stop walk_straight(const PolygonGraph& graph, int polygon, Point2 start, Point2 
 }
 
 Eigen::Vector3f walk(const DetourMesh& mesh, const PolygonGraph& graph, const std::vector<int>& polygon_island,
-                     const Projection& start, const Eigen::Vector3f& end, bool sliding) {
+                     const MeshPoint& start, const Eigen::Vector3f& end, bool sliding) {
   const DetourMesh::Lease query(mesh);
   Reached reached = sliding ? slide(*query, mesh.filter(), start, end) : stop_at_wall(mesh, graph, start, end);
   if (reached.ref == 0) return start.point;

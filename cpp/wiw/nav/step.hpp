@@ -18,6 +18,6 @@ Stop walk_straight(const PolygonGraph& graph, int polygon, Point2 start, Point2 
 
 /// Walks from a projected start towards `end` over the surface; `polygon_island` keeps it on the start's island.
 Eigen::Vector3f walk(const DetourMesh& mesh, const PolygonGraph& graph, const std::vector<int>& polygon_island,
-                     const Projection& start, const Eigen::Vector3f& end, bool sliding);
+                     const MeshPoint& start, const Eigen::Vector3f& end, bool sliding);
 
 }  // namespace wiw::nav

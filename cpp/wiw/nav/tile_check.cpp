@@ -12,7 +12,7 @@ namespace wiw::nav {
 namespace {
 
 // The arrays of a tile in the order they lie in it, copied out so that nothing depends on alignment.
-struct Tile {
+struct TileArrays {
   dtMeshHeader header;
   std::vector<float> vertices;
   std::vector<dtPoly> polygons;
@@ -68,8 +68,8 @@ std::size_t size_of_arrays(const dtMeshHeader& h) {
          bytes(h.detailVertCount, 12) + bytes(h.detailTriCount, 4) + bytes(h.bvNodeCount, sizeof(dtBVNode));
 }
 
-Tile split(std::span<const std::uint8_t> bytes, const dtMeshHeader& header) {
-  Tile tile{.header = header};
+TileArrays split(std::span<const std::uint8_t> bytes, const dtMeshHeader& header) {
+  TileArrays tile{.header = header};
   std::size_t offset = sizeof(dtMeshHeader);
   take(bytes, offset, header.vertCount * 3, tile.vertices);
   take(bytes, offset, header.polyCount, tile.polygons);
@@ -88,7 +88,7 @@ bool all_near(const std::vector<float>& coordinates) {
   return true;
 }
 
-std::string check_polygon(const Tile& tile, const dtPoly& polygon) {
+std::string check_polygon(const TileArrays& tile, const dtPoly& polygon) {
   if (polygon.vertCount < 3 || polygon.vertCount > DT_VERTS_PER_POLYGON) {
     return "expected 3 to 6 corners, got " + std::to_string(polygon.vertCount);
   }
@@ -104,7 +104,7 @@ std::string check_polygon(const Tile& tile, const dtPoly& polygon) {
 
 // Detour makes a link for each side with a neighbour and takes them from the room the tile sets aside, whose last one
 // it marks without asking whether there is one.
-std::string check_links(const Tile& tile) {
+std::string check_links(const TileArrays& tile) {
   int sides = 0;
   for (const dtPoly& polygon : tile.polygons) {
     for (int k = 0; k < polygon.vertCount; ++k) sides += polygon.neis[k] != 0;
@@ -114,7 +114,7 @@ std::string check_links(const Tile& tile) {
          " links, one for each side that two polygons share, got " + std::to_string(tile.header.maxLinkCount);
 }
 
-std::string check_detail(const Tile& tile, const dtPolyDetail& detail, int corners) {
+std::string check_detail(const TileArrays& tile, const dtPolyDetail& detail, int corners) {
   const auto vertices = static_cast<std::uint64_t>(detail.vertBase) + detail.vertCount;
   const auto triangles = static_cast<std::uint64_t>(detail.triBase) + detail.triCount;
   if (vertices > static_cast<std::uint64_t>(tile.header.detailVertCount) ||
@@ -134,7 +134,7 @@ std::string check_detail(const Tile& tile, const dtPolyDetail& detail, int corne
 }
 
 // A node's index is a polygon, or how far to jump when the box is missed; a jump must go forward and stay inside.
-std::string check_tree(const Tile& tile) {
+std::string check_tree(const TileArrays& tile) {
   const int count = tile.header.bvNodeCount;
   for (int i = 0; i < count; ++i) {
     const int target = tile.nodes[static_cast<std::size_t>(i)].i;
@@ -157,7 +157,7 @@ std::string find_tile_fault(std::span<const std::uint8_t> bytes) {
     return expected("bytes in the tile, by its header", static_cast<long long>(size),
                     static_cast<long long>(bytes.size()));
   }
-  const Tile tile = split(bytes, header);
+  const TileArrays tile = split(bytes, header);
   if (!all_near(tile.vertices) || !all_near(tile.detail_vertices)) {
     return "a vertex is not finite or lies beyond 1000 km";
   }

@@ -13,7 +13,7 @@ namespace wiw::physics {
 namespace {
 
 constexpr int kMax = InverseKinematics::kMaxJoints;
-using Vector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMax, 1>;
+using JointVector = Eigen::Matrix<double, Eigen::Dynamic, 1, 0, kMax, 1>;
 using Jacobian = Eigen::Matrix<double, 6, Eigen::Dynamic, 0, 6, kMax>;
 using Vector6 = Eigen::Matrix<double, 6, 1>;
 using Matrix6 = Eigen::Matrix<double, 6, 6>;
@@ -202,7 +202,7 @@ struct InverseKinematics::Search {
   const Pose target;
   const IkOptions& options;
   const Eigen::Index n;
-  Vector q, dq;
+  JointVector q, dq;
   Jacobian jacobian;
   Vector6 error = Vector6::Zero();
   double position_error = 0, rotation_error = 0;

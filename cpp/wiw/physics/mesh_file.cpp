@@ -65,9 +65,9 @@ class MeshFile {
   /// What assimp does not survive.
   void check_damage() const {
     try {
-      if (extension_of(path_) == ".ply") check_ply(path_);
-      if (extension_of(path_) == ".dae") check_collada(path_);
-      if (extension_of(path_) == ".obj") check_obj(path_);
+      if (extension_of(path_) == ".ply") scene::check_ply(path_);
+      if (extension_of(path_) == ".dae") scene::check_collada(path_);
+      if (extension_of(path_) == ".obj") scene::check_obj(path_);
     } catch (const FileError& damage) {
       const std::string text = damage.what();
       const std::string own = path_.string() + ": ";
@@ -117,7 +117,7 @@ Eigen::Vector4f color_of(const aiScene& scene, const aiMesh& mesh) {
   return {color.r, color.g, color.b, 1.f};
 }
 
-void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& scale, Surface& surface) {
+void append(const aiScene& scene, const aiMesh& mesh, const Eigen::Vector3f& scale, VisualMesh& surface) {
   const auto first = static_cast<std::uint32_t>(surface.positions.size());
   const Eigen::Vector4f color = color_of(scene, mesh);
   for (unsigned v = 0; v < mesh.mNumVertices; ++v) {
@@ -136,14 +136,14 @@ void check_scale(const MeshFile& file, const Eigen::Vector3d& scale) {
   if (!scale.allFinite() || (scale.array() == 0).any()) throw file.error("expected finite factors of scale, none zero");
 }
 
-Surface read_surface(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+VisualMesh read_surface(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
   MeshFile file(path, link);
   check_scale(file, scale);
   unsigned steps =
       aiProcess_Triangulate | aiProcess_SortByPType | aiProcess_GenSmoothNormals | aiProcess_JoinIdenticalVertices;
   if (is_stl(path)) steps |= aiProcess_RemoveComponent;
   const aiScene& scene = file.read(steps);
-  Surface surface;
+  VisualMesh surface;
   for (unsigned m = 0; m < scene.mNumMeshes; ++m) append(scene, *scene.mMeshes[m], scale.cast<float>(), surface);
   if (surface.triangles.empty()) throw file.error("it has no triangles");
   return surface;
@@ -167,12 +167,12 @@ std::vector<Eigen::Vector3d> read_hull(const fs::path& path, const Eigen::Vector
 
 }  // namespace
 
-Surface surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
-  return read_as_file(path, [&] { return read_surface(path, scale, link); });
+VisualMesh surface_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
+  return scene::read_as_file(path, [&] { return read_surface(path, scale, link); });
 }
 
 std::vector<Eigen::Vector3d> hull_of_file(const fs::path& path, const Eigen::Vector3d& scale, const std::string& link) {
-  return read_as_file(path, [&] { return read_hull(path, scale, link); });
+  return scene::read_as_file(path, [&] { return read_hull(path, scale, link); });
 }
 
 fs::path find_mesh(const std::string& name, const fs::path& folder) {

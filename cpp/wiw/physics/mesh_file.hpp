@@ -10,14 +10,14 @@
 namespace wiw::physics {
 
 /// A surface to look at: smooth normals, and a colour where the file gives it one.
-struct Surface {
+struct VisualMesh {
   std::vector<Eigen::Vector3f> positions, normals;
   std::vector<Eigen::Vector4f> colors;  // RGBA; alpha 0: the file says nothing
   std::vector<Eigen::Matrix<std::uint32_t, 3, 1>> triangles;
 };
 
 /// What a mesh file shows, as `hull_of_file` reads it. Materials give their diffuse colour; textures are not read.
-Surface surface_of_file(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link);
+VisualMesh surface_of_file(const std::filesystem::path& path, const Eigen::Vector3d& scale, const std::string& link);
 
 /// Vertices of the convex hull of a mesh file (STL, OBJ, DAE, ...) in the file's axes, node transforms applied.
 /// Throws FileError, which names file and `link`, for a file that is missing, damaged or flat.

@@ -48,7 +48,7 @@ struct Check {
 Eigen::Matrix3d diagonal(double x, double y, double z) { return Eigen::Vector3d(x, y, z).asDiagonal(); }
 
 /// Volume, centre and inertia at density 1.
-struct Unit {
+struct UnitDensity {
   MassProperties operator()(const Box& box) const {
     const Eigen::Vector3d s = box.size.cwiseAbs2();
     const double volume = box.size.prod();
@@ -164,7 +164,7 @@ MassProperties joined(const MassProperties& a, const MassProperties& b) {
 
 MassProperties mass_properties(std::span<const Part> parts, double mass) {
   MassProperties all;
-  for (const Part& part : parts) all = joined(all, moved(std::visit(Unit{}, part.shape), part.pose));
+  for (const Part& part : parts) all = joined(all, moved(std::visit(UnitDensity{}, part.shape), part.pose));
   all.inertia *= mass / all.mass;
   all.mass = mass;
   return all;

@@ -70,9 +70,9 @@ Pose to_pose(const urdf::Pose& from, const std::string& what) {
 constexpr int kDeepest = 1000;                // links one below another; arms have some ten
 constexpr std::size_t kMaxBytes = 64u << 20;  // of a description
 
-class Reader {
+class UrdfReader {
  public:
-  Reader(const urdf::ModelInterface& model, std::string source, fs::path folder)
+  UrdfReader(const urdf::ModelInterface& model, std::string source, fs::path folder)
       : model_(model), source_(std::move(source)), folder_(std::move(folder)) {}
 
   ArticulationPtr read() {
@@ -246,7 +246,7 @@ class Reader {
 ArticulationPtr read_model(const std::string& text, const std::string& source, const fs::path& folder) {
   const auto model = parse_xml(text, source);
   try {
-    return Reader(*model, source, folder).read();
+    return UrdfReader(*model, source, folder).read();
   } catch (const ArgumentError& error) {
     throw ArgumentError(restore_percent_signs(error.what()));
   }
@@ -255,8 +255,9 @@ ArticulationPtr read_model(const std::string& text, const std::string& source, c
 }  // namespace
 
 ArticulationPtr Articulation::load(const fs::path& urdf) {
-  if (size_of_file(urdf) > kMaxBytes) throw FileError(urdf.string(), "larger than 64 MiB, which no robot has need of");
-  const auto bytes = read_file(urdf);
+  if (scene::size_of_file(urdf) > kMaxBytes)
+    throw FileError(urdf.string(), "larger than 64 MiB, which no robot has need of");
+  const auto bytes = scene::read_file(urdf);
   return read_model({bytes.begin(), bytes.end()}, urdf.string(), urdf.parent_path());
 }
 

@@ -72,9 +72,9 @@ std::string replace_all(std::string_view text, std::string_view old, std::string
   return result.append(text);
 }
 
-class Checker : public pugi::xml_tree_walker {
+class UrdfChecker : public pugi::xml_tree_walker {
  public:
-  explicit Checker(std::string source) : source_(std::move(source)) {}
+  explicit UrdfChecker(std::string source) : source_(std::move(source)) {}
 
   bool for_each(pugi::xml_node& element) override {
     if (depth() > kDeepest) fail("its elements lie more than " + std::to_string(kDeepest) + " deep in each other");
@@ -127,7 +127,7 @@ std::string check_urdf_text(const std::string& text, const std::string& source) 
     throw FileError(source, "not a robot description (URDF): " + std::string(result.description()) + " at byte " +
                                 std::to_string(result.offset));
   }
-  Checker checker(source);
+  UrdfChecker checker(source);
   pugi::xml_node robot = document.child("robot");
   if (robot) checker.for_each(robot);
   for (const char* part : {"link", "joint", "material"}) {

@@ -9,7 +9,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 namespace {
 
@@ -21,8 +21,8 @@ void convert(const Batch& batch, const ViewIndex::Distinct& distinct, const Pano
     maker.from_panorama(panorama, real.size, source.frame * batch.spec().space.turn_rad, out);
     return;
   }
-  const Batch::Place place = batch.place(source);
-  const Rollout& rollout = imagined.rollouts[static_cast<std::size_t>(place.part)];
+  const Batch::FrameAddress place = batch.place(source);
+  const CallFrames& rollout = imagined.rollouts[static_cast<std::size_t>(place.call)];
   const std::uint8_t* pixels = rollout.data + place.index * rollout.row_stride + place.frame * rollout.frame_stride;
   if (imagined.kind == FrameKind::kPanorama) {
     maker.from_panorama(pixels, rollout.size, 0, out);
@@ -71,16 +71,16 @@ void check_inputs(const Batch& batch, const Panoramas& real, const Imagination& 
                           " and plans for episode " + std::to_string(episode));
     }
   }
-  if (imagined.rollouts.size() != batch.parts().size()) {
-    throw ArgumentError("expected one rollout for each of the batch's " + std::to_string(batch.parts().size()) +
+  if (imagined.rollouts.size() != batch.calls().size()) {
+    throw ArgumentError("expected one rollout for each of the batch's " + std::to_string(batch.calls().size()) +
                         " parts, got " + std::to_string(imagined.rollouts.size()));
   }
   for (std::size_t i = 0; i < imagined.rollouts.size(); ++i) {
-    const Part& part = batch.parts()[i];
-    const Rollout& rollout = imagined.rollouts[i];
-    if (rollout.rows != part.rows.size() || rollout.frames != static_cast<std::size_t>(part.steps) + 1) {
-      throw ArgumentError("rollout of part " + std::to_string(i) + ": expected " + std::to_string(part.rows.size()) +
-                          " rows of " + std::to_string(part.steps + 1) +
+    const ModelCall& call = batch.calls()[i];
+    const CallFrames& rollout = imagined.rollouts[i];
+    if (rollout.rows != call.rows.size() || rollout.frames != static_cast<std::size_t>(call.steps) + 1) {
+      throw ArgumentError("rollout of part " + std::to_string(i) + ": expected " + std::to_string(call.rows.size()) +
+                          " rows of " + std::to_string(call.steps + 1) +
                           " frames (the observation and one an action), got " + std::to_string(rollout.rows) +
                           " rows of " + std::to_string(rollout.frames));
     }
@@ -132,4 +132,4 @@ void make_depths(const Batch& batch, const float* distances, Size size, const Vi
   });
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

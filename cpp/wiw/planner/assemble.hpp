@@ -9,7 +9,7 @@
 #include "wiw/planner/batch.hpp"
 #include "wiw/planner/view_maker.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 /// Observations of the candidates' steps with repetitions named: cells[candidate * steps + step] is the index of a
 /// distinct observation, -1 behind the end of a plan.
@@ -36,9 +36,9 @@ struct Panoramas {
   Size size;
 };
 
-/// What the model answered to one part: uint8 [rows, frames, H, W, 3]. Images are dense; rows and frames may lie any
-/// number of bytes apart, also none (a model that repeats an image need not copy it).
-struct Rollout {
+/// Frames that the model answered one call with: uint8 [rows, frames, H, W, 3]. Images are dense; rows and frames may
+/// lie any number of bytes apart, also none (a model that repeats an image need not copy it).
+struct CallFrames {
   const std::uint8_t* data = nullptr;
   std::size_t rows = 0;
   std::size_t frames = 0;
@@ -47,13 +47,13 @@ struct Rollout {
   std::ptrdiff_t frame_stride = 0;
 };
 
-/// What the model answered to each part of a batch.
+/// Frames of each call of a batch.
 struct Imagination {
   FrameKind kind = FrameKind::kPanorama;
-  std::vector<Rollout> rollouts;
+  std::vector<CallFrames> rollouts;
 };
 
-/// Throws ArgumentError unless there is one panorama an episode and one rollout of the right length a part.
+/// Throws ArgumentError unless there is one panorama an episode and frames of the right length for each call.
 void check_inputs(const Batch& batch, const Panoramas& real, const Imagination& imagined);
 
 /// Views of each distinct observation once, [distinct, bytes of the maker].
@@ -71,4 +71,4 @@ void make_observations(const Batch& batch, const Panoramas& real, const ViewMake
 /// The same for depth, distances float [episodes, H, W] -> [rows, height, width]; see ViewMaker::depth.
 void make_depths(const Batch& batch, const float* distances, Size size, const ViewMaker& maker, float* out);
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -6,23 +6,23 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 namespace {
 
-bool begins_with(const ActionSequence& plan, const ActionSequence& beginning) {
+bool begins_with(const action::ActionSequence& plan, const action::ActionSequence& beginning) {
   return plan.size() >= beginning.size() && std::equal(beginning.begin(), beginning.end(), plan.begin());
 }
 
 /// The plan as the model will see it: whole calls, padded.
-ActionSequence filled(const ActionSequence& plan, const ModelSpec& spec) {
+action::ActionSequence filled(const action::ActionSequence& plan, const ModelSpec& spec) {
   if (spec.steps() == 0 || plan.empty()) return plan;
   const auto steps = static_cast<std::size_t>(spec.steps());
-  return pad(plan, (plan.size() + steps - 1) / steps * steps, spec.padding);
+  return action::pad(plan, (plan.size() + steps - 1) / steps * steps, spec.padding);
 }
 
 /// Whether a rollout of `row` also answers `plan`.
-bool answers(const ActionSequence& row, const ActionSequence& plan, const ModelSpec& spec) {
+bool answers(const action::ActionSequence& row, const action::ActionSequence& plan, const ModelSpec& spec) {
   if (spec.causal) return begins_with(row, plan);
   return row == plan || (row.size() >= plan.size() && filled(row, spec) == filled(plan, spec));
 }
@@ -42,7 +42,7 @@ Batch::Batch(const Plans& plans, const ModelSpec& spec) : spec_(spec) {
   spec_.check();
   for (std::size_t episode = 0; episode < plans.size(); ++episode) {
     std::vector<SplitPlan> splits;
-    for (const ActionSequence& plan : plans[episode]) {
+    for (const action::ActionSequence& plan : plans[episode]) {
       splits.push_back(split_leading_turns(plan, spec_.leading, spec_.space));
     }
     merge(splits, static_cast<int>(episode));
@@ -86,7 +86,7 @@ void Batch::merge(const std::vector<SplitPlan>& splits, int episode) {
 
 int Batch::common_frames(const Row& earlier, const Row& later) const {
   if (earlier.episode != later.episode || earlier.turns != later.turns) return 0;
-  const auto common = [](const ActionSequence& a, const ActionSequence& b) {
+  const auto common = [](const action::ActionSequence& a, const action::ActionSequence& b) {
     return static_cast<int>(std::mismatch(a.begin(), a.end(), b.begin(), b.end()).first - a.begin());
   };
   if (spec_.causal) return common(earlier.actions, later.actions);
@@ -122,11 +122,11 @@ std::size_t Batch::longest() const {
   return steps;
 }
 
-Batch::Place Batch::place(const Source& source) const {
+Batch::FrameAddress Batch::place(const Source& source) const {
   const int call = spec_.steps() == 0 ? 0 : (source.frame - 1) / spec_.steps();
-  Place place = places_[static_cast<std::size_t>(source.row)][static_cast<std::size_t>(call)];
-  place.frame = source.frame - parts_[static_cast<std::size_t>(place.part)].first;
+  FrameAddress place = places_[static_cast<std::size_t>(source.row)][static_cast<std::size_t>(call)];
+  place.frame = source.frame - calls_[static_cast<std::size_t>(place.call)].first;
   return place;
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/planner/leading_turns.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 namespace {
 
@@ -13,13 +13,13 @@ int within_circle(int turns, int circle) {
 
 }  // namespace
 
-SplitPlan split_leading_turns(std::span<const Action> plan, Leading leading, const ActionSpace& space) {
+SplitPlan split_leading_turns(std::span<const action::Action> plan, Leading leading, const action::ActionSpace& space) {
   SplitPlan split;
   const int circle = space.turns_per_circle();
   std::size_t step = 0;
   int net = 0;
-  for (; leading != Leading::kNone && step < plan.size() && plan[step] != Action::kForward; ++step) {
-    const int sign = turn_sign(plan[step]);
+  for (; leading != Leading::kNone && step < plan.size() && plan[step] != action::Action::kForward; ++step) {
+    const int sign = action::turn_sign(plan[step]);
     if (leading == Leading::kSameDirection && sign * net < 0) break;
     net += sign;
     split.rolled.push_back(within_circle(net, circle));
@@ -29,4 +29,4 @@ SplitPlan split_leading_turns(std::span<const Action> plan, Leading leading, con
   return split;
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -3,7 +3,7 @@
 
 #include "wiw/action/length.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 /// Which turns at the start of a plan are answered by rolling the real panorama instead of asking the model.
 enum class Leading {
@@ -16,10 +16,10 @@ enum class Leading {
 struct ModelSpec {
   bool causal = false;  // frame k depends on actions 1..k only
   int frames = 0;       // length of a rollout, the observation included; 0: any
-  Padding padding = Padding::kForward;
+  action::Padding padding = action::Padding::kForward;
   Leading leading = Leading::kSameDirection;
   int max_rows = 0;  // most rows in one call; 0: all at once
-  ActionSpace space;
+  action::ActionSpace space;
 
   /// Actions one call answers; 0: any number.
   [[nodiscard]] int steps() const { return frames == 0 ? 0 : frames - 1; }
@@ -27,4 +27,4 @@ struct ModelSpec {
   void check() const;
 };
 
-}  // namespace wiw
+}  // namespace wiw::planner

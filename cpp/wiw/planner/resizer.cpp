@@ -9,7 +9,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 namespace {
 
@@ -38,21 +38,21 @@ Resizer::Resizer(Size from, Size to, Keep keep) : from_(from), to_(to) {
                  : make_axis(from.height, to.height, from.width, to.width, false);
 }
 
-Resizer::Axis Resizer::make_axis(int from, int to, int in, int out, bool wrap) {
+Resizer::AxisTaps Resizer::make_axis(int from, int to, int in, int out, bool wrap) {
   const int common = std::gcd(in, out);
   in /= common;
   out /= common;
   return out <= in ? averages(from, to, in, out) : interpolations(from, to, in, out, wrap);
 }
 
-Resizer::Axis Resizer::averages(int from, int to, int in, int out) {
+Resizer::AxisTaps Resizer::averages(int from, int to, int in, int out) {
   int twice_first = from * out - to * in;  // where output 0 begins, in units of 1/(2 out) of an input pixel
   if (twice_first % 2 != 0) {
     in *= 2;
     out *= 2;
     twice_first *= 2;
   }
-  Axis axis;
+  AxisTaps axis;
   axis.total = static_cast<std::uint32_t>(in);
   // In units of 1/out of an input pixel: output i covers [begin, begin + in), input j [j * out, (j + 1) * out).
   for (int i = 0, begin = twice_first / 2; i < to; ++i, begin += in) {
@@ -66,8 +66,8 @@ Resizer::Axis Resizer::averages(int from, int to, int in, int out) {
   return axis;
 }
 
-Resizer::Axis Resizer::interpolations(int from, int to, int in, int out, bool wrap) {
-  Axis axis;
+Resizer::AxisTaps Resizer::interpolations(int from, int to, int in, int out, bool wrap) {
+  AxisTaps axis;
   axis.total = static_cast<std::uint32_t>(2 * out);
   const auto place = [&](int j) { return wrap ? wrapped(j, from) : std::clamp(j, 0, from - 1); };
   for (int i = 0; i < to; ++i) {
@@ -131,4 +131,4 @@ void Resizer::operator()(const std::uint8_t* source, int shift, std::uint8_t* ou
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

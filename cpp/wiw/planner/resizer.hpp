@@ -6,7 +6,7 @@
 
 #include "wiw/core/image.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 /// What stays when an image is resized.
 enum class Keep {
@@ -34,20 +34,20 @@ class Resizer {
     std::uint16_t weight;
   };
   /// Output i is the sum over taps[begin[i] .. begin[i + 1]) divided by `total`.
-  struct Axis {
+  struct AxisTaps {
     std::vector<Tap> taps;
     std::vector<std::size_t> begin;
     std::uint32_t total = 0;
   };
   /// `in` of the `from` input pixels become `out` of the `to` output pixels, and the middle stays the middle.
-  static Axis make_axis(int from, int to, int in, int out, bool wrap);
-  static Axis averages(int from, int to, int in, int out);
-  static Axis interpolations(int from, int to, int in, int out, bool wrap);
+  static AxisTaps make_axis(int from, int to, int in, int out, bool wrap);
+  static AxisTaps averages(int from, int to, int in, int out);
+  static AxisTaps interpolations(int from, int to, int in, int out, bool wrap);
 
   Size from_;
   Size to_;
-  Axis rows_;
-  Axis columns_;
+  AxisTaps rows_;
+  AxisTaps columns_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -4,7 +4,7 @@
 
 #include "wiw/planner/batch.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 /// Sorts the rows into calls: by position in the plan, then, for models of any length that look ahead, by length
 /// (padding would change what they imagine).
@@ -22,12 +22,12 @@ void Batch::schedule() {
       if (rows_[r].shared >= end) continue;  // answered whole by an earlier row
       by_length[spec_.steps() == 0 && !spec_.causal ? length : 0].push_back(static_cast<int>(r));
     }
-    for (auto& [length, rows] : by_length) add_parts(first, rows);
+    for (auto& [length, rows] : by_length) add_calls(first, rows);
     if (!any || spec_.steps() == 0) return;
   }
 }
 
-void Batch::add_parts(int first, const std::vector<int>& rows) {
+void Batch::add_calls(int first, const std::vector<int>& rows) {
   const std::size_t most = spec_.max_rows == 0 ? rows.size() : static_cast<std::size_t>(spec_.max_rows);
   for (std::size_t begin = 0; begin < rows.size(); begin += most) {
     const auto from = rows.begin() + static_cast<std::ptrdiff_t>(begin);
@@ -37,24 +37,24 @@ void Batch::add_parts(int first, const std::vector<int>& rows) {
       for (const int r : some)
         steps = std::max(steps, static_cast<int>(rows_[static_cast<std::size_t>(r)].actions.size()));
     }
-    add_part(first, steps, some);
+    add_call(first, steps, some);
   }
 }
 
-void Batch::add_part(int first, int steps, const std::vector<int>& rows) {
-  Part part{.first = first, .steps = steps, .rows = rows};
+void Batch::add_call(int first, int steps, const std::vector<int>& rows) {
+  ModelCall call{.first = first, .steps = steps, .rows = rows};
   for (std::size_t i = 0; i < rows.size(); ++i) {
     const Row& row = rows_[static_cast<std::size_t>(rows[i])];
     const int length = std::min(steps, static_cast<int>(row.actions.size()) - first);
-    const std::span<const Action> own(row.actions.data() + first, static_cast<std::size_t>(length));
-    part.actions.push_back(pad(own, static_cast<std::size_t>(steps), spec_.padding));
-    part.length.push_back(length);
+    const std::span<const action::Action> own(row.actions.data() + first, static_cast<std::size_t>(length));
+    call.actions.push_back(action::pad(own, static_cast<std::size_t>(steps), spec_.padding));
+    call.length.push_back(length);
     const bool here = row.parent >= rows.front() && std::find(rows.begin(), rows.end(), row.parent) != rows.end();
-    part.shared.push_back(here ? std::clamp(row.shared - first, 0, length) : 0);
-    if (first > 0) part.start.push_back(canonical({rows[i], first}));
-    places_[static_cast<std::size_t>(rows[i])].back() = {static_cast<int>(parts_.size()), static_cast<int>(i), 0};
+    call.shared.push_back(here ? std::clamp(row.shared - first, 0, length) : 0);
+    if (first > 0) call.start.push_back(canonical({rows[i], first}));
+    places_[static_cast<std::size_t>(rows[i])].back() = {static_cast<int>(calls_.size()), static_cast<int>(i), 0};
   }
-  parts_.push_back(std::move(part));
+  calls_.push_back(std::move(call));
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -7,7 +7,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/panorama/roll.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 namespace {
 
@@ -105,4 +105,4 @@ void ViewMaker::depth(const float* panorama, Size size, double yaw, float* out) 
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -11,7 +11,7 @@
 #include "wiw/panorama/perspective.hpp"
 #include "wiw/planner/resizer.hpp"
 
-namespace wiw {
+namespace wiw::planner {
 
 enum class ViewKind {
   kFront,     // one perspective view
@@ -63,4 +63,4 @@ class ViewMaker {
   mutable std::map<std::pair<int, int>, std::unique_ptr<Resizer>> resizers_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::planner

@@ -6,7 +6,7 @@
 #include <array>
 #include <cmath>
 
-namespace wiw {
+namespace wiw::render {
 
 /// How far the curved surface that the unit vertex normals describe stands out of the triangle, metres: the greatest
 /// depth of a vertex below the tangent plane of another. 0 where the surface is flat or hollow, and for normals more
@@ -24,4 +24,4 @@ inline float triangle_bulge(const std::array<Eigen::Vector3f, 3>& corners,
   return bulge;
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

@@ -6,7 +6,7 @@
 
 #include "wiw/render/shading.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 namespace {
 
@@ -62,7 +62,7 @@ MipLevel halve(const std::uint8_t* source, Size size) {
 
 }  // namespace
 
-std::vector<MipLevel> build_mips(const Texture& texture) {
+std::vector<MipLevel> build_mips(const scene::Texture& texture) {
   std::vector<MipLevel> levels;
   const std::uint8_t* source = texture.rgba.data();
   Size size = texture.size;
@@ -74,4 +74,4 @@ std::vector<MipLevel> build_mips(const Texture& texture) {
   return levels;
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

@@ -7,7 +7,7 @@
 #include "wiw/core/image.hpp"
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 struct MipLevel {
   Size size;
@@ -17,6 +17,6 @@ struct MipLevel {
 /// Mip levels 1, 2, ... of a texture down to 1 x 1 (level 0 is the texture itself), at most `kMaxMipLevels` in all.
 /// Each side halves, rounding down; every texel is the area-weighted mean of the texels it covers, on the encoded
 /// values, so odd sizes neither shift nor drop rows.
-std::vector<MipLevel> build_mips(const Texture& texture);
+std::vector<MipLevel> build_mips(const scene::Texture& texture);
 
-}  // namespace wiw
+}  // namespace wiw::render

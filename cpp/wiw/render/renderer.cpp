@@ -7,9 +7,9 @@
 #include "wiw/render/cpu/cpu_renderer.hpp"
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
-std::shared_ptr<Renderer> make_renderer(ScenePtr scene, Backend backend, const RenderOptions& options) {
+std::shared_ptr<Renderer> make_renderer(scene::ScenePtr scene, Backend backend, const RenderOptions& options) {
   if (scene == nullptr) throw ArgumentError("make_renderer: expected a scene, got none");
   if (backend == Backend::kGpu || (backend == Backend::kAuto && has_gpu_hardware())) {
     return make_gpu_renderer(std::move(scene), options);
@@ -17,4 +17,4 @@ std::shared_ptr<Renderer> make_renderer(ScenePtr scene, Backend backend, const R
   return make_cpu_renderer(std::move(scene), options);
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

@@ -10,7 +10,7 @@
 #include "wiw/core/pose.hpp"
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 enum class Projection {
   kPerspective,      // depth is planar z
@@ -43,7 +43,7 @@ class Renderer {
   /// Moves instances; the rest stay. Throws ArgumentError for an unknown id. `poses[i]` replaces T_world_instance.
   virtual void set_poses(std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses) = 0;
 
-  [[nodiscard]] virtual const Scene& scene() const = 0;
+  [[nodiscard]] virtual const scene::Scene& scene() const = 0;
   /// "cpu (Embree 3.13.5, avx512)", "gpu (llvmpipe ..., OpenGL 4.5)".
   [[nodiscard]] virtual std::string description() const = 0;
 };
@@ -52,6 +52,6 @@ enum class Backend { kAuto, kCpu, kGpu };
 
 /// kAuto takes the GPU when a hardware EGL device exists, else the CPU ray caster (a software EGL device is slower).
 /// Throws BackendError with the remedy when the asked back end cannot run here.
-std::shared_ptr<Renderer> make_renderer(ScenePtr scene, Backend backend, const RenderOptions& options = {});
+std::shared_ptr<Renderer> make_renderer(scene::ScenePtr scene, Backend backend, const RenderOptions& options = {});
 
-}  // namespace wiw
+}  // namespace wiw::render

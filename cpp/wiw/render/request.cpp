@@ -5,7 +5,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 void check_request(std::span<const Pose> T_world_camera, const Camera& camera) {
   const Size size = camera.size;
@@ -32,7 +32,8 @@ void check_options(const RenderOptions& options) {
   }
 }
 
-void check_poses(const Scene& scene, std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses) {
+void check_poses(const scene::Scene& scene, std::span<const std::uint32_t> ids,
+                 std::span<const Eigen::Affine3f> poses) {
   if (ids.size() != poses.size()) {
     throw ArgumentError("set_poses: expected as many poses as ids, got " + std::to_string(ids.size()) + " ids and " +
                         std::to_string(poses.size()) + " poses");
@@ -48,4 +49,4 @@ void check_poses(const Scene& scene, std::span<const std::uint32_t> ids, std::sp
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

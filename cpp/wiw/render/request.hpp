@@ -5,7 +5,7 @@
 
 #include "wiw/render/renderer.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 /// Largest image side; beyond it, single-precision pixel coordinates and int32 offsets stop being safe.
 constexpr int kMaxImageSide = 16384;
@@ -17,6 +17,6 @@ void check_request(std::span<const Pose> T_world_camera, const Camera& camera);
 void check_options(const RenderOptions& options);
 
 /// Throws ArgumentError for ids the scene does not have, a length mismatch, or poses that are not finite.
-void check_poses(const Scene& scene, std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses);
+void check_poses(const scene::Scene& scene, std::span<const std::uint32_t> ids, std::span<const Eigen::Affine3f> poses);
 
-}  // namespace wiw
+}  // namespace wiw::render

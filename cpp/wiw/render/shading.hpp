@@ -32,7 +32,7 @@
 ///
 /// Alpha cutout. A point is a hole when base_color.a x texture alpha < alpha_cutoff, alpha being bilinear at level 0.
 
-namespace wiw::shading {
+namespace wiw::render::shading {
 
 /// Nothing nearer is drawn: planar depth for perspective, distance for panoramas, metres.
 constexpr float kNearClip = 0.01f;
@@ -90,4 +90,4 @@ constexpr float sample_offset(int coarse, int fine, int n) {
   return (static_cast<float>(coarse) + (static_cast<float>(fine) + 0.5f) / count) / count - 0.5f;
 }
 
-}  // namespace wiw::shading
+}  // namespace wiw::render::shading

@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <cmath>
 
-namespace wiw {
+namespace wiw::render {
 
 /// Largest number of texels that a metre of a triangle's plane covers in any direction: the largest singular value of
 /// d(texel)/d(metre). Edges from vertex 0 in metres and in texels. 1 for triangles without area, which no ray hits.
@@ -25,4 +25,4 @@ inline float texel_density(const Eigen::Vector3f& edge_1, const Eigen::Vector3f&
   return std::isfinite(density) ? std::max(density, 1e-20f) : 1.f;
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

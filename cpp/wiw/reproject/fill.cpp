@@ -15,7 +15,7 @@ namespace {
 // Ends whose depths differ by less than this fraction count as one surface.
 constexpr float kSameSurface = 0.1F;
 
-struct Row {
+struct DepthRow {
   float* depth;
   int width;
   [[nodiscard]] int wrap(int column) const { return ((column % width) + width) % width; }
@@ -29,7 +29,7 @@ float right_weight(float left_depth, float right_depth, float share) {
 }
 
 /// Fills columns (begin, end) exclusive, which may lie beyond the width if the row wraps.
-void fill_gap(const Row& row, int begin, int end) {
+void fill_gap(const DepthRow& row, int begin, int end) {
   const float left_depth = row.depth[row.wrap(begin)];
   const float right_depth = row.depth[row.wrap(end)];
   for (int column = begin + 1; column < end; ++column) {
@@ -40,7 +40,7 @@ void fill_gap(const Row& row, int begin, int end) {
 }
 
 /// Returns false if the row has no depth at all.
-bool fill_row(const Row& row, bool wraps) {
+bool fill_row(const DepthRow& row, bool wraps) {
   int first = 0;
   while (first < row.width && row.depth[first] == kNothing) ++first;
   if (first == row.width) return false;

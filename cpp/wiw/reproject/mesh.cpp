@@ -96,12 +96,12 @@ struct Edges {
 };
 
 /// Part of a quad, as fractions of it.
-struct Part {
+struct QuadPart {
   float x0, x1, y0, y1;
 };
 
 /// Appends a part of quad (row, column) whose surface continues from the given vertices, one per corner.
-void append_fringe(const MeshLayout& layout, const std::vector<float>& depth, int row, int column, const Part& part,
+void append_fringe(const MeshLayout& layout, const std::vector<float>& depth, int row, int column, const QuadPart& part,
                    const std::array<int, 4>& from, FringeQuads& fringe) {
   const RayTable& rays = layout.rays;
   const auto mix = [](float a, float b, float t) { return a + t * (b - a); };
@@ -135,7 +135,7 @@ void append_cut_quad(const MeshLayout& layout, const Edges& edges, int row, int 
                                    mesh.depth[corner10 + 1]};
   const float farthest = *std::max_element(depth.begin(), depth.end());
   const auto nearer = [&](int corner) { return depth[corner] < (1.0F - cut) * farthest; };
-  const auto append = [&](const Part& part, const std::array<int, 4>& from) {
+  const auto append = [&](const QuadPart& part, const std::array<int, 4>& from) {
     append_fringe(layout, mesh.depth, row, column, part, from, mesh.fringe);
   };
   if (edges.down[column] != 0 && edges.down[column + 1] != 0) {

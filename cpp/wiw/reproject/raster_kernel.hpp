@@ -193,7 +193,7 @@ inline Quads advance(const Quads& quads, int n) {
 }
 
 /// What is known of up to kLanes quads before and after testing one position of their boxes.
-struct Chunk {
+struct QuadChunk {
   float u00[kLanes], u01[kLanes], u10[kLanes], u11[kLanes];  // on the same side of the seam
   float inverse_upper[kLanes], inverse_lower[kLanes];        // 1 / area, 0 where there is no triangle
   int left[kLanes], top[kLanes], width[kLanes], height[kLanes];
@@ -229,12 +229,12 @@ inline unsigned set_lanes(const int* values) {
 
 inline float inverse_or_zero(float area) { return absolute(area) > 1.0e-12F ? 1.0F / area : 0.0F; }
 
-struct Box {
+struct ChunkExtent {
   int width, height, any_large;
 };
 
 /// Fills corners and boxes of a chunk; returns the largest box that the chunk loops take.
-WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, Chunk& __restrict chunk) {
+WIW_NOINLINE ChunkExtent bound_chunk(const RasterJob& job, const Quads& quads, QuadChunk& __restrict chunk) {
   // A pinhole image does not wrap: a turn longer than any difference leaves it alone.
   const float turn = job.panoramic ? static_cast<float>(job.width) : 1.0e9F;
   const int low_u = job.panoramic ? -job.width : 0;
@@ -294,7 +294,7 @@ WIW_NOINLINE Box bound_chunk(const RasterJob& job, const Quads& quads, Chunk& __
 
 /// Tests position (step_u, step_v) of every box in the chunk.
 template <bool kOneRow>
-WIW_NOINLINE void test_chunk(const Quads& quads, int step_u, int step_v, Chunk& __restrict chunk) {
+WIW_NOINLINE void test_chunk(const Quads& quads, int step_u, int step_v, QuadChunk& __restrict chunk) {
   const float *v0 = quads.corner[0].v, *v1 = quads.corner[1].v, *v2 = quads.corner[2].v, *v3 = quads.corner[3].v;
   const float *d0 = quads.corner[0].depth, *d1 = quads.corner[1].depth;
   const float *d2 = quads.corner[2].depth, *d3 = quads.corner[3].depth;
@@ -333,7 +333,7 @@ WIW_NOINLINE void test_chunk(const Quads& quads, int step_u, int step_v, Chunk& 
   }
 }
 
-inline void put_chunk(const RasterJob& job, const Quads& quads, const Chunk& chunk) {
+inline void put_chunk(const RasterJob& job, const Quads& quads, const QuadChunk& chunk) {
   for (unsigned left = set_lanes(chunk.hit); left != 0; left &= left - 1) {
     const int k = __builtin_ctz(left);
     put(job, chunk.hit_u[k], chunk.hit_v[k], chunk.hit_depth[k], quads.texel[k] + quads.texel_row,
@@ -341,32 +341,32 @@ inline void put_chunk(const RasterJob& job, const Quads& quads, const Chunk& chu
   }
 }
 
-struct Vector {
+struct RayVector {
   float x, y, z;
 };
-inline Vector operator-(const Vector& a, const Vector& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vector cross(const Vector& a, const Vector& b) {
+inline RayVector operator-(const RayVector& a, const RayVector& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline RayVector cross(const RayVector& a, const RayVector& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-inline float dot(const Vector& a, const Vector& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vector point(const Vertices& vertices, int k) { return {vertices.px[k], vertices.py[k], vertices.pz[k]}; }
+inline float dot(const RayVector& a, const RayVector& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline RayVector point(const Vertices& vertices, int k) { return {vertices.px[k], vertices.py[k], vertices.pz[k]}; }
 
 /// Triangle corner + a side_a + b side_b, prepared for rays from the origin (Moeller and Trumbore 1997, with all but
 /// the ray's direction factored out): a = normal_a . d / n . d, likewise b; the depth is n . corner / n . d. normal_a
 /// and normal_b are perpendicular to the corner, so the ray through it, `origin`, is taken off d first: what is left is
 /// as small as the triangle, and so are the errors.
 struct RayTriangle {
-  Vector normal, normal_a, normal_b, origin;
+  RayVector normal, normal_a, normal_b, origin;
   float offset;
 };
 
 /// `depth` is the corner's.
-inline RayTriangle ray_triangle(const Vector& corner, float depth, const Vector& end_a, const Vector& end_b) {
-  const Vector side_a = end_a - corner;
-  const Vector side_b = end_b - corner;
-  const Vector normal = cross(side_a, side_b);
+inline RayTriangle ray_triangle(const RayVector& corner, float depth, const RayVector& end_a, const RayVector& end_b) {
+  const RayVector side_a = end_a - corner;
+  const RayVector side_b = end_b - corner;
+  const RayVector normal = cross(side_a, side_b);
   const float scale = 1.0F / depth;
-  const Vector origin{corner.x * scale, corner.y * scale, corner.z * scale};
+  const RayVector origin{corner.x * scale, corner.y * scale, corner.z * scale};
   return {normal, cross(side_b, corner), cross(corner, side_a), origin, dot(normal, corner)};
 }
 
@@ -386,8 +386,8 @@ WIW_NOINLINE void meet_rays(const RasterJob& job, const RayTriangle& triangle, i
   const float *ray_x = job.target_ray_x + left, *ray_z = job.target_ray_z + left;
   const float m = job.target_ray_m[v];
   const float y = job.target_ray_y[v];
-  const Vector n = triangle.normal, normal_a = triangle.normal_a, normal_b = triangle.normal_b;
-  const Vector origin = triangle.origin;
+  const RayVector n = triangle.normal, normal_a = triangle.normal_a, normal_b = triangle.normal_b;
+  const RayVector origin = triangle.origin;
   const float offset = triangle.offset;
   const float dy = y - origin.y;
   const int count = right - left + 1;
@@ -430,7 +430,7 @@ inline void draw_triangle(const RasterJob& job, const Quads& quads, int k, const
 }
 
 /// Pixels that a large quad may cover.
-inline PixelBox large_box(const RasterJob& job, const Quads& quads, int k, const Chunk& chunk) {
+inline PixelBox large_box(const RasterJob& job, const Quads& quads, int k, const QuadChunk& chunk) {
   float left = min_of(min_of(chunk.u00[k], chunk.u01[k]), min_of(chunk.u10[k], chunk.u11[k]));
   float right = max_of(max_of(chunk.u00[k], chunk.u01[k]), max_of(chunk.u10[k], chunk.u11[k]));
   const float v0 = quads.corner[0].v[k], v1 = quads.corner[1].v[k], v2 = quads.corner[2].v[k];
@@ -459,12 +459,12 @@ inline PixelBox large_box(const RasterJob& job, const Quads& quads, int k, const
 }
 
 /// Draws a quad that the chunk loops do not take.
-inline void draw_large(const RasterJob& job, const Quads& quads, int k, const Chunk& chunk) {
+inline void draw_large(const RasterJob& job, const Quads& quads, int k, const QuadChunk& chunk) {
   const PixelBox box = large_box(job, quads, k, chunk);
-  const Vector p00 = point(quads.corner[0], k);
-  const Vector p01 = point(quads.corner[1], k);
-  const Vector p10 = point(quads.corner[2], k);
-  const Vector p11 = point(quads.corner[3], k);
+  const RayVector p00 = point(quads.corner[0], k);
+  const RayVector p01 = point(quads.corner[1], k);
+  const RayVector p10 = point(quads.corner[2], k);
+  const RayVector p11 = point(quads.corner[3], k);
   if ((quads.triangles[k] & 1) != 0)
     draw_triangle(job, quads, k, ray_triangle(p00, quads.corner[0].depth[k], p01, p10), false, box);
   if ((quads.triangles[k] & 2) != 0)
@@ -472,10 +472,10 @@ inline void draw_large(const RasterJob& job, const Quads& quads, int k, const Ch
 }
 
 template <bool kOneRow>
-inline void draw_quads(const RasterJob& job, const Quads& all, int count, Chunk& chunk) {
+inline void draw_quads(const RasterJob& job, const Quads& all, int count, QuadChunk& chunk) {
   for (int first = 0; first < count; first += kLanes) {
     const Quads quads = advance(all, first);
-    const Box box = bound_chunk(job, quads, chunk);
+    const ChunkExtent box = bound_chunk(job, quads, chunk);
     for (int step_v = 0; step_v < box.height; ++step_v) {
       for (int step_u = 0; step_u < box.width; ++step_u) {
         test_chunk<kOneRow>(quads, step_u, step_v, chunk);
@@ -502,7 +502,7 @@ inline Quads quad_row(const RasterJob& job, int row, const Vertices& upper, cons
           0};
 }
 
-inline void draw_mesh(const RasterJob& job, Chunk& chunk) {
+inline void draw_mesh(const RasterJob& job, QuadChunk& chunk) {
   Vertices upper = vertices_at(job.scratch, padded_lanes(job.columns));
   Vertices lower =
       vertices_at(job.scratch + 6 * static_cast<std::ptrdiff_t>(padded_lanes(job.columns)), padded_lanes(job.columns));
@@ -517,7 +517,7 @@ inline void draw_mesh(const RasterJob& job, Chunk& chunk) {
 }
 
 /// The fringe's quads, a few hundred at a time so that the vertices stay in the cache.
-inline void draw_fringe(const RasterJob& job, Chunk& chunk) {
+inline void draw_fringe(const RasterJob& job, QuadChunk& chunk) {
   const Fringe& fringe = job.fringe;
   for (int first = 0; first < fringe.count; first += kFringeBlock) {
     const int count = min_of(kFringeBlock, fringe.count - first);
@@ -542,7 +542,7 @@ inline void draw_fringe(const RasterJob& job, Chunk& chunk) {
 }
 
 inline void raster(const RasterJob& job) {
-  Chunk chunk;
+  QuadChunk chunk;
   draw_mesh(job, chunk);
   draw_fringe(job, chunk);
 }

@@ -6,7 +6,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Changes whenever the layout of a cache file does; files of another version are refused.
 inline constexpr std::uint32_t kSceneCacheVersion = 3;
@@ -25,4 +25,4 @@ void write_scene_cache(const Scene& scene, const std::filesystem::path& path);
 /// again.
 ScenePtr map_scene_cache(const std::filesystem::path& path);
 
-}  // namespace wiw
+}  // namespace wiw::scene

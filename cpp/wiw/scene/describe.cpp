@@ -6,7 +6,7 @@
 
 #include "wiw/scene/measure.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 std::string fixed(double value, int decimals) {
@@ -69,4 +69,4 @@ std::string describe(const Scene& scene) {
   return text;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

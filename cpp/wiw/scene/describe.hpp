@@ -5,7 +5,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// One line: name, placements, triangles, size.
 std::string summary(const Scene& scene);
@@ -13,4 +13,4 @@ std::string summary(const Scene& scene);
 /// The summary, then attributes, categories with their counts, memory and warnings, a line each.
 std::string describe(const Scene& scene);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -21,7 +21,7 @@
 #include "wiw/scene/import/ply_header.hpp"
 #include "wiw/scene/text.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr int kImporterVersion = 3;  // raise it whenever the same file and options give another scene
@@ -108,4 +108,4 @@ ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& optio
   return read_as_file(path, [&] { return import_mesh(path, options); });
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -9,7 +9,7 @@
 #include "wiw/scene/import/limits.hpp"
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Names the importer's behaviour: this code's version, the cache layout's and assimp's. Scenes imported under another
 /// name are imported again.
@@ -41,4 +41,4 @@ struct ImportOptions {
 /// too large file.
 ScenePtr load_mesh(const std::filesystem::path& path, const ImportOptions& options = {});
 
-}  // namespace wiw
+}  // namespace wiw::scene

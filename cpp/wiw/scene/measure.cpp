@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/scene/measure.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 template <class... T>
@@ -33,4 +33,4 @@ std::size_t mesh_bytes(const Scene& scene) {
   return bytes;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

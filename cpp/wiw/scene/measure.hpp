@@ -5,7 +5,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Box around one placed object, in the world.
 Eigen::AlignedBox3f instance_bounds(const Scene& scene, const Instance& instance);
@@ -14,4 +14,4 @@ Eigen::AlignedBox3f instance_bounds(const Scene& scene, const Instance& instance
 std::size_t texture_bytes(const Scene& scene);
 std::size_t mesh_bytes(const Scene& scene);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 std::size_t Scene::triangle_count() const {
   std::size_t count = 0;
@@ -116,4 +116,4 @@ TriangleSoup world_triangles(const Scene& scene) {
   return soup;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -11,8 +11,9 @@
 
 #include "wiw/core/buffer.hpp"
 #include "wiw/core/image.hpp"
+#include "wiw/scene/triangle.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// 8-bit RGBA image, display-encoded (sRGB-like), row 0 at the top; texture coordinate v = 0 is the TOP edge.
 struct Texture {
@@ -44,7 +45,7 @@ struct Mesh {
   Buffer<Eigen::Vector2f> uv;
   Buffer<Eigen::Vector2f> lightmap_uv;
   Buffer<Eigen::Matrix<std::uint8_t, 4, 1>> colors;
-  Buffer<Eigen::Matrix<std::uint32_t, 3, 1>> triangles;
+  Buffer<Triangle> triangles;
   std::int32_t material = kNone;
   std::int32_t lightmap = kNone;  // index into Scene::textures
 };
@@ -110,9 +111,9 @@ using ScenePtr = std::shared_ptr<const Scene>;
 /// World-space triangle soup of all placements, e.g. for a navigation mesh.
 struct TriangleSoup {
   std::vector<Eigen::Vector3f> vertices;
-  std::vector<Eigen::Matrix<std::uint32_t, 3, 1>> triangles;
+  std::vector<Triangle> triangles;
   std::vector<std::uint32_t> instance;  // per triangle: Instance::id
 };
 TriangleSoup world_triangles(const Scene& scene);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -5,13 +5,13 @@
 #include "wiw/scene/sdf/assembler.hpp"
 #include "wiw/scene/sdf/reader.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 ScenePtr load_sdf_world(const std::filesystem::path& path, const ImportOptions& options) {
   return read_as_file(path, [&] {
-    const sdf::World world = sdf::Reader(path, options).read();
+    const sdf::SdfWorld world = sdf::SdfReader(path, options).read();
     return sdf::Assembler(world, options).assemble(path);
   });
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -5,7 +5,7 @@
 
 #include "wiw/scene/import.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Reads a Gazebo world (.world or .sdf): every model, included or inline, becomes one instance; visuals that are
 /// meshes, boxes, spheres, cylinders or planes are drawn, collision shapes are not. Models are looked for in
@@ -14,4 +14,4 @@ namespace wiw {
 /// Throws FileError for a missing or damaged file, or one above the limits.
 ScenePtr load_sdf_world(const std::filesystem::path& path, const ImportOptions& options = {});
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -5,7 +5,7 @@
 
 #include "wiw/core/utf8.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 void make_utf8(std::map<std::string, std::string>& attributes) {
@@ -29,4 +29,4 @@ void make_text_utf8(Scene& scene) {
   make_utf8(scene.attributes);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

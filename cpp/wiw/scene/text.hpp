@@ -3,9 +3,9 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Makes all names, attributes and warnings UTF-8; bytes that are not are taken as Latin-1.
 void make_text_utf8(Scene& scene);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -17,7 +17,7 @@ constexpr double kMargin = 1e-4;
 constexpr int kCylinderSides = 32;
 constexpr double kPi = 3.14159265358979323846;
 
-struct Make {
+struct ToBulletShape {
   using Result = std::unique_ptr<btCollisionShape>;
   Result operator()(const Box& box) const {
     auto shape = std::make_unique<btBoxShape>(to_bullet(Eigen::Vector3d(box.size / 2)));
@@ -58,7 +58,7 @@ struct Make {
 
 CollisionShape::CollisionShape(std::span<const Part> parts, const Pose& frame) {
   if (parts.empty()) return;
-  for (const Part& part : parts) owned_.push_back(std::visit(Make{}, part.shape));
+  for (const Part& part : parts) owned_.push_back(std::visit(ToBulletShape{}, part.shape));
   const Pose to_frame = frame.inverse();
   if (parts.size() == 1 && (to_frame * parts[0].pose).isApprox(Pose::Identity(), 1e-12)) {
     root_ = owned_[0].get();

@@ -15,7 +15,7 @@
 #include "wiw/render/cpu/ray_tables.hpp"
 #include "wiw/render/request.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 namespace {
 
@@ -45,9 +45,9 @@ TileKernel kernel_for(Isa isa) {
   return render_tile_scalar;
 }
 
-Image image_of(const RenderTargets& targets, Size size, std::size_t index) {
+ImageTargets image_of(const RenderTargets& targets, Size size, std::size_t index) {
   const std::size_t first = index * size.pixels();
-  Image image{};
+  ImageTargets image{};
   image.height = size.height;
   image.width = size.width;
   if (targets.color != nullptr) image.color = targets.color + 3 * first;
@@ -58,7 +58,7 @@ Image image_of(const RenderTargets& targets, Size size, std::size_t index) {
 
 class CpuRenderer final : public Renderer {
  public:
-  CpuRenderer(ScenePtr scene, const RenderOptions& options, Isa isa)
+  CpuRenderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa)
       : scene_(std::move(scene)),
         options_(options),
         isa_(isa),
@@ -66,7 +66,7 @@ class CpuRenderer final : public Renderer {
         shading_(*scene_),
         embree_(*scene_, shading_, isa) {
     shading_.describe(kernel_scene_);
-    for (const Part& part : shading_.parts())
+    for (const InstanceMesh& part : shading_.parts())
       last_.push_back(scene_->instances[part.instance].T_world_instance.matrix());
   }
 
@@ -95,12 +95,12 @@ class CpuRenderer final : public Renderer {
     check_poses(*scene_, ids, poses);
     const std::scoped_lock lock(mutex_);
     const auto parts = shading_.parts();
-    std::vector<EmbreeScene::Placed> moved;
+    std::vector<EmbreeScene::MeshPlacement> moved;
     for (std::size_t i = 0; i < ids.size(); ++i) {
       const std::uint32_t index = ids[i] - 1;
       // Parts are ordered by instance.
       auto part = std::lower_bound(parts.begin(), parts.end(), index,
-                                   [](const Part& p, std::uint32_t value) { return p.instance < value; });
+                                   [](const InstanceMesh& p, std::uint32_t value) { return p.instance < value; });
       for (; part != parts.end() && part->instance == index; ++part) {
         const auto number = static_cast<std::size_t>(part - parts.begin());
         if (last_[number] == poses[i].matrix()) continue;
@@ -112,13 +112,13 @@ class CpuRenderer final : public Renderer {
     embree_.move(moved);
   }
 
-  [[nodiscard]] const Scene& scene() const override { return *scene_; }
+  [[nodiscard]] const scene::Scene& scene() const override { return *scene_; }
   [[nodiscard]] std::string description() const override {
     return "cpu (Embree " + embree_.version() + ", " + isa_name(isa_) + ")";
   }
 
  private:
-  ScenePtr scene_;
+  scene::ScenePtr scene_;
   RenderOptions options_;
   Isa isa_;
   TileKernel kernel_;
@@ -132,7 +132,7 @@ class CpuRenderer final : public Renderer {
 
 }  // namespace
 
-std::shared_ptr<Renderer> make_cpu_renderer(ScenePtr scene, const RenderOptions& options, Isa isa) {
+std::shared_ptr<Renderer> make_cpu_renderer(scene::ScenePtr scene, const RenderOptions& options, Isa isa) {
   check_options(options);
   if (isa > native_isa()) {
     throw BackendError("render: this processor has no " + isa_name(isa) + ", only " + isa_name(native_isa()));
@@ -142,4 +142,4 @@ std::shared_ptr<Renderer> make_cpu_renderer(ScenePtr scene, const RenderOptions&
   return std::make_shared<CpuRenderer>(std::move(scene), options, isa);
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

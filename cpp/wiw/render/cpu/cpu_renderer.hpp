@@ -6,10 +6,11 @@
 #include "wiw/core/cpu.hpp"
 #include "wiw/render/renderer.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 /// Embree ray caster whose packets and shading use `isa`, which the processor must have. Throws ArgumentError for a
 /// scene without triangles.
-std::shared_ptr<Renderer> make_cpu_renderer(ScenePtr scene, const RenderOptions& options, Isa isa = active_isa());
+std::shared_ptr<Renderer> make_cpu_renderer(scene::ScenePtr scene, const RenderOptions& options,
+                                            Isa isa = active_isa());
 
-}  // namespace wiw
+}  // namespace wiw::render

@@ -4,7 +4,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/core/thread_pool.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 namespace {
 
@@ -26,7 +26,7 @@ RTCDeviceProperty native_packet(Isa isa) {
 
 }  // namespace
 
-EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa isa)
+EmbreeScene::EmbreeScene(const scene::Scene& scene, const ShadingScene& shading, Isa isa)
     : scene_(scene), shading_(shading), device_(rtcNewDevice(device_options(isa).c_str())) {
   if (device_ == nullptr) throw BackendError("render: Embree does not start on this processor; use the GPU back end");
   // An unknown instruction set in the options is not an error for Embree, it silently takes another one.
@@ -35,7 +35,7 @@ EmbreeScene::EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa is
     throw BackendError("render: this Embree lacks ray masks or " + isa_name(isa) +
                        " packets; set WIW_ISA to a lower one (scalar, avx2)");
   }
-  for (const Part& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
+  for (const InstanceMesh& part : shading.parts()) cutouts_.push_back({shading.records(part), &shading.surface(part)});
   in_moved_.assign(shading.parts().size(), false);
   away_.assign(shading.parts().size(), false);
   fixed_ = rtcNewScene(device_);
@@ -66,7 +66,7 @@ void EmbreeScene::check(const char* what) const {
 }
 
 RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f& T_world_instance) {
-  const Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
+  const scene::Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
   RTCGeometry geometry = rtcNewGeometry(device_, RTC_GEOMETRY_TYPE_TRIANGLE);
   rtcSetNewGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, sizeof(Eigen::Vector3f),
                           mesh.positions.size());
@@ -84,7 +84,7 @@ RTCGeometry EmbreeScene::make_geometry(std::size_t number, const Eigen::Affine3f
 
 void EmbreeScene::write_vertices(RTCGeometry geometry, std::size_t number,
                                  const Eigen::Affine3f& T_world_instance) const {
-  const Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
+  const scene::Mesh& mesh = scene_.meshes[shading_.parts()[number].mesh];
   if (mesh.positions.empty()) return;
   auto* vertices = static_cast<Eigen::Vector3f*>(rtcGetGeometryBufferData(geometry, RTC_BUFFER_TYPE_VERTEX, 0));
   if (vertices == nullptr) throw Error("render: out of memory for the scene's vertices");
@@ -106,16 +106,16 @@ void EmbreeScene::pierce(const RTCFilterFunctionNArguments* arguments) {
   }
 }
 
-void EmbreeScene::move(std::span<const Placed> parts) {
+void EmbreeScene::move(std::span<const MeshPlacement> parts) {
   bool any_new = false;
-  for (const Placed& part : parts) {
+  for (const MeshPlacement& part : parts) {
     if (!in_moved_[part.number] && !is_home(part)) adopt(part.number), any_new = true;
   }
   // Trees are built from the parts as the scene has them and fitted to every later pose, which is much faster than
   // building and leaves pictures a function of the poses alone.
   if (any_new) rtcCommitScene(moved_);
   bool any_placed = false;
-  for (const Placed& part : parts) {
+  for (const MeshPlacement& part : parts) {
     if (!in_moved_[part.number]) continue;
     RTCGeometry geometry = rtcGetGeometry(moved_, static_cast<unsigned>(part.number));
     write_vertices(geometry, part.number, *part.T_world_instance);
@@ -129,7 +129,7 @@ void EmbreeScene::move(std::span<const Placed> parts) {
   check("moving instances");
 }
 
-bool EmbreeScene::is_home(const Placed& part) const {
+bool EmbreeScene::is_home(const MeshPlacement& part) const {
   return part.T_world_instance->matrix() ==
          scene_.instances[shading_.parts()[part.number].instance].T_world_instance.matrix();
 }
@@ -162,4 +162,4 @@ std::string EmbreeScene::version() const {
          std::to_string(version % 100);
 }
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

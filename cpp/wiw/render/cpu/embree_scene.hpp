@@ -11,23 +11,23 @@
 #include "wiw/core/cpu.hpp"
 #include "wiw/render/cpu/shading_scene.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 /// The parts' triangles in two Embree scenes: one built once from everything, and a small dynamic one with the parts
 /// that have been moved. Each part is masked out of one of them: out of the first while it is away from where the scene
 /// has it, so that one is never rebuilt. Geometry ids are part numbers in both.
 class EmbreeScene {
  public:
-  EmbreeScene(const Scene& scene, const ShadingScene& shading, Isa isa);
+  EmbreeScene(const scene::Scene& scene, const ShadingScene& shading, Isa isa);
   ~EmbreeScene();
   EmbreeScene(const EmbreeScene&) = delete;
   EmbreeScene& operator=(const EmbreeScene&) = delete;
 
-  struct Placed {
+  struct MeshPlacement {
     std::size_t number;  // of the part
     const Eigen::Affine3f* T_world_instance;
   };
-  void move(std::span<const Placed> parts);
+  void move(std::span<const MeshPlacement> parts);
 
   [[nodiscard]] RTCScene fixed() const { return fixed_; }
   /// Null while every part is where the scene has it.
@@ -37,18 +37,18 @@ class EmbreeScene {
  private:
   struct Cutout {
     const TriangleRecord* records;
-    const Surface* surface;
+    const ShadingSurface* surface;
   };
   static void pierce(const RTCFilterFunctionNArguments* arguments);
 
   void adopt(std::size_t part);
   void show(std::size_t part, bool from_fixed);
-  [[nodiscard]] bool is_home(const Placed& part) const;
+  [[nodiscard]] bool is_home(const MeshPlacement& part) const;
   RTCGeometry make_geometry(std::size_t part, const Eigen::Affine3f& T_world_instance);
   void write_vertices(RTCGeometry geometry, std::size_t part, const Eigen::Affine3f& T_world_instance) const;
   void check(const char* what) const;
 
-  const Scene& scene_;
+  const scene::Scene& scene_;
   const ShadingScene& shading_;
   std::vector<Cutout> cutouts_;  // by part
   RTCDevice device_ = nullptr;
@@ -59,4 +59,4 @@ class EmbreeScene {
   int away_count_ = 0;
 };
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

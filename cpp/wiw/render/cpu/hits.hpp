@@ -6,7 +6,7 @@
 #include "wiw/render/cpu/lanes.hpp"
 #include "wiw/render/cpu/sample.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 struct Directions {
@@ -32,7 +32,7 @@ inline Floats interpolate(const Hits& hits, Floats at_0, Floats to_1, Floats to_
 struct Detail {
   Floats nx, ny, nz;
   Floats bulge;
-  Rgb color;
+  RgbLanes color;
 };
 
 inline Detail load_detail(const KernelScene& scene, const Hits& hits) {
@@ -49,9 +49,9 @@ inline Detail load_detail(const KernelScene& scene, const Hits& hits) {
   detail.ny = smooth ? ny : hits.ny;
   detail.nz = smooth ? nz : hits.nz;
   detail.bulge = smooth ? words[12] : Floats{};
-  const Rgb c0 = unpack(reinterpret_cast<Ints>(words[9]));
-  const Rgb c1 = unpack(reinterpret_cast<Ints>(words[10]));
-  const Rgb c2 = unpack(reinterpret_cast<Ints>(words[11]));
+  const RgbLanes c0 = unpack(reinterpret_cast<Ints>(words[9]));
+  const RgbLanes c1 = unpack(reinterpret_cast<Ints>(words[10]));
+  const RgbLanes c2 = unpack(reinterpret_cast<Ints>(words[11]));
   const Floats one = Floats{} + 255.f;
   detail.color.r = (has ? interpolate(hits, c0.r, c1.r - c0.r, c2.r - c0.r) : one) * (1.f / 255.f);
   detail.color.g = (has ? interpolate(hits, c0.g, c1.g - c0.g, c2.g - c0.g) : one) * (1.f / 255.f);
@@ -75,4 +75,4 @@ inline FacingNormal facing_normal(const Hits& hits, const Detail& detail) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

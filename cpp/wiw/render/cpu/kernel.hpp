@@ -9,7 +9,7 @@
 
 struct RTCSceneTy;
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 constexpr std::uint32_t kNoDetail = 0xFFFFFFFFu;
 constexpr int kLevelSlots = 16;  // = shading::kMaxMipLevels, one AVX-512 register of table entries
@@ -46,7 +46,7 @@ struct SampledTexture {
   bool repeat;  // else clamped to the edge
 };
 
-struct Surface {
+struct ShadingSurface {
   float base_color[3];
   const SampledTexture* texture;   // null: none
   const SampledTexture* lightmap;  // null: none
@@ -68,7 +68,7 @@ struct KernelScene {
   const std::uint32_t* first_record;  // by geometry id
   const TriangleRecord* records;
   const TriangleDetail* details;
-  const Surface* surfaces;
+  const ShadingSurface* surfaces;
   const Sunlight* sun;  // null: none
   float zenith[3];
   float horizon[3];
@@ -85,7 +85,7 @@ struct RayGrid {
   const float* row_spread;  // squared pixel width at t = 1, divided by the samples a pixel
 };
 
-struct View {
+struct KernelView {
   bool panorama;
   float origin[3];
   float right[3], up[3], forward[3];
@@ -95,7 +95,7 @@ struct View {
 };
 
 /// Where the pixels of one image go; null members are not wanted.
-struct Image {
+struct ImageTargets {
   int height, width;
   std::uint8_t* color;
   float* depth;
@@ -106,10 +106,10 @@ struct Tile {
   int x, y, width, height;
 };
 
-using TileKernel = void (*)(const KernelScene&, const View&, const Image&, const Tile&);
+using TileKernel = void (*)(const KernelScene&, const KernelView&, const ImageTargets&, const Tile&);
 
-void render_tile_scalar(const KernelScene& scene, const View& view, const Image& image, const Tile& tile);
-void render_tile_avx2(const KernelScene& scene, const View& view, const Image& image, const Tile& tile);
-void render_tile_avx512(const KernelScene& scene, const View& view, const Image& image, const Tile& tile);
+void render_tile_scalar(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
+void render_tile_avx2(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
+void render_tile_avx512(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile);
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

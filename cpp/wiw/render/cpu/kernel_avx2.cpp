@@ -4,10 +4,10 @@
 // The lanes must be defined first.
 #include "wiw/render/cpu/kernel_body.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
-void render_tile_avx2(const KernelScene& scene, const View& view, const Image& image, const Tile& tile) {
+void render_tile_avx2(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile) {
   draw_tile(scene, view, image, tile);
 }
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

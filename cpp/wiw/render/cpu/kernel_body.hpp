@@ -6,7 +6,7 @@
 
 #include "wiw/render/cpu/shade.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 constexpr int kPacketWidth = 4;
@@ -18,7 +18,7 @@ inline Ints lane_numbers() {
   return lanes;
 }
 
-inline Directions directions(const View& view, const RayGrid& grid, int x, int y) {
+inline Directions directions(const KernelView& view, const RayGrid& grid, int x, int y) {
   const Floats column = columns_of(grid.column + x);
   const Floats row = rows_of(grid.row + y);
   Floats right = column;
@@ -34,7 +34,7 @@ inline Directions directions(const View& view, const RayGrid& grid, int x, int y
 }
 
 /// What never changes from packet to packet: Embree writes only tfar and the hit.
-inline void start_rays(RayHit& rays, const View& view) {
+inline void start_rays(RayHit& rays, const KernelView& view) {
   store(rays.ray.org_x, Floats{} + view.origin[0]);
   store(rays.ray.org_y, Floats{} + view.origin[1]);
   store(rays.ray.org_z, Floats{} + view.origin[2]);
@@ -72,8 +72,8 @@ inline Ints record_numbers(const KernelScene& scene, const RayHit& rays, Ints hi
   return numbers;
 }
 
-inline Rgb shade_rays(const KernelScene& scene, const Directions& d, const RayHit& rays, Ints hit, Floats spread) {
-  Rgb color{};
+inline RgbLanes shade_rays(const KernelScene& scene, const Directions& d, const RayHit& rays, Ints hit, Floats spread) {
+  RgbLanes color{};
   if (mask_bits(~hit) != 0) color = sky(scene, d);
   if (mask_bits(hit) == 0) return color;
   Hits hits;
@@ -92,13 +92,13 @@ inline Rgb shade_rays(const KernelScene& scene, const Directions& d, const RayHi
 }
 
 /// The mean of the pixel's colour samples, each clamped as a display would.
-inline Rgb supersample(const KernelScene& scene, const View& view, int x, int y, Ints valid, RayHit& rays) {
-  Rgb sum{};
+inline RgbLanes supersample(const KernelScene& scene, const KernelView& view, int x, int y, Ints valid, RayHit& rays) {
+  RgbLanes sum{};
   for (int i = 0; i < view.sample_count; ++i) {
     const RayGrid& grid = view.samples[i];
     const Directions d = directions(view, grid, x, y);
     const Ints hit = cast(scene, d, valid, rays);
-    const Rgb color = shade_rays(scene, d, rays, hit, rows_of(grid.row_spread + y));
+    const RgbLanes color = shade_rays(scene, d, rays, hit, rows_of(grid.row_spread + y));
     sum = {sum.r + color.r, sum.g + color.g, sum.b + color.b};
   }
   const float weight = 1.f / static_cast<float>(view.sample_count);
@@ -106,13 +106,13 @@ inline Rgb supersample(const KernelScene& scene, const View& view, int x, int y,
 }
 
 /// Where a packet lies in the image: `columns` of each of its `rows` rows of 4 lanes are inside.
-struct Place {
+struct PacketPlace {
   std::size_t first;   // pixel index of lane 0
   std::size_t stride;  // image width
   int columns, rows;
 };
 
-inline void write_color(const Image& image, const Place& place, const Rgb& color) {
+inline void write_color(const ImageTargets& image, const PacketPlace& place, const RgbLanes& color) {
   const auto byte = [](Floats value) { return __builtin_convertvector(value * 255.f + 0.5f, Ints); };
   const Ints packed = byte(color.r) | (byte(color.g) << 8) | (byte(color.b) << 16);
   alignas(64) std::uint32_t pixels[kLanes];
@@ -130,7 +130,7 @@ inline void write_color(const Image& image, const Place& place, const Rgb& color
 }
 
 template <class Pixels>
-inline void write_words(void* target, const Place& place, Pixels values) {
+inline void write_words(void* target, const PacketPlace& place, Pixels values) {
   alignas(64) std::uint32_t pixels[kLanes];
   __builtin_memcpy(pixels, &values, sizeof values);
   for (int row = 0; row < place.rows; ++row) {
@@ -154,11 +154,12 @@ inline Ints instance_ids(const KernelScene& scene, const RayHit& rays, Ints hit)
   return ids;
 }
 
-inline void draw_packet(const KernelScene& scene, const View& view, const Image& image, int x, int y, RayHit& rays) {
+inline void draw_packet(const KernelScene& scene, const KernelView& view, const ImageTargets& image, int x, int y,
+                        RayHit& rays) {
   const int columns = image.width - x < kPacketWidth ? image.width - x : kPacketWidth;
   const int rows = image.height - y < kPacketHeight ? image.height - y : kPacketHeight;
   const auto stride = static_cast<std::size_t>(image.width);
-  const Place place{static_cast<std::size_t>(y) * stride + static_cast<std::size_t>(x), stride, columns, rows};
+  const PacketPlace place{static_cast<std::size_t>(y) * stride + static_cast<std::size_t>(x), stride, columns, rows};
   const Ints lanes = lane_numbers();
   const Ints valid = ((lanes & 3) < columns) & ((lanes >> 2) < rows);
   const bool one_sample = view.sample_count == 1;
@@ -176,7 +177,7 @@ inline void draw_packet(const KernelScene& scene, const View& view, const Image&
   if (image.color != nullptr && !one_sample) write_color(image, place, supersample(scene, view, x, y, valid, rays));
 }
 
-inline void draw_tile(const KernelScene& scene, const View& view, const Image& image, const Tile& tile) {
+inline void draw_tile(const KernelScene& scene, const KernelView& view, const ImageTargets& image, const Tile& tile) {
   alignas(64) RayHit rays;
   start_rays(rays, view);
   for (int y = tile.y; y < tile.y + tile.height; y += kPacketHeight) {
@@ -185,4 +186,4 @@ inline void draw_tile(const KernelScene& scene, const View& view, const Image& i
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -3,7 +3,7 @@
 
 /// Lanes to and from Embree's packets. Included after a simd_*.hpp.
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 inline void store(float* target, Floats values) { __builtin_memcpy(target, &values, sizeof values); }
@@ -30,4 +30,4 @@ struct alignas(64) ValidLanes {
 };
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -6,7 +6,7 @@
 
 #include "wiw/render/shading.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 namespace {
 constexpr int kPadding = 4;  // kernels read whole packets of 4 columns and up to 4 rows
@@ -57,8 +57,8 @@ RayGrid RayTables::add_grid(double dx, double dy) {
   return grid;
 }
 
-View RayTables::view(const Pose& T_world_camera) const {
-  View view{};
+KernelView RayTables::view(const Pose& T_world_camera) const {
+  KernelView view{};
   view.panorama = camera_.projection == Projection::kEquirectangular;
   for (int c = 0; c < 3; ++c) {
     view.origin[c] = static_cast<float>(T_world_camera.translation()[c]);
@@ -76,4 +76,4 @@ bool RayTables::fits(const Camera& camera) const {
   return camera.projection == camera_.projection && camera.size == camera_.size && camera.hfov == camera_.hfov;
 }
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -6,7 +6,7 @@
 #include "wiw/render/cpu/kernel.hpp"
 #include "wiw/render/renderer.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 /// Per-row and per-column factors of a camera's rays, for the pixel centres and for every colour sample.
 class RayTables {
@@ -14,7 +14,7 @@ class RayTables {
   RayTables(const Camera& camera, int samples);
 
   /// The grids point into this object.
-  [[nodiscard]] View view(const Pose& T_world_camera) const;
+  [[nodiscard]] KernelView view(const Pose& T_world_camera) const;
   [[nodiscard]] bool fits(const Camera& camera) const;
 
  private:
@@ -27,4 +27,4 @@ class RayTables {
   std::vector<RayGrid> grids_;
 };
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -3,14 +3,14 @@
 
 /// Arithmetic on lanes and texture sampling. Included after a simd_*.hpp.
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
-struct Rgb {
+struct RgbLanes {
   Floats r, g, b;
 };
 
-inline Rgb multiply(const Rgb& a, const Rgb& b) { return {a.r * b.r, a.g * b.g, a.b * b.b}; }
+inline RgbLanes multiply(const RgbLanes& a, const RgbLanes& b) { return {a.r * b.r, a.g * b.g, a.b * b.b}; }
 
 /// Into [0, 1]; not-a-number becomes 0, so that no texture coordinate can leave its texture.
 inline Floats saturate(Floats x) {
@@ -29,17 +29,18 @@ inline Floats log2_of(Floats x) {
 }
 
 /// The three colour bytes of RGBA words as floats in [0, 255].
-inline Rgb unpack(Ints texel) {
+inline RgbLanes unpack(Ints texel) {
   return {__builtin_convertvector(texel & 255, Floats), __builtin_convertvector((texel >> 8) & 255, Floats),
           __builtin_convertvector((texel >> 16) & 255, Floats)};
 }
 
-inline Rgb mix(const Rgb& a, const Rgb& b, Floats weight) {
+inline RgbLanes mix(const RgbLanes& a, const RgbLanes& b, Floats weight) {
   return {a.r + weight * (b.r - a.r), a.g + weight * (b.g - a.g), a.b + weight * (b.b - a.b)};
 }
 
 /// Bilinear colour in [0, 255] at (u, v) in [0, 1] of each lane's level.
-inline Rgb sample_level(const SampledTexture& texture, Floats u, Floats v, Floats width, Floats height, Ints offset) {
+inline RgbLanes sample_level(const SampledTexture& texture, Floats u, Floats v, Floats width, Floats height,
+                             Ints offset) {
   const Floats x = u * width + 0.5f;  // texel centres at half integers, plus the border of one texel
   const Floats y = v * height + 0.5f;
   const Ints column = __builtin_convertvector(x, Ints);
@@ -59,25 +60,25 @@ inline Floats wrap(const SampledTexture& texture, Floats coordinate) {
   return saturate(texture.repeat ? coordinate - floor_of(coordinate) : coordinate);
 }
 
-inline Rgb normalised(const Rgb& bytes) {
+inline RgbLanes normalised(const RgbLanes& bytes) {
   return {bytes.r * (1.f / 255.f), bytes.g * (1.f / 255.f), bytes.b * (1.f / 255.f)};
 }
 
 /// Level 0 alone.
-inline Rgb sample_bilinear(const SampledTexture& texture, Floats u, Floats v) {
+inline RgbLanes sample_bilinear(const SampledTexture& texture, Floats u, Floats v) {
   return normalised(sample_level(texture, wrap(texture, u), wrap(texture, v), Floats{} + texture.width[0],
                                  Floats{} + texture.height[0], Ints{} + texture.offset[0]));
 }
 
-inline Rgb sample_trilinear(const SampledTexture& texture, Floats u, Floats v, Floats lod) {
+inline RgbLanes sample_trilinear(const SampledTexture& texture, Floats u, Floats v, Floats lod) {
   u = wrap(texture, u);
   v = wrap(texture, v);
   lod = lod > 0.f ? lod : Floats{};
   lod = lod < texture.last_level ? lod : Floats{} + texture.last_level;
   const Ints fine = __builtin_convertvector(lod, Ints);
   const Floats blend = lod - __builtin_convertvector(fine, Floats);
-  Rgb color = sample_level(texture, u, v, look_up(texture.width, fine), look_up(texture.height, fine),
-                           look_up(texture.offset, fine));
+  RgbLanes color = sample_level(texture, u, v, look_up(texture.width, fine), look_up(texture.height, fine),
+                                look_up(texture.offset, fine));
   if (mask_bits(blend > 0.f) != 0) {
     const Ints coarse = blend > 0.f ? fine + 1 : fine;
     color = mix(color,
@@ -89,4 +90,4 @@ inline Rgb sample_trilinear(const SampledTexture& texture, Floats u, Floats v, F
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

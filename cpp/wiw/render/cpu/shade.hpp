@@ -5,10 +5,10 @@
 
 #include "wiw/render/cpu/sunlight.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
-inline Rgb sky(const KernelScene& scene, const Directions& d) {
+inline RgbLanes sky(const KernelScene& scene, const Directions& d) {
   const Floats dy = d.y / sqrt_of(d.x * d.x + d.y * d.y + d.z * d.z);
   const Floats zenith = shading::sky_weight(dy);
   const auto mix = [&](int c) { return scene.horizon[c] + zenith * (scene.zenith[c] - scene.horizon[c]); };
@@ -30,12 +30,13 @@ inline Floats ambient(const Hits& hits, const Detail& detail) {
 }
 
 /// Colour of the packet as if all of its hits were on `surface`; `sunlit` is the light in a scene with a sun.
-inline Rgb shade_surface(const KernelScene& scene, const Surface& surface, const Hits& hits, Floats sunlit) {
-  Rgb color{Floats{} + surface.base_color[0], Floats{} + surface.base_color[1], Floats{} + surface.base_color[2]};
+inline RgbLanes shade_surface(const KernelScene& scene, const ShadingSurface& surface, const Hits& hits,
+                              Floats sunlit) {
+  RgbLanes color{Floats{} + surface.base_color[0], Floats{} + surface.base_color[1], Floats{} + surface.base_color[2]};
   if (surface.texture != nullptr) {
     const Floats* uv = hits.record;
-    const Rgb texel = sample_trilinear(*surface.texture, interpolate(hits, uv[0], uv[2], uv[4]),
-                                       interpolate(hits, uv[1], uv[3], uv[5]), level_of_detail(hits));
+    const RgbLanes texel = sample_trilinear(*surface.texture, interpolate(hits, uv[0], uv[2], uv[4]),
+                                            interpolate(hits, uv[1], uv[3], uv[5]), level_of_detail(hits));
     color = multiply(color, texel);
   }
   Floats light = Floats{} + 1.f;
@@ -48,22 +49,22 @@ inline Rgb shade_surface(const KernelScene& scene, const Surface& surface, const
   }
   if (surface.lightmap != nullptr && !surface.emissive) {
     const Floats* uv = hits.record + 6;
-    const Rgb baked = sample_bilinear(*surface.lightmap, interpolate(hits, uv[0], uv[2], uv[4]),
-                                      interpolate(hits, uv[1], uv[3], uv[5]));
+    const RgbLanes baked = sample_bilinear(*surface.lightmap, interpolate(hits, uv[0], uv[2], uv[4]),
+                                           interpolate(hits, uv[1], uv[3], uv[5]));
     color = multiply(color, {2.f * baked.r, 2.f * baked.g, 2.f * baked.b});
   }
   return {saturate(color.r * light), saturate(color.g * light), saturate(color.b * light)};
 }
 
 /// Shades surface after surface: a packet mostly sees one or two, and within one all tables are scalars.
-inline Rgb shade_hits(const KernelScene& scene, const Hits& hits, Rgb color) {
+inline RgbLanes shade_hits(const KernelScene& scene, const Hits& hits, RgbLanes color) {
   const Ints surface = reinterpret_cast<Ints>(hits.record[12]);
   const Floats sunlit = scene.sun == nullptr ? Floats{} : sunlight(scene, hits);
   int left = mask_bits(hits.hit);
   while (left != 0) {
     const int number = surface[__builtin_ctz(static_cast<unsigned>(left))];
     const Ints mine = (surface == number) & hits.hit;
-    const Rgb shaded = shade_surface(scene, scene.surfaces[number], hits, sunlit);
+    const RgbLanes shaded = shade_surface(scene, scene.surfaces[number], hits, sunlit);
     color = {mine ? shaded.r : color.r, mine ? shaded.g : color.g, mine ? shaded.b : color.b};
     left &= ~mask_bits(mine);
   }
@@ -71,4 +72,4 @@ inline Rgb shade_hits(const KernelScene& scene, const Hits& hits, Rgb color) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -11,30 +11,28 @@
 #include "wiw/render/bulge.hpp"
 #include "wiw/render/texel_density.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 namespace {
 
-using Triangle = Eigen::Matrix<std::uint32_t, 3, 1>;
-
-const Material& material_of(const Scene& scene, const Mesh& mesh) {
-  static const Material plain;
-  return mesh.material == kNone ? plain : scene.materials[static_cast<std::size_t>(mesh.material)];
+const scene::Material& material_of(const scene::Scene& scene, const scene::Mesh& mesh) {
+  static const scene::Material plain;
+  return mesh.material == scene::kNone ? plain : scene.materials[static_cast<std::size_t>(mesh.material)];
 }
 
-bool is_textured(const Scene& scene, const Mesh& mesh) {
-  return material_of(scene, mesh).texture != kNone && !mesh.uv.empty();
+bool is_textured(const scene::Scene& scene, const scene::Mesh& mesh) {
+  return material_of(scene, mesh).texture != scene::kNone && !mesh.uv.empty();
 }
 
-bool is_lightmapped(const Mesh& mesh) { return mesh.lightmap != kNone && !mesh.lightmap_uv.empty(); }
+bool is_lightmapped(const scene::Mesh& mesh) { return mesh.lightmap != scene::kNone && !mesh.lightmap_uv.empty(); }
 
-bool needs_detail(const Scene& scene, const Mesh& mesh) {
+bool needs_detail(const scene::Scene& scene, const scene::Mesh& mesh) {
   const bool ambient = !is_lightmapped(mesh) && !material_of(scene, mesh).emissive;
   return !mesh.colors.empty() || (ambient && !mesh.normals.empty());
 }
 
 /// Value at vertex 0, then the differences that barycentric interpolation needs.
-void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& triangle, float* out) {
+void write_differences(const Buffer<Eigen::Vector2f>& values, const scene::Triangle& triangle, float* out) {
   if (values.empty()) return;
   const Eigen::Vector2f& first = values[triangle[0]];
   const Eigen::Vector2f to_1 = values[triangle[1]] - first;
@@ -48,7 +46,7 @@ void write_differences(const Buffer<Eigen::Vector2f>& values, const Triangle& tr
 
 using Normals = std::vector<Eigen::Vector3f>;
 
-Normals normals_of(const Mesh& mesh, const Eigen::Matrix3f& linear) {
+Normals normals_of(const scene::Mesh& mesh, const Eigen::Matrix3f& linear) {
   const Eigen::Matrix3f to_world = linear.inverse().transpose();
   Normals normals;
   normals.reserve(mesh.normals.size());
@@ -56,7 +54,8 @@ Normals normals_of(const Mesh& mesh, const Eigen::Matrix3f& linear) {
   return normals;
 }
 
-float bulge_of(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f& linear, const Normals& normals) {
+float bulge_of(const scene::Mesh& mesh, const scene::Triangle& triangle, const Eigen::Matrix3f& linear,
+               const Normals& normals) {
   std::array<Eigen::Vector3f, 3> corners;
   std::array<Eigen::Vector3f, 3> at_corners;
   for (std::size_t i = 0; i < 3; ++i) {
@@ -67,7 +66,7 @@ float bulge_of(const Mesh& mesh, const Triangle& triangle, const Eigen::Matrix3f
   return triangle_bulge(corners, at_corners);
 }
 
-void write_normals(const Triangle& triangle, const Normals& normals, float* out) {
+void write_normals(const scene::Triangle& triangle, const Normals& normals, float* out) {
   const Eigen::Vector3f& first = normals[triangle[0]];
   const Eigen::Vector3f to_1 = normals[triangle[1]] - first;
   const Eigen::Vector3f to_2 = normals[triangle[2]] - first;
@@ -80,7 +79,7 @@ void write_normals(const Triangle& triangle, const Normals& normals, float* out)
 
 }  // namespace
 
-ShadingScene::ShadingScene(const Scene& scene) : scene_(scene) {
+ShadingScene::ShadingScene(const scene::Scene& scene) : scene_(scene) {
   if (scene_.sun) {
     // Without components that are dust beside the others, which Embree's reciprocals overflow on.
     for (int c = 0; c < 3; ++c) {
@@ -92,9 +91,9 @@ ShadingScene::ShadingScene(const Scene& scene) : scene_(scene) {
   add_parts();
   stretches_.resize(parts_.size());
   parallel_for(parts_.size(), [this](std::size_t i) {
-    const Part& part = parts_[i];
-    const Instance& instance = scene_.instances[part.instance];
-    const Mesh& mesh = scene_.meshes[part.mesh];
+    const InstanceMesh& part = parts_[i];
+    const scene::Instance& instance = scene_.instances[part.instance];
+    const scene::Mesh& mesh = scene_.meshes[part.mesh];
     for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
       TriangleRecord& record = records_[part.first_record + t];
       write_differences(mesh.uv, mesh.triangles[t], record.uv);
@@ -116,8 +115,8 @@ void ShadingScene::add_parts() {
   std::size_t details = 0;
   for (std::uint32_t i = 0; i < scene_.instances.size(); ++i) {
     for (const std::uint32_t index : scene_.instances[i].meshes) {
-      const Mesh& mesh = scene_.meshes[index];
-      Part part{i, index, add_surface(mesh), static_cast<std::uint32_t>(records), kNoDetail};
+      const scene::Mesh& mesh = scene_.meshes[index];
+      InstanceMesh part{i, index, add_surface(mesh), static_cast<std::uint32_t>(records), kNoDetail};
       records += mesh.triangles.size();
       if (needs_detail(scene_, mesh)) {
         part.first_detail = static_cast<std::uint32_t>(details);
@@ -137,21 +136,21 @@ void ShadingScene::add_parts() {
   details_.resize(std::max<std::size_t>(1, details), plain);
 }
 
-std::uint32_t ShadingScene::add_surface(const Mesh& mesh) {
+std::uint32_t ShadingScene::add_surface(const scene::Mesh& mesh) {
   const bool textured = is_textured(scene_, mesh);
-  const std::int32_t lightmap = is_lightmapped(mesh) ? mesh.lightmap : kNone;
+  const std::int32_t lightmap = is_lightmapped(mesh) ? mesh.lightmap : scene::kNone;
   const SurfaceKey key{mesh.material, lightmap, textured, !mesh.colors.empty()};
   const auto [entry, is_new] = surface_numbers_.try_emplace(key, static_cast<std::uint32_t>(surfaces_.size()));
   if (!is_new) return entry->second;
-  const Material& material = material_of(scene_, mesh);
-  Surface surface{};
+  const scene::Material& material = material_of(scene_, mesh);
+  ShadingSurface surface{};
   for (int c = 0; c < 3; ++c) surface.base_color[c] = material.base_color[c];
   surface.base_alpha = material.base_color[3];
   surface.alpha_cutoff = material.alpha_cutoff;
   surface.emissive = material.emissive;
   surface.vertex_colors = !mesh.colors.empty();
   if (textured) surface.texture = add_texture(material.texture, TextureStore::Edge::kRepeat);
-  if (lightmap != kNone) surface.lightmap = add_texture(lightmap, TextureStore::Edge::kClamp);
+  if (lightmap != scene::kNone) surface.lightmap = add_texture(lightmap, TextureStore::Edge::kClamp);
   surfaces_.push_back(surface);
   return entry->second;
 }
@@ -164,8 +163,8 @@ const SampledTexture* ShadingScene::add_texture(std::int32_t index, TextureStore
 
 void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_instance) {
   place_texels(number, T_world_instance.linear());
-  const Part& part = parts_[number];
-  const Mesh& mesh = scene_.meshes[part.mesh];
+  const InstanceMesh& part = parts_[number];
+  const scene::Mesh& mesh = scene_.meshes[part.mesh];
   if (part.first_detail == kNoDetail || mesh.normals.empty()) return;
   const Normals normals = normals_of(mesh, T_world_instance.linear());
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
@@ -175,13 +174,13 @@ void ShadingScene::place(std::size_t number, const Eigen::Affine3f& T_world_inst
 }
 
 void ShadingScene::place_texels(std::size_t number, const Eigen::Matrix3f& linear) {
-  const Part& part = parts_[number];
+  const InstanceMesh& part = parts_[number];
   const SampledTexture* texture = surfaces_[part.surface].texture;
   if (texture == nullptr) return;
-  const Mesh& mesh = scene_.meshes[part.mesh];
+  const scene::Mesh& mesh = scene_.meshes[part.mesh];
   const Eigen::Vector2f size(texture->width[0], texture->height[0]);
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
-    const Triangle& triangle = mesh.triangles[t];
+    const scene::Triangle& triangle = mesh.triangles[t];
     TriangleRecord& record = records_[part.first_record + t];
     const Eigen::Vector3f first = mesh.positions[triangle[0]];
     const Eigen::Vector3f to_1 = linear * (mesh.positions[triangle[1]] - first);
@@ -198,8 +197,8 @@ void ShadingScene::place_bulges(std::size_t number, const Eigen::Matrix3f& linea
   std::optional<Eigen::Matrix3f>& last = stretches_[number];
   if (last == stretch) return;
   last = stretch;
-  const Part& part = parts_[number];
-  const Mesh& mesh = scene_.meshes[part.mesh];
+  const InstanceMesh& part = parts_[number];
+  const scene::Mesh& mesh = scene_.meshes[part.mesh];
   const Normals normals = normals_of(mesh, stretch);
   for (std::size_t t = 0; t < mesh.triangles.size(); ++t) {
     details_[part.first_detail + t].bulge = bulge_of(mesh, mesh.triangles[t], stretch, normals);
@@ -218,4 +217,4 @@ void ShadingScene::describe(KernelScene& kernel) const {
   }
 }
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

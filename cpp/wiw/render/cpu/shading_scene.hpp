@@ -9,10 +9,10 @@
 
 #include "wiw/render/cpu/texture_store.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
-/// One mesh of one instance: the unit of geometry, numbered alike here and in Embree.
-struct Part {
+/// One mesh of one instance, called a part here: the unit of geometry, numbered alike in Embree.
+struct InstanceMesh {
   std::uint32_t instance = 0;  // index into Scene::instances
   std::uint32_t mesh = 0;
   std::uint32_t surface = 0;
@@ -23,11 +23,13 @@ struct Part {
 /// What the kernels shade with: one record a placed triangle, surfaces, and textures with their mip levels.
 class ShadingScene {
  public:
-  explicit ShadingScene(const Scene& scene);
+  explicit ShadingScene(const scene::Scene& scene);
 
-  [[nodiscard]] std::span<const Part> parts() const { return parts_; }
-  [[nodiscard]] const Surface& surface(const Part& part) const { return surfaces_[part.surface]; }
-  [[nodiscard]] const TriangleRecord* records(const Part& part) const { return records_.data() + part.first_record; }
+  [[nodiscard]] std::span<const InstanceMesh> parts() const { return parts_; }
+  [[nodiscard]] const ShadingSurface& surface(const InstanceMesh& part) const { return surfaces_[part.surface]; }
+  [[nodiscard]] const TriangleRecord* records(const InstanceMesh& part) const {
+    return records_.data() + part.first_record;
+  }
 
   /// Recomputes what depends on a part's pose: world normals, bulges and texel densities.
   void place(std::size_t part, const Eigen::Affine3f& T_world_instance);
@@ -37,22 +39,22 @@ class ShadingScene {
 
  private:
   using SurfaceKey = std::tuple<std::int32_t, std::int32_t, bool, bool>;  // material, lightmap, textured, colours
-  std::uint32_t add_surface(const Mesh& mesh);
+  std::uint32_t add_surface(const scene::Mesh& mesh);
   const SampledTexture* add_texture(std::int32_t index, TextureStore::Edge edge);
   void add_parts();
   void place_texels(std::size_t part, const Eigen::Matrix3f& linear);
   void place_bulges(std::size_t part, const Eigen::Matrix3f& linear);
 
-  const Scene& scene_;
+  const scene::Scene& scene_;
   Sunlight sun_{};  // if the scene has one
   std::map<std::pair<std::int32_t, TextureStore::Edge>, std::unique_ptr<TextureStore>> textures_;
   std::map<SurfaceKey, std::uint32_t> surface_numbers_;
-  std::vector<Surface> surfaces_;
-  std::vector<Part> parts_;
+  std::vector<ShadingSurface> surfaces_;
+  std::vector<InstanceMesh> parts_;
   std::vector<std::uint32_t> first_record_;  // by part
   std::vector<TriangleRecord> records_;
   std::vector<TriangleDetail> details_;
   std::vector<std::optional<Eigen::Matrix3f>> stretches_;  // by part: what its bulges are of
 };
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

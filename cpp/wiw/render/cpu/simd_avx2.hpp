@@ -7,7 +7,7 @@
 #include "wiw/render/cpu/kernel.hpp"
 
 /// Eight lanes: AVX2 with FMA.
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 constexpr int kLanes = 8;
@@ -98,4 +98,4 @@ inline void load_lines(const void* lines, Ints index, Floats* words) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -7,7 +7,7 @@
 #include "wiw/render/cpu/kernel.hpp"
 
 /// Sixteen lanes: AVX-512 F, DQ, BW, VL.
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 constexpr int kLanes = 16;
@@ -103,4 +103,4 @@ inline void load_lines(const void* lines, Ints index, Floats* words) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -6,7 +6,7 @@
 #include "wiw/render/cpu/kernel.hpp"
 
 /// Four lanes in the compiler's portable vectors: the processor's baseline, no instruction set assumed.
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 constexpr int kLanes = 4;
@@ -65,4 +65,4 @@ inline void load_lines(const void* lines, Ints index, Floats* words) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

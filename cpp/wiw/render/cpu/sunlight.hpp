@@ -6,7 +6,7 @@
 #include "wiw/render/cpu/hits.hpp"
 #include "wiw/render/shading.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 namespace {
 
 /// Where the hits' rays to the sun start, see shading.hpp.
@@ -59,4 +59,4 @@ inline Floats sunlight(const KernelScene& scene, const Hits& hits) {
 }
 
 }  // namespace
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

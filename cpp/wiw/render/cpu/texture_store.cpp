@@ -8,7 +8,7 @@
 #include "wiw/render/mipmap.hpp"
 #include "wiw/render/shading.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 static_assert(kLevelSlots == shading::kMaxMipLevels);
 
@@ -23,7 +23,7 @@ int edge_index(int i, int size, TextureStore::Edge edge) {
 }
 }  // namespace
 
-TextureStore::TextureStore(const Texture& texture, Edge edge) {
+TextureStore::TextureStore(const scene::Texture& texture, Edge edge) {
   const auto mips = edge == Edge::kRepeat ? build_mips(texture) : std::vector<MipLevel>{};
   std::size_t total = bordered_texels(texture.size);
   for (const MipLevel& level : mips) total += bordered_texels(level.size);
@@ -70,4 +70,4 @@ float sample_alpha(const SampledTexture& texture, float u, float v) {
   return std::lerp(top, bottom, y - static_cast<float>(row)) / 255.f;
 }
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -8,13 +8,13 @@
 #include "wiw/render/cpu/kernel.hpp"
 #include "wiw/scene/scene.hpp"
 
-namespace wiw::cpu {
+namespace wiw::render::cpu {
 
 /// A texture as the kernels read it, with the texels it points to. Clamped textures (lightmaps) keep level 0 only.
 class TextureStore {
  public:
   enum class Edge { kRepeat, kClamp };
-  TextureStore(const Texture& texture, Edge edge);
+  TextureStore(const scene::Texture& texture, Edge edge);
 
   [[nodiscard]] const SampledTexture& sampled() const { return sampled_; }
 
@@ -28,4 +28,4 @@ class TextureStore {
 /// Bilinear alpha in [0, 1] of level 0, by the same rule as the kernels' colours.
 float sample_alpha(const SampledTexture& texture, float u, float v);
 
-}  // namespace wiw::cpu
+}  // namespace wiw::render::cpu

@@ -6,10 +6,10 @@
 
 #include "wiw/render/gpu/frustum.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
-void DrawList::gather(const View& view, const Scene& scene, const std::vector<MeshRange>& meshes,
-                      const std::vector<Chunk>& chunks, const std::vector<Eigen::Affine3f>& poses) {
+void DrawList::gather(const ViewBlock& view, const scene::Scene& scene, const std::vector<MeshRange>& meshes,
+                      const std::vector<MeshChunk>& chunks, const std::vector<Eigen::Affine3f>& poses) {
   draws_.clear();
   const Frustum frustum(view);
   const Eigen::Vector3f eye = view.eye.head<3>();
@@ -19,7 +19,7 @@ void DrawList::gather(const View& view, const Scene& scene, const std::vector<Me
       const MeshRange& range = meshes[mesh];
       if (range.chunk_count == 0 || !local.may_see(range.box)) continue;
       for (std::size_t k = range.first_chunk; k < range.first_chunk + range.chunk_count; ++k) {
-        const Chunk& chunk = chunks[k];
+        const MeshChunk& chunk = chunks[k];
         if (range.chunk_count > 1 && !local.may_see(chunk.box)) continue;
         const float distance = (poses[i] * chunk.box.center() - eye).norm();
         draws_.push_back({distance, i, mesh, static_cast<std::uint32_t>(k)});
@@ -31,7 +31,7 @@ void DrawList::gather(const View& view, const Scene& scene, const std::vector<Me
   });
 }
 
-void DrawList::gather_all(const Scene& scene, const std::vector<MeshRange>& meshes) {
+void DrawList::gather_all(const scene::Scene& scene, const std::vector<MeshRange>& meshes) {
   draws_.clear();
   for (std::uint32_t i = 0; i < scene.instances.size(); ++i) {
     for (const std::uint32_t mesh : scene.instances[i].meshes) {
@@ -43,4 +43,4 @@ void DrawList::gather_all(const Scene& scene, const std::vector<MeshRange>& mesh
   }
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -6,7 +6,7 @@
 #include "wiw/render/gpu/geometry.hpp"
 #include "wiw/render/gpu/view.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// One visible chunk of one instance.
 struct Draw {
@@ -21,11 +21,11 @@ struct Draw {
 class DrawList {
  public:
   /// `meshes` and `chunks` are those of build_geometry; instance i shows scene.instances[i].meshes at poses[i].
-  void gather(const View& view, const Scene& scene, const std::vector<MeshRange>& meshes,
-              const std::vector<Chunk>& chunks, const std::vector<Eigen::Affine3f>& poses);
+  void gather(const ViewBlock& view, const scene::Scene& scene, const std::vector<MeshRange>& meshes,
+              const std::vector<MeshChunk>& chunks, const std::vector<Eigen::Affine3f>& poses);
 
   /// Everything, in no particular order.
-  void gather_all(const Scene& scene, const std::vector<MeshRange>& meshes);
+  void gather_all(const scene::Scene& scene, const std::vector<MeshRange>& meshes);
 
   [[nodiscard]] const std::vector<Draw>& draws() const { return draws_; }
 
@@ -33,4 +33,4 @@ class DrawList {
   std::vector<Draw> draws_;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 std::vector<EglDevice> list_devices(const EglLibrary& egl) {
   std::vector<EglDevice> devices;
@@ -54,4 +54,4 @@ std::string device_name(const EglDevice& device) {
   return device.index < 0 ? "the surfaceless platform" : "EGL device " + std::to_string(device.index);
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -6,7 +6,7 @@
 
 #include "wiw/render/gpu/egl_library.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// One way to reach a GL implementation without a window system.
 struct EglDevice {
@@ -26,4 +26,4 @@ std::vector<EglDevice> candidate_devices(const EglLibrary& egl);
 /// "EGL device 0" or "the surfaceless platform".
 std::string device_name(const EglDevice& device);
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

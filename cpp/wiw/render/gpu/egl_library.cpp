@@ -11,7 +11,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -101,4 +101,4 @@ bool has_extension(const char* list, const char* name) {
   return false;
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

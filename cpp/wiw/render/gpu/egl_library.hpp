@@ -9,7 +9,7 @@
 
 #include <string>
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// The EGL entry points in use, opened at run time: a machine without any GL can still load this library.
 struct EglLibrary {
@@ -45,4 +45,4 @@ const EglLibrary& egl_library();
 /// Whether a space-separated extension list holds `name`; a null list is empty.
 bool has_extension(const char* list, const char* name);
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

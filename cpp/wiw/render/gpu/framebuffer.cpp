@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -124,4 +124,4 @@ void Framebuffer::clear(ProgramKey outputs, bool depth_test) const {
   if (depth_test) gl_.ClearBufferfv(GL_DEPTH, 0, kZero.data());
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

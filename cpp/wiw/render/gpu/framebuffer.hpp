@@ -10,7 +10,7 @@
 #include "wiw/render/gpu/gl_object.hpp"
 #include "wiw/render/gpu/shader_source.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 // Colour attachments, in the order of the shaders' output locations.
 enum : std::size_t { kColorTarget = 0, kDepthTarget = 1, kIdTarget = 2, kSlopeTarget = 3 };
@@ -66,4 +66,4 @@ class Framebuffer {
   int layers_ = 0;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -3,9 +3,9 @@
 
 #include <cmath>
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
-Frustum::Frustum(const View& view) {
+Frustum::Frustum(const ViewBlock& view) {
   const Eigen::Vector3f right = view.right.head<3>();
   const Eigen::Vector3f up = view.up.head<3>();
   const Eigen::Vector3f forward = -view.back.head<3>();
@@ -39,4 +39,4 @@ bool Frustum::may_see(const Eigen::AlignedBox3f& box) const {
   return true;
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -6,12 +6,12 @@
 
 #include "wiw/render/gpu/view.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// The four sides and the near plane of a view; a point p is inside where normal . p + offset >= 0 for all of them.
 class Frustum {
  public:
-  explicit Frustum(const View& view);
+  explicit Frustum(const ViewBlock& view);
 
   /// The same planes in the coordinates of an instance.
   [[nodiscard]] Frustum in_instance(const Eigen::Affine3f& T_world_instance) const;
@@ -25,4 +25,4 @@ class Frustum {
   std::array<float, 5> offsets_{};
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

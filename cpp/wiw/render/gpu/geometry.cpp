@@ -13,11 +13,11 @@
 #include "wiw/render/bulge.hpp"
 #include "wiw/render/shading.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
-Vertex make_vertex(const Mesh& mesh, std::size_t i) {
+Vertex make_vertex(const scene::Mesh& mesh, std::size_t i) {
   Vertex vertex{};
   Eigen::Map<Eigen::Vector3f>(vertex.position) = mesh.positions[i];
   if (!mesh.normals.empty()) {
@@ -31,16 +31,16 @@ Vertex make_vertex(const Mesh& mesh, std::size_t i) {
   return vertex;
 }
 
-void set_appearance(const Scene& scene, const Mesh& mesh, MeshRange& range) {
-  static const Material kDefault;
-  const Material& material =
-      mesh.material == kNone ? kDefault : scene.materials[static_cast<std::size_t>(mesh.material)];
+void set_appearance(const scene::Scene& scene, const scene::Mesh& mesh, MeshRange& range) {
+  static const scene::Material kDefault;
+  const scene::Material& material =
+      mesh.material == scene::kNone ? kDefault : scene.materials[static_cast<std::size_t>(mesh.material)];
   range.material = mesh.material;
-  if (material.texture != kNone && !mesh.uv.empty()) {
+  if (material.texture != scene::kNone && !mesh.uv.empty()) {
     range.texture = material.texture;
     range.appearance |= kTextured;
   }
-  if (mesh.lightmap != kNone && !mesh.lightmap_uv.empty()) {
+  if (mesh.lightmap != scene::kNone && !mesh.lightmap_uv.empty()) {
     range.lightmap = mesh.lightmap;
     range.appearance |= kLightmapped;
   }
@@ -52,7 +52,7 @@ void set_appearance(const Scene& scene, const Mesh& mesh, MeshRange& range) {
 }
 
 /// Writes how far a curved surface stands out of the triangles around each of its vertices.
-void write_lifts(const Mesh& mesh, std::span<Vertex> vertices) {
+void write_lifts(const scene::Mesh& mesh, std::span<Vertex> vertices) {
   for (Vertex& vertex : vertices) vertex.lightmap_uv[0] = 0.f;
   for (const auto& triangle : mesh.triangles) {
     std::array<Eigen::Vector3f, 3> corners;
@@ -69,7 +69,7 @@ void write_lifts(const Mesh& mesh, std::span<Vertex> vertices) {
 /// Splits the triangles of one mesh at the median of the longest side until a part is small enough.
 class Splitter {
  public:
-  Splitter(const Mesh& mesh, std::uint32_t first_vertex, Geometry& geometry)
+  Splitter(const scene::Mesh& mesh, std::uint32_t first_vertex, SceneGeometry& geometry)
       : mesh_(mesh), first_vertex_(first_vertex), geometry_(geometry), order_(mesh.triangles.size()) {
     centres_.reserve(order_.size());
     for (const auto& triangle : mesh.triangles) {
@@ -99,7 +99,7 @@ class Splitter {
 
   void emit(std::span<std::uint32_t> part) {
     std::ranges::sort(part);  // the file's order keeps neighbouring vertices close in memory
-    Chunk chunk;
+    MeshChunk chunk;
     chunk.first_index = geometry_.indices.size();
     chunk.index_count = 3 * part.size();
     for (const std::uint32_t i : part) {
@@ -111,24 +111,24 @@ class Splitter {
     geometry_.chunks.push_back(chunk);
   }
 
-  const Mesh& mesh_;
+  const scene::Mesh& mesh_;
   std::uint32_t first_vertex_;
-  Geometry& geometry_;
+  SceneGeometry& geometry_;
   std::vector<std::uint32_t> order_;
   std::vector<Eigen::Vector3f> centres_;
 };
 
 }  // namespace
 
-Geometry build_geometry(const Scene& scene) {
-  Geometry geometry;
+SceneGeometry build_geometry(const scene::Scene& scene) {
+  SceneGeometry geometry;
   std::size_t vertices = 0;
-  for (const Mesh& mesh : scene.meshes) vertices += mesh.positions.size();
+  for (const scene::Mesh& mesh : scene.meshes) vertices += mesh.positions.size();
   if (vertices > std::numeric_limits<std::uint32_t>::max()) {
     throw ArgumentError("the gpu back end draws at most 2^32 vertices, got " + std::to_string(vertices));
   }
   geometry.vertices.reserve(vertices);
-  for (const Mesh& mesh : scene.meshes) {
+  for (const scene::Mesh& mesh : scene.meshes) {
     MeshRange range;
     range.first_chunk = geometry.chunks.size();
     const auto first_vertex = static_cast<std::uint32_t>(geometry.vertices.size());
@@ -145,4 +145,4 @@ Geometry build_geometry(const Scene& scene) {
   return geometry;
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -9,7 +9,7 @@
 #include "wiw/render/gpu/shader_source.hpp"
 #include "wiw/scene/scene.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// Vertex as the graphics card reads it, 40 bytes.
 struct Vertex {
@@ -22,7 +22,7 @@ struct Vertex {
 static_assert(sizeof(Vertex) == 40);
 
 /// Nearby triangles of one mesh, culled together.
-struct Chunk {
+struct MeshChunk {
   Eigen::AlignedBox3f box;  // instance coordinates
   std::size_t first_index = 0;
   std::size_t index_count = 0;
@@ -36,19 +36,19 @@ struct MeshRange {
   std::size_t first_chunk = 0;
   std::size_t chunk_count = 0;
   ProgramKey appearance = 0;
-  std::int32_t material = kNone;
-  std::int32_t texture = kNone;
-  std::int32_t lightmap = kNone;
+  std::int32_t material = scene::kNone;
+  std::int32_t texture = scene::kNone;
+  std::int32_t lightmap = scene::kNone;
 };
 
 /// All meshes of a scene in one vertex and one index array.
-struct Geometry {
+struct SceneGeometry {
   std::vector<Vertex> vertices;
   std::vector<std::uint32_t> indices;
-  std::vector<Chunk> chunks;
+  std::vector<MeshChunk> chunks;
   std::vector<MeshRange> meshes;  // parallel to Scene::meshes
 };
 
-Geometry build_geometry(const Scene& scene);
+SceneGeometry build_geometry(const scene::Scene& scene);
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -3,7 +3,7 @@
 
 #include <GL/glcorearb.h>
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 // Every OpenGL function in use: member name, C type.
 #define WIW_GL_FUNCTIONS(X)                                    \
@@ -81,4 +81,4 @@ struct Gl {
 #undef WIW_GL_MEMBER
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -11,7 +11,7 @@
 #include "wiw/render/gpu/program.hpp"
 #include "wiw/render/gpu/workspace.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -215,4 +215,4 @@ GlContext::Current::~Current() {
   egl.bind_api(api_);
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -9,7 +9,7 @@
 #include "wiw/render/gpu/egl_device.hpp"
 #include "wiw/render/gpu/gl_api.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 class ProgramCache;
 struct Workspace;
@@ -89,4 +89,4 @@ class GlContext {
   std::atomic<bool> lost_ = false;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

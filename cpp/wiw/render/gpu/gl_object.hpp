@@ -7,7 +7,7 @@
 
 #include "wiw/render/gpu/gl_api.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// Owns one GL name. Create and destroy only while the context is current.
 template <auto Generate, auto Delete>
@@ -41,4 +41,4 @@ using GlSampler = GlObject<&Gl::GenSamplers, &Gl::DeleteSamplers>;
 using GlVertexArray = GlObject<&Gl::GenVertexArrays, &Gl::DeleteVertexArrays>;
 using GlFramebuffer = GlObject<&Gl::GenFramebuffers, &Gl::DeleteFramebuffers>;
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

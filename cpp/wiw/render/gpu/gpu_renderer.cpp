@@ -14,7 +14,7 @@
 #include "wiw/render/request.hpp"
 #include "wiw/render/shading.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -41,7 +41,7 @@ ProgramKey outputs_of(const RenderTargets& targets) {
 
 /// What one renderer keeps on the device. Make, use and destroy while the context is current.
 struct GraphicsMemory {
-  GraphicsMemory(GlContext& context, const Scene& content, const Geometry& geometry)
+  GraphicsMemory(GlContext& context, const scene::Scene& content, const SceneGeometry& geometry)
       : scene(context, content, geometry),
         views(context.gl(), context.info().uniform_alignment),
         no_vertices(context.gl()) {
@@ -49,7 +49,7 @@ struct GraphicsMemory {
   }
 
   SceneBuffers scene;
-  UniformSlots<View> views;
+  UniformSlots<ViewBlock> views;
   GlVertexArray no_vertices;
   std::optional<SunMap> sun;
 };
@@ -58,11 +58,11 @@ struct GraphicsMemory {
 
 class GpuRenderer final : public Renderer {
  public:
-  GpuRenderer(ScenePtr scene, const RenderOptions& options)
+  GpuRenderer(scene::ScenePtr scene, const RenderOptions& options)
       : scene_(std::move(scene)), samples_(options.samples), context_(GlContext::shared()) {
     if (scene_->triangle_count() == 0) throw ArgumentError("render: scene '" + scene_->name + "' has no triangles");
-    Geometry geometry = build_geometry(*scene_);
-    for (const Instance& instance : scene_->instances) poses_.push_back(instance.T_world_instance);
+    SceneGeometry geometry = build_geometry(*scene_);
+    for (const scene::Instance& instance : scene_->instances) poses_.push_back(instance.T_world_instance);
     const GlContext::Current current(*context_);
     gl_ = &context_->gl();
     memory_ = std::make_unique<GraphicsMemory>(*context_, *scene_, geometry);
@@ -115,7 +115,7 @@ class GpuRenderer final : public Renderer {
     context_->check("moving instances");
   }
 
-  [[nodiscard]] const Scene& scene() const override { return *scene_; }
+  [[nodiscard]] const scene::Scene& scene() const override { return *scene_; }
 
   [[nodiscard]] std::string description() const override {
     const GlContext::Info& info = context_->info();
@@ -191,7 +191,7 @@ class GpuRenderer final : public Renderer {
     Framebuffer& batch = context_->workspace().batch;
     batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, true);
     if (sampled) context_->workspace().samples.reserve(camera.size, samples_, kColorOut, true);
-    std::vector<View> views;
+    std::vector<ViewBlock> views;
     for (const Pose& pose : poses) views.push_back(perspective_view(pose, camera, Eigen::Vector2f::Zero(), 1));
     if (sampled) {
       for (const Pose& pose : poses) {
@@ -211,7 +211,7 @@ class GpuRenderer final : public Renderer {
     }
   }
 
-  void draw_samples(const std::vector<View>& views, std::size_t first_view, Size size) {
+  void draw_samples(const std::vector<ViewBlock>& views, std::size_t first_view, Size size) {
     Framebuffer& target = context_->workspace().samples;
     for (int i = 0; i < samples_; ++i) {
       bind_layer(target, i, size, kColorOut, true);
@@ -234,7 +234,7 @@ class GpuRenderer final : public Renderer {
     Framebuffer& faces = context_->workspace().faces;
     batch.reserve(camera.size, static_cast<int>(poses.size()), outputs, false);
     faces.reserve({side, side}, kFaces, face_outputs, true);
-    std::vector<View> views;
+    std::vector<ViewBlock> views;
     for (const Pose& pose : poses) {
       for (int face = 0; face < kFaces; ++face) views.push_back(face_view(pose, face, camera.size, samples_));
     }
@@ -268,7 +268,7 @@ class GpuRenderer final : public Renderer {
   }
 
   /// The scene as `view` sees it, and the sky behind it.
-  void draw_view(const std::vector<View>& views, std::size_t view, ProgramKey outputs) {
+  void draw_view(const std::vector<ViewBlock>& views, std::size_t view, ProgramKey outputs) {
     gl_->DepthFunc(GL_GREATER);
     memory_->views.bind(kViewBinding, view);
     memory_->scene.bind_geometry();
@@ -286,9 +286,9 @@ class GpuRenderer final : public Renderer {
   void draw_chunks(ProgramKey outputs) {
     ProgramKey key = ~0u;
     std::uint32_t instance = ~0u;
-    std::int32_t material = kNone - 1;
-    std::int32_t texture = kNone;
-    std::int32_t lightmap = kNone;
+    std::int32_t material = scene::kNone - 1;
+    std::int32_t texture = scene::kNone;
+    std::int32_t lightmap = scene::kNone;
     for (const Draw& draw : draws_.draws()) {
       const MeshRange& mesh = meshes_[draw.mesh];
       const ProgramKey wanted = reduce(mesh.appearance | outputs);
@@ -301,7 +301,7 @@ class GpuRenderer final : public Renderer {
       if ((wanted & kLightmapped) != 0 && std::exchange(lightmap, mesh.lightmap) != mesh.lightmap) {
         memory_->scene.bind_lightmap(mesh.lightmap);
       }
-      const Chunk& chunk = chunks_[draw.chunk];
+      const MeshChunk& chunk = chunks_[draw.chunk];
       gl_->DrawElements(GL_TRIANGLES, static_cast<GLsizei>(chunk.index_count), GL_UNSIGNED_INT,
                         buffer_offset(chunk.first_index * sizeof(std::uint32_t)));
     }
@@ -375,25 +375,25 @@ class GpuRenderer final : public Renderer {
     gl_->BindBuffer(GL_PIXEL_PACK_BUFFER, 0);
   }
 
-  ScenePtr scene_;
+  scene::ScenePtr scene_;
   int samples_;
   std::shared_ptr<GlContext> context_;
   const Gl* gl_ = nullptr;
   std::vector<Eigen::Affine3f> poses_;
-  std::vector<Chunk> chunks_;
+  std::vector<MeshChunk> chunks_;
   std::vector<MeshRange> meshes_;
   std::unique_ptr<GraphicsMemory> memory_;
   DrawList draws_;
   bool sun_is_drawn_ = false;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu
 
-namespace wiw {
+namespace wiw::render {
 
-std::shared_ptr<Renderer> make_gpu_renderer(ScenePtr scene, const RenderOptions& options) {
+std::shared_ptr<Renderer> make_gpu_renderer(scene::ScenePtr scene, const RenderOptions& options) {
   check_options(options);
   return std::make_shared<gpu::GpuRenderer>(std::move(scene), options);
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

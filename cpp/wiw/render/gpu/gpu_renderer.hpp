@@ -7,10 +7,10 @@
 
 #include "wiw/render/renderer.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 /// OpenGL back end on the process's EGL device. Throws BackendError with the remedy when there is none.
-std::shared_ptr<Renderer> make_gpu_renderer(ScenePtr scene, const RenderOptions& options);
+std::shared_ptr<Renderer> make_gpu_renderer(scene::ScenePtr scene, const RenderOptions& options);
 
 /// Whether an EGL device that is no software rasteriser gives a context here; opens one only on devices that may be
 /// hardware. Throws BackendError if WIW_EGL_DEVICE names a device that does not exist.
@@ -29,4 +29,4 @@ struct EglDeviceReport {
 /// Every EGL device, each tried. Throws BackendError when there is no EGL library.
 std::vector<EglDeviceReport> report_egl_devices();
 
-}  // namespace wiw
+}  // namespace wiw::render

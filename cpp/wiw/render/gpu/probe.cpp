@@ -5,7 +5,7 @@
 #include "wiw/render/gpu/gl_context.hpp"
 #include "wiw/render/gpu/gpu_renderer.hpp"
 
-namespace wiw {
+namespace wiw::render {
 
 bool has_gpu_hardware() {
   const gpu::EglLibrary* egl = nullptr;
@@ -51,4 +51,4 @@ std::vector<EglDeviceReport> report_egl_devices() {
   return reports;
 }
 
-}  // namespace wiw
+}  // namespace wiw::render

@@ -5,7 +5,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 GLuint ProgramCache::find_or_make(ProgramKey key, const auto& make) {
   if (const auto entry = programs_.find(key); entry != programs_.end()) return entry->second;
@@ -85,4 +85,4 @@ void ProgramCache::bind_names(GLuint program) {
   }
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -7,7 +7,7 @@
 #include "wiw/render/gpu/gl_api.hpp"
 #include "wiw/render/gpu/shader_source.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 // Where uniform blocks and textures are bound, the same in every program.
 enum : GLuint { kViewBinding = 0, kInstanceBinding = 1, kMaterialBinding = 2, kSunBinding = 3 };
@@ -39,4 +39,4 @@ class ProgramCache {
   std::unordered_map<ProgramKey, GLuint> programs_;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

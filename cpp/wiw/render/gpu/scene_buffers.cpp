@@ -7,7 +7,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/render/mipmap.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -42,7 +42,7 @@ GlSampler make_sampler(const Gl& gl, GLint minify, GLint wrap) {
 
 }  // namespace
 
-SceneBuffers::SceneBuffers(GlContext& context, const Scene& scene, const Geometry& geometry)
+SceneBuffers::SceneBuffers(GlContext& context, const scene::Scene& scene, const SceneGeometry& geometry)
     : gl_(context.gl()),
       vertex_array_(gl_),
       vertices_(gl_),
@@ -54,14 +54,14 @@ SceneBuffers::SceneBuffers(GlContext& context, const Scene& scene, const Geometr
   upload_geometry(geometry);
   std::vector<InstanceBlock> instances;
   instances.reserve(scene.instances.size());
-  for (const Instance& instance : scene.instances) {
+  for (const scene::Instance& instance : scene.instances) {
     instances.push_back(make_instance(instance.id, instance.T_world_instance));
   }
   instances_.upload(instances, GL_DYNAMIC_DRAW);
   std::vector<MaterialBlock> materials;
   materials.reserve(scene.materials.size() + 1);
   materials.push_back({Eigen::Vector4f::Ones(), Eigen::Vector4f::Zero()});
-  for (const Material& material : scene.materials) {
+  for (const scene::Material& material : scene.materials) {
     materials.push_back({material.base_color, Eigen::Vector4f::Constant(material.alpha_cutoff)});
   }
   materials_.upload(materials, GL_STATIC_DRAW);
@@ -69,7 +69,7 @@ SceneBuffers::SceneBuffers(GlContext& context, const Scene& scene, const Geometr
   context.check("uploading the scene");
 }
 
-void SceneBuffers::upload_geometry(const Geometry& geometry) {
+void SceneBuffers::upload_geometry(const SceneGeometry& geometry) {
   gl_.BindVertexArray(vertex_array_.id());
   gl_.BindBuffer(GL_ARRAY_BUFFER, vertices_.id());
   gl_.BufferData(GL_ARRAY_BUFFER, static_cast<GLsizeiptr>(geometry.vertices.size() * sizeof(Vertex)),
@@ -90,14 +90,14 @@ void SceneBuffers::upload_geometry(const Geometry& geometry) {
   gl_.BindVertexArray(0);
 }
 
-void SceneBuffers::upload_textures(const Scene& scene, int max_size) {
+void SceneBuffers::upload_textures(const scene::Scene& scene, int max_size) {
   std::vector<bool> needs_mips(scene.textures.size(), false);
-  for (const Material& material : scene.materials) {
-    if (material.texture != kNone) needs_mips[static_cast<std::size_t>(material.texture)] = true;
+  for (const scene::Material& material : scene.materials) {
+    if (material.texture != scene::kNone) needs_mips[static_cast<std::size_t>(material.texture)] = true;
   }
   gl_.ActiveTexture(GL_TEXTURE0);
   for (std::size_t i = 0; i < scene.textures.size(); ++i) {
-    const Texture& texture = scene.textures[i];
+    const scene::Texture& texture = scene.textures[i];
     if (texture.size.width > max_size || texture.size.height > max_size) {
       throw ArgumentError("texture '" + texture.name + "' is " + std::to_string(texture.size.height) + " x " +
                           std::to_string(texture.size.width) + ", but this OpenGL driver takes at most " +
@@ -133,4 +133,4 @@ void SceneBuffers::bind_lightmap(std::int32_t index) const {
   gl_.BindSampler(kLightmapUnit, lightmap_sampler_.id());
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -8,7 +8,7 @@
 #include "wiw/render/gpu/program.hpp"
 #include "wiw/render/gpu/uniform_slots.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// The shaders' uniform block `Instance` (std140).
 struct InstanceBlock {
@@ -27,7 +27,7 @@ struct MaterialBlock {
 class SceneBuffers {
  public:
   /// Throws ArgumentError when a texture is larger than the driver takes.
-  SceneBuffers(GlContext& context, const Scene& scene, const Geometry& geometry);
+  SceneBuffers(GlContext& context, const scene::Scene& scene, const SceneGeometry& geometry);
 
   void set_pose(std::uint32_t id, const Eigen::Affine3f& T_world_instance);
 
@@ -38,8 +38,8 @@ class SceneBuffers {
   void bind_lightmap(std::int32_t index) const;
 
  private:
-  void upload_geometry(const Geometry& geometry);
-  void upload_textures(const Scene& scene, int max_size);
+  void upload_geometry(const SceneGeometry& geometry);
+  void upload_textures(const scene::Scene& scene, int max_size);
 
   const Gl& gl_;
   GlVertexArray vertex_array_;
@@ -52,4 +52,4 @@ class SceneBuffers {
   GlSampler lightmap_sampler_;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

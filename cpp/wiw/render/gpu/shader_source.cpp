@@ -4,7 +4,7 @@
 #include <array>
 #include <utility>
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
@@ -437,4 +437,4 @@ std::string panorama_fragment_source(ProgramKey key) {
   return header(key) + kViewBlock + kOutputs + kSky + kPanoramaMain;
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

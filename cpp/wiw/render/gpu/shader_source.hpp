@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <string>
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 // Properties of a surface and of a pass that a scene program is compiled for; a ProgramKey is their union.
 enum : std::uint32_t {
@@ -35,4 +35,4 @@ std::string sky_fragment_source(ProgramKey outputs);
 std::string average_fragment_source();
 std::string panorama_fragment_source(ProgramKey key);
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -3,15 +3,15 @@
 
 #include "wiw/render/gpu/program.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
 /// What covers more of the scene than this, as the sun sees it, is not in the finer square.
 constexpr float kLargeShare = 0.25f;
 
-Eigen::AlignedBox3f bounds_along(const Eigen::Matrix3f& axes, const Instance& instance, const Eigen::Affine3f& pose,
-                                 const std::vector<MeshRange>& meshes) {
+Eigen::AlignedBox3f bounds_along(const Eigen::Matrix3f& axes, const scene::Instance& instance,
+                                 const Eigen::Affine3f& pose, const std::vector<MeshRange>& meshes) {
   Eigen::AlignedBox3f bounds;
   const Eigen::Affine3f T_map_instance = axes * pose;
   for (const std::uint32_t mesh : instance.meshes) {
@@ -26,7 +26,7 @@ Eigen::AlignedBox3f bounds_along(const Eigen::Matrix3f& axes, const Instance& in
 float area(const Eigen::AlignedBox3f& box) { return box.isEmpty() ? 0.f : box.sizes().x() * box.sizes().y(); }
 
 /// Bounds of the whole scene and of its small instances in the frame whose rows are `axes`; heights are the scene's.
-std::array<Eigen::AlignedBox3f, kSunSquares> bounds_of_squares(const Eigen::Matrix3f& axes, const Scene& scene,
+std::array<Eigen::AlignedBox3f, kSunSquares> bounds_of_squares(const Eigen::Matrix3f& axes, const scene::Scene& scene,
                                                                const std::vector<MeshRange>& meshes,
                                                                const std::vector<Eigen::Affine3f>& poses) {
   std::vector<Eigen::AlignedBox3f> boxes;
@@ -46,7 +46,7 @@ std::array<Eigen::AlignedBox3f, kSunSquares> bounds_of_squares(const Eigen::Matr
 
 }  // namespace
 
-SunBlock sun_block(const Sun& sun, const Scene& scene, const std::vector<MeshRange>& meshes,
+SunBlock sun_block(const scene::Sun& sun, const scene::Scene& scene, const std::vector<MeshRange>& meshes,
                    const std::vector<Eigen::Affine3f>& poses, int side) {
   const Eigen::Vector3f direction = sun.direction.normalized();
   const Eigen::Vector3f right = direction.unitOrthogonal();
@@ -70,8 +70,8 @@ SunBlock sun_block(const Sun& sun, const Scene& scene, const std::vector<MeshRan
   return block;
 }
 
-View sun_view(const SunBlock& block, std::size_t square) {
-  View view;
+ViewBlock sun_view(const SunBlock& block, std::size_t square) {
+  ViewBlock view;
   view.right = block.right;
   view.up = block.up;
   view.back = block.direction;
@@ -83,17 +83,17 @@ View sun_view(const SunBlock& block, std::size_t square) {
   return view;
 }
 
-SunMap::SunMap(GlContext& context, const Sun& sun)
+SunMap::SunMap(GlContext& context, const scene::Sun& sun)
     : context_(context),
       sun_(sun),
       target_(context.gl()),
       block_(context.gl(), context.info().uniform_alignment),
       views_(context.gl(), context.info().uniform_alignment) {}
 
-void SunMap::begin(const Scene& scene, const std::vector<MeshRange>& meshes,
+void SunMap::begin(const scene::Scene& scene, const std::vector<MeshRange>& meshes,
                    const std::vector<Eigen::Affine3f>& poses) {
   const SunBlock block = sun_block(sun_, scene, meshes, poses, kSunSide);
-  const std::array<View, kSunSquares> views{sun_view(block, 0), sun_view(block, 1)};
+  const std::array<ViewBlock, kSunSquares> views{sun_view(block, 0), sun_view(block, 1)};
   block_.upload(std::span(&block, 1), GL_DYNAMIC_DRAW);
   views_.upload(views, GL_DYNAMIC_DRAW);
   constexpr ProgramKey kNoOutputs = 0;
@@ -124,4 +124,4 @@ void SunMap::bind() const {
   gl.BindSampler(kSunUnit, 0);
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

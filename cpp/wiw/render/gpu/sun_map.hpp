@@ -10,7 +10,7 @@
 #include "wiw/render/gpu/uniform_slots.hpp"
 #include "wiw/render/gpu/view.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// The map is two squares: one over the whole scene, and a finer one over everything but what spans most of it, such as
 /// a ground. A shadow lies right behind what casts it, so the finer square has the shadows of all small things.
@@ -29,19 +29,20 @@ struct SunBlock {
 static_assert(sizeof(SunBlock) == 8 * 16);
 
 /// The frames of squares of `side` texels that hold all instances, and the small ones.
-SunBlock sun_block(const Sun& sun, const Scene& scene, const std::vector<MeshRange>& meshes,
+SunBlock sun_block(const scene::Sun& sun, const scene::Scene& scene, const std::vector<MeshRange>& meshes,
                    const std::vector<Eigen::Affine3f>& poses, int side);
 
 /// The view to draw a square with (kParallel): heights over the scene's lowest point, in [0, 1].
-View sun_view(const SunBlock& block, std::size_t square);
+ViewBlock sun_view(const SunBlock& block, std::size_t square);
 
 /// Depths along the sun's direction. Make, use and destroy while the context is current.
 class SunMap {
  public:
-  SunMap(GlContext& context, const Sun& sun);
+  SunMap(GlContext& context, const scene::Sun& sun);
 
   /// Fits the map to the scene and clears it.
-  void begin(const Scene& scene, const std::vector<MeshRange>& meshes, const std::vector<Eigen::Affine3f>& poses);
+  void begin(const scene::Scene& scene, const std::vector<MeshRange>& meshes,
+             const std::vector<Eigen::Affine3f>& poses);
   /// What is drawn next with kParallel goes into this square.
   void begin_square(std::size_t square) const;
   /// For the programs that light surfaces.
@@ -49,10 +50,10 @@ class SunMap {
 
  private:
   GlContext& context_;
-  Sun sun_;
+  scene::Sun sun_;
   Framebuffer target_;
   UniformSlots<SunBlock> block_;
-  UniformSlots<View> views_;
+  UniformSlots<ViewBlock> views_;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -8,7 +8,7 @@
 
 #include "wiw/render/gpu/gl_object.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// Uniform buffer that holds an array of one std140 block, each at the alignment the driver wants.
 template <class Block>
@@ -44,4 +44,4 @@ class UniformSlots {
   std::size_t stride_;
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -6,13 +6,13 @@
 
 #include "wiw/render/shading.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 namespace {
 
-View oriented_view(const Pose& pose, const Eigen::Matrix3f& axes) {
+ViewBlock oriented_view(const Pose& pose, const Eigen::Matrix3f& axes) {
   const Eigen::Matrix3f rotation = pose.linear().cast<float>() * axes;
-  View view;
+  ViewBlock view;
   view.right.head<3>() = rotation.col(0);
   view.up.head<3>() = rotation.col(1);
   view.back.head<3>() = rotation.col(2);
@@ -32,8 +32,9 @@ Eigen::Matrix3f axes(const Eigen::Vector3f& right, const Eigen::Vector3f& up) {
 
 }  // namespace
 
-View perspective_view(const Pose& T_world_camera, const Camera& camera, const Eigen::Vector2f& sample, int samples) {
-  View view = oriented_view(T_world_camera, Eigen::Matrix3f::Identity());
+ViewBlock perspective_view(const Pose& T_world_camera, const Camera& camera, const Eigen::Vector2f& sample,
+                           int samples) {
+  ViewBlock view = oriented_view(T_world_camera, Eigen::Matrix3f::Identity());
   const auto width = static_cast<float>(camera.size.width);
   const auto height = static_cast<float>(camera.size.height);
   const auto focal = static_cast<float>(Intrinsics{camera.size, camera.hfov}.focal());
@@ -51,8 +52,8 @@ const std::array<Eigen::Matrix3f, kFaces>& face_axes() {
   return kAxes;
 }
 
-View face_view(const Pose& T_world_camera, int face, Size panorama, int samples) {
-  View view = oriented_view(T_world_camera, face_axes()[static_cast<std::size_t>(face)]);
+ViewBlock face_view(const Pose& T_world_camera, int face, Size panorama, int samples) {
+  ViewBlock view = oriented_view(T_world_camera, face_axes()[static_cast<std::size_t>(face)]);
   view.projection = {1, -1, 0, 0};
   view.lens = {shading::kNearClip / std::sqrt(3.f), static_cast<float>(kPi / panorama.height),
                static_cast<float>(2 * kPi / panorama.width), lod_bias(samples)};
@@ -64,4 +65,4 @@ int face_size(Size panorama, int samples) {
   return static_cast<int>(std::ceil(2 / pixel * kFaceOversampling));
 }
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

@@ -3,7 +3,7 @@
 
 #include "wiw/render/gpu/framebuffer.hpp"
 
-namespace wiw::gpu {
+namespace wiw::render::gpu {
 
 /// Targets of a render call: the views of a batch, the faces of one panorama, the samples of one view.
 struct Workspace {
@@ -21,4 +21,4 @@ struct Workspace {
   GlBuffer packed;  // what is read back
 };
 
-}  // namespace wiw::gpu
+}  // namespace wiw::render::gpu

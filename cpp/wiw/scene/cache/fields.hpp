@@ -3,7 +3,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw::cache {
+namespace wiw::scene::cache {
 
 // What is stored of each type, in order: written once, for the writer and the reader alike. An archive offers
 // value (plain data), text, texts, pairs, array (a Buffer, with a checksum), texels (a Buffer without), and of what has
@@ -97,4 +97,4 @@ void fields_of(Archive& archive, T& scene)
   archive.option(scene.sun);
 }
 
-}  // namespace wiw::cache
+}  // namespace wiw::scene::cache

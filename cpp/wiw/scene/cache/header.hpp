@@ -6,12 +6,12 @@
 #include <cstring>
 #include <span>
 
-namespace wiw::cache {
+namespace wiw::scene::cache {
 
 constexpr std::array<char, 8> kMagic{'w', 'i', 'w', 's', 'c', 'e', 'n', 'e'};
 constexpr std::size_t kAlignment = 64;  // a cache line, and the widest vector register
 
-struct Header {
+struct CacheHeader {
   std::array<char, 8> magic = kMagic;
   std::uint32_t version = 0;
   std::uint32_t byte_order = 0x01020304;
@@ -20,7 +20,7 @@ struct Header {
   std::uint64_t checksum = 0;      // of the header with this field zero, then the table
   std::array<std::uint64_t, 3> reserved{};
 };
-static_assert(sizeof(Header) == kAlignment);
+static_assert(sizeof(CacheHeader) == kAlignment);
 
 /// 64-bit FNV-1a.
 inline std::uint64_t hash(std::span<const std::uint8_t> bytes, std::uint64_t value = 0xCBF29CE484222325ULL) {
@@ -49,11 +49,11 @@ inline std::uint64_t array_checksum(std::span<const std::uint8_t> bytes) {
   return value;
 }
 
-inline std::uint64_t checksum(Header header, std::span<const std::uint8_t> table) {
+inline std::uint64_t checksum(CacheHeader header, std::span<const std::uint8_t> table) {
   header.checksum = 0;
-  std::array<std::uint8_t, sizeof(Header)> bytes{};
+  std::array<std::uint8_t, sizeof(CacheHeader)> bytes{};
   std::memcpy(bytes.data(), &header, sizeof(header));
   return hash(table, hash(bytes));
 }
 
-}  // namespace wiw::cache
+}  // namespace wiw::scene::cache

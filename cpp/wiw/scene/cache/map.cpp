@@ -5,16 +5,16 @@
 #include "wiw/scene/cache/header.hpp"
 #include "wiw/scene/cache/mapped_file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 using cache::fields_of;
 
 namespace {
 
 /// Reads the table in the writer's order; arrays become views of the mapping. Everything is checked against the bytes
 /// that are there, so that a table that lies cannot lead outside of them.
-class Reader {
+class CacheReader {
  public:
-  Reader(std::shared_ptr<const MappedFile> file, std::uint64_t table_offset)
+  CacheReader(std::shared_ptr<const MappedFile> file, std::uint64_t table_offset)
       : file_(std::move(file)),
         arrays_(file_->bytes().first(table_offset)),
         rest_(file_->bytes().subspan(table_offset)) {}
@@ -104,11 +104,11 @@ class Reader {
   std::span<const std::uint8_t> rest_;
 };
 
-cache::Header checked_header(std::span<const std::uint8_t> file) {
-  cache::Header header;
+cache::CacheHeader checked_header(std::span<const std::uint8_t> file) {
+  cache::CacheHeader header;
   if (file.size() < sizeof(header)) throw Error("it is shorter than its header");
   std::memcpy(&header, file.data(), sizeof(header));
-  const cache::Header expected;
+  const cache::CacheHeader expected;
   if (header.magic != expected.magic || header.byte_order != expected.byte_order) throw Error("it is no scene cache");
   if (header.version != kSceneCacheVersion) {
     throw Error("it has version " + std::to_string(header.version) + ", expected " +
@@ -128,9 +128,9 @@ cache::Header checked_header(std::span<const std::uint8_t> file) {
 ScenePtr map_scene_cache(const std::filesystem::path& path) {
   auto file = std::make_shared<const MappedFile>(path);
   try {
-    const cache::Header header = checked_header(file->bytes());
+    const cache::CacheHeader header = checked_header(file->bytes());
     auto scene = std::make_shared<Scene>();
-    Reader reader(std::move(file), header.table_offset);
+    CacheReader reader(std::move(file), header.table_offset);
     fields_of(reader, *scene);
     if (!reader.at_end()) throw Error("its table is longer than its scene");
     scene->validate();
@@ -140,4 +140,4 @@ ScenePtr map_scene_cache(const std::filesystem::path& path) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

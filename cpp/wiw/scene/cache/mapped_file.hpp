@@ -5,7 +5,7 @@
 #include <filesystem>
 #include <span>
 
-namespace wiw {
+namespace wiw::scene {
 
 /// A whole file mapped read-only, for as long as the object lives.
 class MappedFile {
@@ -22,4 +22,4 @@ class MappedFile {
   std::span<const std::uint8_t> bytes_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::scene

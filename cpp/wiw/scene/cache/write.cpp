@@ -10,7 +10,7 @@
 #include "wiw/scene/cache/fields.hpp"
 #include "wiw/scene/cache/header.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 using cache::fields_of;
 
 namespace {
@@ -22,7 +22,7 @@ std::span<const std::uint8_t> as_bytes(const void* data, std::size_t size) {
 /// Puts arrays into the file at once and everything else into the table.
 class Writer {
  public:
-  explicit Writer(std::ofstream& stream) : stream_(stream), position_(sizeof(cache::Header)) {}
+  explicit Writer(std::ofstream& stream) : stream_(stream), position_(sizeof(cache::CacheHeader)) {}
 
   template <class T>
   void value(const T& plain) {
@@ -75,7 +75,7 @@ class Writer {
   /// Appends the table and fills in the header.
   void finish() {
     align();
-    cache::Header header;
+    cache::CacheHeader header;
     header.version = kSceneCacheVersion;
     header.table_offset = position_;
     header.file_bytes = position_ + table_.size();
@@ -87,7 +87,7 @@ class Writer {
   }
 
   void begin() {
-    const cache::Header empty{};
+    const cache::CacheHeader empty{};
     stream_.write(reinterpret_cast<const char*>(&empty), sizeof(empty));
   }
 
@@ -149,4 +149,4 @@ void write_scene_cache(const Scene& scene, const std::filesystem::path& path) {
   sync_to_disk(path.has_parent_path() ? path.parent_path() : ".");  // not every file system can: the name may come late
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

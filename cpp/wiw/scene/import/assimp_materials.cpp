@@ -8,7 +8,7 @@
 #include "wiw/scene/import/assimp_scene.hpp"
 #include "wiw/scene/import/texture_source.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr float kNeutral = 0.7f;  // stands in for a texture that is missing
@@ -106,4 +106,4 @@ void convert_materials(const aiScene& file, const FileContext& context, Scene& s
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

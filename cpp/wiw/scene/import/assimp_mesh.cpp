@@ -9,10 +9,10 @@
 #include "wiw/scene/import/polygon.hpp"
 #include "wiw/scene/import/weld.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
-using Color = Eigen::Matrix<std::uint8_t, 4, 1>;
+using Rgba8 = Eigen::Matrix<std::uint8_t, 4, 1>;
 
 Eigen::Vector3f vec(const aiVector3D& v) { return {v.x, v.y, v.z}; }
 
@@ -80,8 +80,8 @@ std::uint8_t quantised(float value, bool linear) {
 }
 
 /// glTF vertex colours are linear light, those of the other formats display-encoded.
-std::vector<Color> colors_of(const aiMesh& source, bool linear) {
-  std::vector<Color> colors;
+std::vector<Rgba8> colors_of(const aiMesh& source, bool linear) {
+  std::vector<Rgba8> colors;
   if (!source.HasVertexColors(0)) return colors;
   colors.reserve(source.mNumVertices);
   for (unsigned i = 0; i < source.mNumVertices; ++i) {
@@ -113,4 +113,4 @@ Mesh convert_mesh(const aiScene& file, unsigned index, const FileContext& contex
   return weld(mesh);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

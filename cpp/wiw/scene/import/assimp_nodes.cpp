@@ -9,7 +9,7 @@
 #include "wiw/scene/import/category.hpp"
 #include "wiw/scene/import/mesh_baker.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 Eigen::Affine3f affine(const aiMatrix4x4& m) {
@@ -98,4 +98,4 @@ void convert_nodes(const aiScene& file, const FileContext& context, const UpAxis
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

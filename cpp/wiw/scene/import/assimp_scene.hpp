@@ -9,7 +9,7 @@
 
 struct aiScene;
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Where a file came from and how it is to be read.
 struct FileContext {
@@ -27,4 +27,4 @@ Mesh convert_mesh(const aiScene& file, unsigned index, const FileContext& contex
 /// One instance per node that carries meshes, and the meshes with it, turned to Y up.
 void convert_nodes(const aiScene& file, const FileContext& context, const UpAxis& up, Scene& scene);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -5,7 +5,7 @@
 #include <array>
 #include <cctype>
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr std::array<std::string_view, 31> kEmptyWords{
@@ -62,4 +62,4 @@ std::int32_t category_index(Scene& scene, const std::string& category) {
   return static_cast<std::int32_t>(scene.categories.size() - 1);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

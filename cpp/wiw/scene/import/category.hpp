@@ -7,7 +7,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// The category that a model, node or material name speaks of, or "" if it says nothing:
 ///  1. the publisher's prefix `aws_robomaker_<kind>_` is dropped;
@@ -22,4 +22,4 @@ std::string category_from_name(std::string_view name);
 /// Index of `category` in Scene::categories, added if new; kNone for "".
 std::int32_t category_index(Scene& scene, const std::string& category);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -9,7 +9,7 @@
 #include "wiw/scene/import/category.hpp"
 #include "wiw/scene/measure.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 Eigen::AlignedBox3f floor_bounds(const Scene& scene) {
@@ -52,4 +52,4 @@ void add_ceiling(Scene& scene, float height) {
   scene.instances.push_back(std::move(instance));
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -11,7 +11,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 struct Requirement {
@@ -154,4 +154,4 @@ void check_collada(const std::filesystem::path& path) {
   Instances(document, path.string()).check(document);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

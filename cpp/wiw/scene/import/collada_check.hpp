@@ -3,10 +3,10 @@
 
 #include <filesystem>
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Checks a DAE file for well-formed XML and for the attributes that the COLLADA schema requires of the elements
 /// assimp reads, because assimp takes them for granted. Throws FileError naming what is wrong.
 void check_collada(const std::filesystem::path& path);
 
-}  // namespace wiw
+}  // namespace wiw::scene

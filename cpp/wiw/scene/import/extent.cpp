@@ -3,7 +3,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr float kMost = 1e7f;
@@ -34,4 +34,4 @@ void check_imported(const Scene& scene, const std::filesystem::path& path) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -6,7 +6,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 std::size_t size_of_file(const std::filesystem::path& path) {
   std::error_code error;
@@ -28,4 +28,4 @@ std::vector<std::uint8_t> read_file(const std::filesystem::path& path, std::size
   return bytes;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

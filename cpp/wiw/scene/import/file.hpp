@@ -10,7 +10,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Size of a regular, readable file in bytes; throws FileError saying what is wrong otherwise.
 std::size_t size_of_file(const std::filesystem::path& path);
@@ -34,4 +34,4 @@ auto read_as_file(const std::filesystem::path& path, const Read& read) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -13,7 +13,7 @@
 #include "wiw/scene/import/gltf_nodes.hpp"
 #include "wiw/scene/import/json.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 /// assimp would hand another version to its reader of glTF 1, whose layout is not checked here.
@@ -105,4 +105,4 @@ GltfRewrite check_gltf(const std::filesystem::path& path, MeshFormat format, con
   return rewrite;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

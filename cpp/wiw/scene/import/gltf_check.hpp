@@ -7,7 +7,7 @@
 #include "wiw/scene/import/gltf_rewrite.hpp"
 #include "wiw/scene/import/mesh_format.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Checks the parts of a GLB or glTF file that assimp takes for granted, and rewrites what assimp would drop or draw
 /// wrong (see `rewrite_gltf`). What cannot be drawn is named in warnings: textures that hold no PNG or JPEG, counted,
@@ -16,4 +16,4 @@ namespace wiw {
 /// read and versions other than 2.
 GltfRewrite check_gltf(const std::filesystem::path& path, MeshFormat format, const ImportOptions& options);
 
-}  // namespace wiw
+}  // namespace wiw::scene

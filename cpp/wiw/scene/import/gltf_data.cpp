@@ -10,7 +10,7 @@
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/gltf_nodes.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 struct ComponentType {
@@ -171,4 +171,4 @@ void GltfData::read_sparse(const Json& accessor, GltfValues& values) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -12,7 +12,7 @@
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/gltf_document.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Numbers of an accessor: `count` rows of `components`. Normalised integers are fractions.
 struct GltfValues {
@@ -53,4 +53,4 @@ class GltfData {
 /// "my%20scene.bin" -> "my scene.bin".
 std::string decode_percent_escapes(std::string_view text);
 
-}  // namespace wiw
+}  // namespace wiw::scene

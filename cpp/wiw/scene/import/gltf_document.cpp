@@ -7,7 +7,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr std::size_t kChunkHeader = 8;  // length, type
@@ -83,4 +83,4 @@ std::vector<std::uint8_t> glb_bytes(const Json& root, const std::vector<std::uin
   return bytes;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

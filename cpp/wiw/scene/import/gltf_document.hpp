@@ -10,7 +10,7 @@
 #include "wiw/scene/import/json.hpp"
 #include "wiw/scene/import/mesh_format.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// What a glTF file says of itself, and where a GLB's binary chunk lies if it has one.
 struct GltfDocument {
@@ -25,4 +25,4 @@ GltfDocument read_gltf_document(const std::filesystem::path& path, MeshFormat fo
 /// A GLB file of these two chunks.
 std::vector<std::uint8_t> glb_bytes(const Json& root, const std::vector<std::uint8_t>& body);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -8,10 +8,10 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
-struct View {
+struct BufferView {
   std::uint64_t bytes = 0;
   std::uint64_t stride = 0;  // 0: elements lie densely
 };
@@ -30,9 +30,9 @@ std::uint64_t component_bytes(std::uint64_t code) {
   return code == 5125 || code == 5126 ? 4 : 0;
 }
 
-class Checker {
+class GltfLayoutChecker {
  public:
-  Checker(const Json& document, std::optional<std::size_t> body, const std::string& path)
+  GltfLayoutChecker(const Json& document, std::optional<std::size_t> body, const std::string& path)
       : document_(document), body_(body), path_(path) {}
 
   void check() {
@@ -76,7 +76,7 @@ class Checker {
   void add_view(const Json& view) {
     const std::uint64_t available = buffer_bytes(view);
     const std::uint64_t offset = number(view, "byteOffset", 0);
-    const View added{number(view, "byteLength", 0), number(view, "byteStride", 0)};
+    const BufferView added{number(view, "byteLength", 0), number(view, "byteStride", 0)};
     if (offset > available || added.bytes > available - offset) {
       fail("bufferView " + std::to_string(views_.size()) + " has " + std::to_string(added.bytes) + " bytes from " +
            std::to_string(offset) + ", but its buffer " + std::to_string(available));
@@ -95,7 +95,7 @@ class Checker {
 
   /// `count` elements from the object's byteOffset must lie inside its buffer view.
   void check_fit(const Json& object, std::uint64_t count, std::uint64_t element) const {
-    const View& view = entry(views_, object, "bufferView");
+    const BufferView& view = entry(views_, object, "bufferView");
     const std::uint64_t offset = number(object, "byteOffset", 0);
     const std::uint64_t step = std::max(view.stride, element);
     if (count == 0) return;
@@ -159,14 +159,14 @@ class Checker {
   const Json& document_;
   std::optional<std::size_t> body_;
   const std::string& path_;
-  std::vector<View> views_;
+  std::vector<BufferView> views_;
   std::vector<std::uint64_t> counts_;  // of each accessor's elements
 };
 
 }  // namespace
 
 void check_gltf_layout(const Json& document, std::optional<std::size_t> body, const std::string& path) {
-  Checker(document, body, path).check();
+  GltfLayoutChecker(document, body, path).check();
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr int kDeepest = 1000;  // nodes in nodes
@@ -84,4 +84,4 @@ void check_gltf_size(const Json& document, const ImportLimits& limits, const std
   check_vertices(document, limits, path);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

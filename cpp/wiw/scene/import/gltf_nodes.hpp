@@ -6,7 +6,7 @@
 #include "wiw/scene/import/json.hpp"
 #include "wiw/scene/import/limits.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Checks what a glTF document's scene grows to before anything is copied: a node with several parents is copied for
 /// each of them, and so are vertices that several meshes share. Throws FileError for nodes among their own descendants,
@@ -19,4 +19,4 @@ std::size_t vertex_limit(const ImportLimits& limits);
 /// Indices of the nodes at the top of the scene that is drawn.
 const Json& scene_roots(const Json& document);
 
-}  // namespace wiw
+}  // namespace wiw::scene

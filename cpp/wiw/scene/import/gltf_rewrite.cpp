@@ -14,7 +14,7 @@
 #include "wiw/scene/import/gltf_nodes.hpp"
 #include "wiw/scene/import/gltf_skin.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr std::uint64_t kFloat = 5126;
@@ -130,15 +130,15 @@ class Rewriter {
   }
 
   std::size_t add_instances(std::size_t node, const Json& attributes) {
-    struct Part {
+    struct TransformProperty {
       const char* attribute;
       const char* member;
       std::size_t components;
     };
-    constexpr std::array<Part, 3> kParts{
+    constexpr std::array<TransformProperty, 3> kParts{
         {{"TRANSLATION", "translation", 3}, {"ROTATION", "rotation", 4}, {"SCALE", "scale", 3}}};
     std::vector<Json> copies;
-    for (const Part& part : kParts) {
+    for (const TransformProperty& part : kParts) {
       const auto accessor = index_of(attributes, part.attribute, accessors_.size());
       if (!accessor) continue;
       const GltfValues rows = values(*accessor);
@@ -473,4 +473,4 @@ GltfRewrite rewrite_gltf(const GltfDocument& document, const std::filesystem::pa
   return Rewriter(document, path, options).run(format);
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

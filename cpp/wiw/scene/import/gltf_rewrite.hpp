@@ -10,7 +10,7 @@
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/gltf_document.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Contents that stand in for files, by file name.
 using FileContents = std::map<std::string, std::vector<std::uint8_t>>;
@@ -30,4 +30,4 @@ GltfRewrite rewrite_gltf(const GltfDocument& document, const std::filesystem::pa
 /// Whether a glTF material's base colour is black and its emission is not.
 bool is_emissive_only(const Json& material);
 
-}  // namespace wiw
+}  // namespace wiw::scene

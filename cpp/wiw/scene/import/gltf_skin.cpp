@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 [[noreturn]] void fail(const std::filesystem::path& path, const std::string& cause) {
@@ -122,4 +122,4 @@ void move_vertices(const std::vector<Eigen::Matrix4f>& maps, bool are_normals, G
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -10,7 +10,7 @@
 #include "wiw/scene/import/gltf_data.hpp"
 #include "wiw/scene/import/json.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Joints and weights of vertices, in sets of four.
 struct SkinWeights {
@@ -29,4 +29,4 @@ std::vector<Eigen::Matrix4f> vertex_maps(const SkinWeights& skin, const std::vec
 /// Positions, or normals, each by its own map.
 void move_vertices(const std::vector<Eigen::Matrix4f>& maps, bool are_normals, GltfValues& values);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -8,7 +8,7 @@
 
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr int kMostReadsAtEnd = 1000;
@@ -76,4 +76,4 @@ void GuardedIo::Close(Assimp::IOStream* stream) {
   delete stream;  // NOLINT(cppcoreguidelines-owning-memory): made by Open
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

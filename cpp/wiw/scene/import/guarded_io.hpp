@@ -9,7 +9,7 @@
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/gltf_rewrite.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// What assimp reads files through: read only, each within the size limit, each noted in the trace, `contents` in place
 /// of the files of these names. A loader that goes
@@ -30,4 +30,4 @@ class GuardedIo : public Assimp::IOSystem {
   FileContents contents_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::scene

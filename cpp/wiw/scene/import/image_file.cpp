@@ -7,7 +7,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/stb_image.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr int kChannels = 4;
@@ -42,4 +42,4 @@ Texture decode_image(std::string name, std::span<const std::uint8_t> bytes) {
   return {std::move(name), size, Buffer<std::uint8_t>(pixels, view)};
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

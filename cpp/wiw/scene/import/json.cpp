@@ -7,7 +7,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 constexpr int kMostNesting = 256;
@@ -288,4 +288,4 @@ std::string_view Json::text() const {
   return string ? std::string_view(*string) : std::string_view();
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -11,7 +11,7 @@
 #include <variant>
 #include <vector>
 
-namespace wiw {
+namespace wiw::scene {
 
 /// A JSON value (RFC 8259), read, changed and written. Whole numbers from 0 to 2^64 - 1 are kept as such, others as
 /// they stand in the text.
@@ -63,4 +63,4 @@ class Json {
   Value value_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -3,7 +3,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 void check_limit(const std::string& path, const char* what, std::size_t figure, std::size_t limit,
                  const char* limit_name) {
@@ -12,4 +12,4 @@ void check_limit(const std::string& path, const char* what, std::size_t figure, 
                             std::to_string(limit) + " (raise limits." + limit_name + " to allow it)");
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

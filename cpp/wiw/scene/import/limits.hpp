@@ -5,7 +5,7 @@
 #include <mutex>
 #include <string>
 
-namespace wiw {
+namespace wiw::scene {
 
 /// What an import may cost before it is refused. A hostile or mistaken file ends in a FileError, not in swapping.
 struct ImportLimits {
@@ -35,4 +35,4 @@ class SharedCount {
 void check_limit(const std::string& path, const char* what, std::size_t figure, std::size_t limit,
                  const char* limit_name);
 
-}  // namespace wiw
+}  // namespace wiw::scene

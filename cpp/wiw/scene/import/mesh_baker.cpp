@@ -5,7 +5,7 @@
 #include <algorithm>
 #include <utility>
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 /// Normals are covectors: n' ~ A^-T n, whose sign keeps them on their side under a mirroring map. A map that flattens
@@ -65,4 +65,4 @@ std::uint32_t MeshBaker::bake(const Mesh& source, const Eigen::Affine3f& map, st
   return index;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

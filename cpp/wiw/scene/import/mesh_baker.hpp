@@ -9,7 +9,7 @@
 
 #include "wiw/scene/scene.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 /// A linear map as rotation x stretch: `rotation` is proper, `stretch` symmetric (with one negative eigenvalue for a
 /// mirroring map).
@@ -34,4 +34,4 @@ class MeshBaker {
   std::map<Key, std::uint32_t> baked_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::scene

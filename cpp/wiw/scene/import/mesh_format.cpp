@@ -14,7 +14,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 struct FormatRow {
@@ -85,4 +85,4 @@ std::unique_ptr<Assimp::Importer> make_importer() {
   return importer;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -9,7 +9,7 @@ namespace Assimp {
 class Importer;
 }
 
-namespace wiw {
+namespace wiw::scene {
 
 enum class MeshFormat { kGlb, kGltf, kObj, kPly, kDae };
 
@@ -26,4 +26,4 @@ void check_signature(const std::filesystem::path& path, MeshFormat format);
 /// formats that nobody here needs or tests.
 std::unique_ptr<Assimp::Importer> make_importer();
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -10,7 +10,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace fs = std::filesystem;
 namespace {
 
@@ -60,4 +60,4 @@ void check_obj(const fs::path& path) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

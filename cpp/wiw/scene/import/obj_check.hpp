@@ -3,10 +3,10 @@
 
 #include <filesystem>
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Checks the material files of an OBJ file: assimp follows a texture that belongs to no material into nowhere. Throws
 /// FileError naming the material file and its line.
 void check_obj(const std::filesystem::path& path);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -15,7 +15,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 struct Property {
@@ -29,7 +29,7 @@ struct Element {
   std::vector<Property> properties;
 };
 
-struct Header {
+struct PlyHeader {
   std::string format;
   std::vector<Element> elements;
   std::size_t bytes = 0;
@@ -38,33 +38,33 @@ struct Header {
 constexpr std::size_t kMostEntries = 1 << 16;  // of one face; more is damage
 
 std::size_t bytes_of(const std::string& type) {
-  struct Row {
+  struct TypeSize {
     std::string_view name;
     std::size_t bytes;
   };
-  constexpr std::array<Row, 16> kTypes{{{"char", 1},
-                                        {"uchar", 1},
-                                        {"int8", 1},
-                                        {"uint8", 1},
-                                        {"short", 2},
-                                        {"ushort", 2},
-                                        {"int16", 2},
-                                        {"uint16", 2},
-                                        {"int", 4},
-                                        {"uint", 4},
-                                        {"int32", 4},
-                                        {"uint32", 4},
-                                        {"float", 4},
-                                        {"float32", 4},
-                                        {"double", 8},
-                                        {"float64", 8}}};
-  const auto* row = std::ranges::find(kTypes, type, &Row::name);
+  constexpr std::array<TypeSize, 16> kTypes{{{"char", 1},
+                                             {"uchar", 1},
+                                             {"int8", 1},
+                                             {"uint8", 1},
+                                             {"short", 2},
+                                             {"ushort", 2},
+                                             {"int16", 2},
+                                             {"uint16", 2},
+                                             {"int", 4},
+                                             {"uint", 4},
+                                             {"int32", 4},
+                                             {"uint32", 4},
+                                             {"float", 4},
+                                             {"float32", 4},
+                                             {"double", 8},
+                                             {"float64", 8}}};
+  const auto* row = std::ranges::find(kTypes, type, &TypeSize::name);
   return row == kTypes.end() ? 0 : row->bytes;
 }
 
 /// Text of the header's lines and the offset behind `end_header`.
-Header read_header(std::string_view file, const std::string& path) {
-  Header header;
+PlyHeader read_header(std::string_view file, const std::string& path) {
+  PlyHeader header;
   std::size_t at = 0;
   while (at < file.size()) {
     const std::size_t end = std::min(file.find('\n', at), file.size());
@@ -109,7 +109,7 @@ Header read_header(std::string_view file, const std::string& path) {
 
 /// assimp gives each vertex and face its place by the element's count, so it must meet each element once, and faces
 /// after the vertices that they name.
-void check_elements(const Header& header, const std::string& path) {
+void check_elements(const PlyHeader& header, const std::string& path) {
   std::set<std::string_view> names;
   for (const Element& element : header.elements) {
     if (!names.insert(element.name).second) {
@@ -152,7 +152,7 @@ std::size_t row_end(const Element& element, std::string_view file, std::size_t a
   return at;
 }
 
-void check_binary(const Header& header, std::string_view file, const std::string& path) {
+void check_binary(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t at = header.bytes;
   for (const Element& element : header.elements) {
     for (std::size_t row = 0; row < element.count; ++row) {
@@ -165,7 +165,7 @@ void check_binary(const Header& header, std::string_view file, const std::string
   }
 }
 
-void check_ascii(const Header& header, std::string_view file, const std::string& path) {
+void check_ascii(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t rows = 0;
   for (const Element& element : header.elements) rows += element.count;
   const auto body = file.substr(header.bytes);
@@ -182,7 +182,7 @@ void check_ascii(const Header& header, std::string_view file, const std::string&
 void check_ply(const std::filesystem::path& path) {
   const auto bytes = read_file(path);
   const std::string_view file(reinterpret_cast<const char*>(bytes.data()), bytes.size());
-  const Header header = read_header(file, path.string());
+  const PlyHeader header = read_header(file, path.string());
   check_elements(header, path.string());
   if (header.format == "ascii") {
     check_ascii(header, file, path.string());
@@ -194,4 +194,4 @@ void check_ply(const std::filesystem::path& path) {
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -4,10 +4,10 @@
 #include <Eigen/Geometry>
 #include <algorithm>
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
-struct Corner {
+struct PolygonCorner {
   std::uint32_t vertex;
   Eigen::Vector2d point;
 };
@@ -29,20 +29,20 @@ Eigen::Vector3d newell_normal(std::span<const unsigned> polygon, std::span<const
 }
 
 /// Drops the axis of the normal's largest component and keeps the polygon counter-clockwise.
-std::vector<Corner> flatten(std::span<const unsigned> polygon, std::span<const Eigen::Vector3f> positions,
-                            const Eigen::Vector3d& normal) {
+std::vector<PolygonCorner> flatten(std::span<const unsigned> polygon, std::span<const Eigen::Vector3f> positions,
+                                   const Eigen::Vector3d& normal) {
   Eigen::Index axis = 0;
   normal.cwiseAbs().maxCoeff(&axis);
   Eigen::Index u = (axis + 1) % 3;
   Eigen::Index v = (axis + 2) % 3;
   if (normal[axis] < 0.) std::swap(u, v);
-  std::vector<Corner> corners;
+  std::vector<PolygonCorner> corners;
   corners.reserve(polygon.size());
   for (const unsigned vertex : polygon) corners.push_back({vertex, {positions[vertex][u], positions[vertex][v]}});
   return corners;
 }
 
-bool is_convex(const std::vector<Corner>& corners) {
+bool is_convex(const std::vector<PolygonCorner>& corners) {
   const std::size_t n = corners.size();
   for (std::size_t i = 0; i < n; ++i) {
     if (turn(corners[i].point, corners[(i + 1) % n].point, corners[(i + 2) % n].point) < 0.) return false;
@@ -50,13 +50,13 @@ bool is_convex(const std::vector<Corner>& corners) {
   return true;
 }
 
-bool is_ear(const std::vector<Corner>& corners, std::size_t i) {
+bool is_ear(const std::vector<PolygonCorner>& corners, std::size_t i) {
   const std::size_t n = corners.size();
   const Eigen::Vector2d& a = corners[(i + n - 1) % n].point;
   const Eigen::Vector2d& b = corners[i].point;
   const Eigen::Vector2d& c = corners[(i + 1) % n].point;
   if (turn(a, b, c) <= 0.) return false;
-  return std::ranges::none_of(corners, [&](const Corner& corner) {
+  return std::ranges::none_of(corners, [&](const PolygonCorner& corner) {
     const Eigen::Vector2d& p = corner.point;
     if (p == a || p == b || p == c) return false;
     return turn(a, b, p) >= 0. && turn(b, c, p) >= 0. && turn(c, a, p) >= 0.;
@@ -80,7 +80,7 @@ void triangulate(std::span<const unsigned> polygon, std::span<const Eigen::Vecto
     return;
   }
   const Eigen::Vector3d normal = newell_normal(polygon, positions);
-  std::vector<Corner> corners = flatten(polygon, positions, normal);
+  std::vector<PolygonCorner> corners = flatten(polygon, positions, normal);
   const bool convex = is_convex(corners);
   while (corners.size() > 3 && !convex) {
     std::size_t ear = 0;
@@ -95,4 +95,4 @@ void triangulate(std::span<const unsigned> polygon, std::span<const Eigen::Vecto
   }
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -6,13 +6,13 @@
 #include <span>
 #include <vector>
 
-namespace wiw {
+#include "wiw/scene/triangle.hpp"
 
-using Triangle = Eigen::Matrix<std::uint32_t, 3, 1>;
+namespace wiw::scene {
 
 /// Appends the triangles of a simple polygon, given as indices into `positions` in order. Convex polygons become a fan,
 /// others are cut ear by ear in the plane that their Newell normal names. Triangles without area are left out.
 void triangulate(std::span<const unsigned> polygon, std::span<const Eigen::Vector3f> positions,
                  std::vector<Triangle>& triangles);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -14,7 +14,7 @@
 #include "wiw/scene/import/file.hpp"
 #include "wiw/scene/import/image_file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace fs = std::filesystem;
 
 /// Where a reference leads: to an image of the mesh file or a file of its own.
@@ -179,4 +179,4 @@ std::int32_t TextureSource::find(const std::string& reference) const {
   return found == indices_.end() ? kNone : found->second;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -10,7 +10,7 @@
 
 struct aiScene;
 
-namespace wiw {
+namespace wiw::scene {
 
 /// Finds and decodes the textures a mesh file refers to. A reference is tried as
 ///  1. an image embedded in the file;
@@ -44,4 +44,4 @@ class TextureSource {
   std::map<std::string, std::int32_t> indices_;
 };
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -5,7 +5,7 @@
 
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 /// <asset> is the first child of a COLLADA document, so its head is enough.
@@ -38,4 +38,4 @@ UpAxis up_axis_of(const std::filesystem::path& path, MeshFormat format, Up up) {
   return {'Y', "default, the file does not say"};
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -8,7 +8,7 @@
 #include "wiw/scene/import.hpp"
 #include "wiw/scene/import/mesh_format.hpp"
 
-namespace wiw {
+namespace wiw::scene {
 
 struct UpAxis {
   char axis = 'Y';     // 'X', 'Y' or 'Z'
@@ -28,4 +28,4 @@ struct UpAxis {
 ///  5. OBJ and PLY, which do not say: Y.
 UpAxis up_axis_of(const std::filesystem::path& path, MeshFormat format, Up up);
 
-}  // namespace wiw
+}  // namespace wiw::scene

@@ -6,7 +6,7 @@
 #include <unordered_map>
 #include <vector>
 
-namespace wiw {
+namespace wiw::scene {
 namespace {
 
 /// Position, normal, texture coordinate and colour as bits.
@@ -73,4 +73,4 @@ Mesh weld(const Mesh& mesh) {
   return result;
 }
 
-}  // namespace wiw
+}  // namespace wiw::scene

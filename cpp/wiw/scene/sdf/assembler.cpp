@@ -13,7 +13,7 @@
 #include "wiw/scene/sdf/primitives.hpp"
 #include "wiw/scene/text.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace {
 
 const Eigen::Vector4f kNeutral(0.7f, 0.7f, 0.7f, 1.f);
@@ -26,7 +26,7 @@ std::vector<double> key_of(const Geometry& g) {
 
 }  // namespace
 
-Assembler::Assembler(const World& world, const ImportOptions& options)
+Assembler::Assembler(const SdfWorld& world, const ImportOptions& options)
     : world_(world), options_(options), scene_(std::make_shared<Scene>()), baker_(*scene_) {}
 
 ScenePtr Assembler::assemble(const std::filesystem::path& path) {
@@ -45,8 +45,8 @@ ScenePtr Assembler::assemble(const std::filesystem::path& path) {
 void Assembler::load_parts() {
   std::set<std::filesystem::path> unique;
   for (const Model& model : world_.models) {
-    for (const Visual& visual : model.visuals) {
-      if (visual.geometry.shape == Shape::kMesh) unique.insert(visual.geometry.mesh);
+    for (const ModelVisual& visual : model.visuals) {
+      if (visual.geometry.shape == ShapeKind::kMesh) unique.insert(visual.geometry.mesh);
     }
   }
   const std::vector<std::filesystem::path> files(unique.begin(), unique.end());
@@ -88,7 +88,7 @@ void Assembler::add_model(const Model& model) {
   instance.id = static_cast<std::uint32_t>(scene_->instances.size() + 1);
   instance.name = model.name;
   instance.T_world_instance = turn * Eigen::Affine3f(model.T_world_model.matrix().cast<float>()) * turn.inverse();
-  for (const Visual& visual : model.visuals) add_visual(visual, instance);
+  for (const ModelVisual& visual : model.visuals) add_visual(visual, instance);
   if (instance.meshes.empty()) return;
   instance.category = category_index(*scene_, category_from_name(model.kind));
   instance.attributes["model"] = model.kind;
@@ -96,9 +96,9 @@ void Assembler::add_model(const Model& model) {
   scene_->instances.push_back(std::move(instance));
 }
 
-void Assembler::add_visual(const Visual& visual, Instance& instance) {
+void Assembler::add_visual(const ModelVisual& visual, Instance& instance) {
   const Eigen::Affine3f T_instance_visual = z_to_y_up() * Eigen::Affine3f(visual.T_model_visual.matrix().cast<float>());
-  if (visual.geometry.shape == Shape::kMesh) {
+  if (visual.geometry.shape == ShapeKind::kMesh) {
     add_mesh(visual, T_instance_visual, instance);
     return;
   }
@@ -108,8 +108,8 @@ void Assembler::add_visual(const Visual& visual, Instance& instance) {
       baker_.bake(*primitive, T_instance_visual, plain_material(visual.color.value_or(kNeutral))));
 }
 
-void Assembler::add_mesh(const Visual& visual, const Eigen::Affine3f& T_instance_visual, Instance& instance) {
-  const Part& part = parts_.at(visual.geometry.mesh);
+void Assembler::add_mesh(const ModelVisual& visual, const Eigen::Affine3f& T_instance_visual, Instance& instance) {
+  const ImportedMesh& part = parts_.at(visual.geometry.mesh);
   const Eigen::Affine3f scale(Eigen::Scaling(visual.geometry.size.cast<float>().eval()));
   bool drawn = false;
   for (const Instance& node : part.scene->instances) {
@@ -139,4 +139,4 @@ void Assembler::count(const Instance& instance) {
   check_limit(world_.name, "triangles", triangles_, options_.limits.triangles, "triangles");
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -8,7 +8,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/sdf/pose.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace {
 
 struct NamedColor {
@@ -60,4 +60,4 @@ std::optional<Eigen::Vector4f> material_color(const pugi::xml_node& visual, cons
   return std::nullopt;
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

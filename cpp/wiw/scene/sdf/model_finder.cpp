@@ -5,7 +5,7 @@
 
 #include "wiw/scene/sdf/xml.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace fs = std::filesystem;
 
 ModelFinder::ModelFinder(const fs::path& world, const ImportOptions& options)
@@ -62,4 +62,4 @@ std::string ModelFinder::searched() const {
   return text;
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -9,7 +9,7 @@
 
 #include "wiw/scene/import.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
 /// Turns the URIs of a world into paths, each looked for once.
 class ModelFinder {
@@ -37,4 +37,4 @@ class ModelFinder {
   const ImportOptions& options_;
 };
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

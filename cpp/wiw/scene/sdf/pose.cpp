@@ -9,7 +9,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace {
 
 constexpr int kMostHops = 1000;  // from frame to frame; more is a circle
@@ -129,4 +129,4 @@ Eigen::Isometry3d frame_in_model(const pugi::xml_node& model, const std::string&
   return FrameWalk(file).frame_in(model, name, name_of(model));
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

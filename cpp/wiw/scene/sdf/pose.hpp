@@ -9,7 +9,7 @@
 
 #include "wiw/core/error.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
 /// Numbers of an element's text; throws FileError naming the element unless there are `count` finite ones.
 std::vector<double> numbers(const pugi::xml_node& element, std::size_t count, const std::filesystem::path& file);
@@ -32,4 +32,4 @@ Eigen::Isometry3d pose_in_model(const pugi::xml_node& element, const std::filesy
 Eigen::Isometry3d frame_in_model(const pugi::xml_node& model, const std::string& name,
                                  const std::filesystem::path& file);
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -5,7 +5,7 @@
 #include <numbers>
 #include <vector>
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace {
 
 constexpr int kSlices = 32;  // around the axis
@@ -113,13 +113,13 @@ Mesh plane(const Geometry& geometry) {
 
 Mesh primitive_mesh(const Geometry& geometry) {
   switch (geometry.shape) {
-    case Shape::kBox: return box(geometry.size);
-    case Shape::kSphere: return sphere(geometry.size.x());
-    case Shape::kCylinder: return cylinder(geometry.size.x(), geometry.size.z());
-    case Shape::kPlane: return plane(geometry);
-    case Shape::kMesh: break;
+    case ShapeKind::kBox: return box(geometry.size);
+    case ShapeKind::kSphere: return sphere(geometry.size.x());
+    case ShapeKind::kCylinder: return cylinder(geometry.size.x(), geometry.size.z());
+    case ShapeKind::kPlane: return plane(geometry);
+    case ShapeKind::kMesh: break;
   }
   return {};
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -8,7 +8,7 @@
 #include "wiw/scene/sdf/pose.hpp"
 #include "wiw/scene/sdf/xml.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 namespace fs = std::filesystem;
 namespace {
 
@@ -40,14 +40,14 @@ bool only_wraps(const pugi::xml_node& model) {
 
 }  // namespace
 
-Reader::Reader(const fs::path& world, const ImportOptions& options)
+SdfReader::SdfReader(const fs::path& world, const ImportOptions& options)
     : path_(world), options_(options), finder_(world, options) {}
 
-void Reader::warn(const std::string& text) {
+void SdfReader::warn(const std::string& text) {
   if (std::ranges::find(world_.warnings, text) == world_.warnings.end()) world_.warnings.push_back(text);
 }
 
-pugi::xml_node Reader::root_of(const fs::path& file) {
+pugi::xml_node SdfReader::root_of(const fs::path& file) {
   const auto [known, added] = documents_.try_emplace(file);
   if (added) known->second = read_xml(file, options_);
   const pugi::xml_node root = known->second.child("sdf");
@@ -55,11 +55,11 @@ pugi::xml_node Reader::root_of(const fs::path& file) {
   return root;
 }
 
-void Reader::count_placed() {
+void SdfReader::count_placed() {
   check_limit(path_.string(), "placed models and visuals", ++placed_, options_.limits.nodes, "nodes");
 }
 
-std::optional<Eigen::Isometry3d> Reader::pose_of(const pugi::xml_node& element, const fs::path& file) {
+std::optional<Eigen::Isometry3d> SdfReader::pose_of(const pugi::xml_node& element, const fs::path& file) {
   try {
     return pose_in_model(element, file);
   } catch (const UnknownFrame& error) {
@@ -68,7 +68,7 @@ std::optional<Eigen::Isometry3d> Reader::pose_of(const pugi::xml_node& element, 
   }
 }
 
-World Reader::read() {
+SdfWorld SdfReader::read() {
   const pugi::xml_node root = root_of(path_);
   const pugi::xml_node world = root.child("world");
   world_.name = path_.stem().string();
@@ -80,7 +80,7 @@ World Reader::read() {
   return std::move(world_);
 }
 
-void Reader::read_children(const pugi::xml_node& parent, const Scope& scope) {
+void SdfReader::read_children(const pugi::xml_node& parent, const Scope& scope) {
   if (scope.depth > kMostNesting) {
     throw FileError(scope.file.string(), "models are nested more than " + std::to_string(kMostNesting) +
                                              " deep (a model that includes itself?)");
@@ -101,7 +101,7 @@ void Reader::read_children(const pugi::xml_node& parent, const Scope& scope) {
   }
 }
 
-void Reader::read_include(const pugi::xml_node& element, const Scope& parent) {
+void SdfReader::read_include(const pugi::xml_node& element, const Scope& parent) {
   const std::string uri = element.child_value("uri");
   if (uri == "model://sun") return;  // a light, not a thing to draw
   const fs::path folder = finder_.find(uri, parent.file);
@@ -122,8 +122,8 @@ void Reader::read_include(const pugi::xml_node& element, const Scope& parent) {
                      parent.T_world * *pose * placed->inverse(), file, parent.depth + 1});
 }
 
-std::optional<Eigen::Isometry3d> Reader::placement(const pugi::xml_node& include, const pugi::xml_node& model,
-                                                   const fs::path& file) {
+std::optional<Eigen::Isometry3d> SdfReader::placement(const pugi::xml_node& include, const pugi::xml_node& model,
+                                                      const fs::path& file) {
   const std::string outer = include.child_value("placement_frame");
   const std::string frame = outer.empty() ? model.attribute("placement_frame").value() : outer;
   if (frame.empty()) return Eigen::Isometry3d::Identity();
@@ -135,7 +135,7 @@ std::optional<Eigen::Isometry3d> Reader::placement(const pugi::xml_node& include
   }
 }
 
-void Reader::read_model(const pugi::xml_node& element, const Scope& scope) {
+void SdfReader::read_model(const pugi::xml_node& element, const Scope& scope) {
   count_placed();
   Model model{scope.name, scope.kind, scope.T_world, {}};
   for (const pugi::xml_node& link : element.children("link")) read_visuals(link, scope.file, model);
@@ -143,12 +143,12 @@ void Reader::read_model(const pugi::xml_node& element, const Scope& scope) {
   read_children(element, scope);
 }
 
-void Reader::read_visuals(const pugi::xml_node& link, const fs::path& file, Model& model) {
+void SdfReader::read_visuals(const pugi::xml_node& link, const fs::path& file, Model& model) {
   for (const pugi::xml_node& element : link.children("visual")) {
     count_placed();
     const auto pose = pose_of(element, file);
     if (!pose) continue;
-    Visual visual;
+    ModelVisual visual;
     visual.T_model_visual = *pose;
     if (!read_geometry(element.child("geometry"), file, visual.geometry)) continue;
     std::vector<std::string> warnings;
@@ -158,22 +158,22 @@ void Reader::read_visuals(const pugi::xml_node& link, const fs::path& file, Mode
   }
 }
 
-bool Reader::read_geometry(const pugi::xml_node& element, const fs::path& file, Geometry& geometry) {
+bool SdfReader::read_geometry(const pugi::xml_node& element, const fs::path& file, Geometry& geometry) {
   const pugi::xml_node shape = element.first_child();
   const std::string tag = shape.name();
   if (tag == "mesh") return read_mesh(shape, file, geometry);
   if (tag == "box") {
-    geometry.shape = Shape::kBox;
+    geometry.shape = ShapeKind::kBox;
     geometry.size = vector_of(shape.child("size"), file);
   } else if (tag == "sphere") {
-    geometry.shape = Shape::kSphere;
+    geometry.shape = ShapeKind::kSphere;
     geometry.size.setConstant(positive(shape.child("radius"), file));
   } else if (tag == "cylinder") {
-    geometry.shape = Shape::kCylinder;
+    geometry.shape = ShapeKind::kCylinder;
     const double radius = positive(shape.child("radius"), file);
     geometry.size = {radius, radius, positive(shape.child("length"), file)};
   } else if (tag == "plane") {
-    geometry.shape = Shape::kPlane;
+    geometry.shape = ShapeKind::kPlane;
     const auto size = numbers(shape.child("size"), 2, file);
     geometry.size = {size[0], size[1], 1.};
     if (shape.child("normal")) geometry.normal = vector_of(shape.child("normal"), file).normalized();
@@ -184,9 +184,9 @@ bool Reader::read_geometry(const pugi::xml_node& element, const fs::path& file, 
   return true;
 }
 
-bool Reader::read_mesh(const pugi::xml_node& mesh, const fs::path& file, Geometry& geometry) {
+bool SdfReader::read_mesh(const pugi::xml_node& mesh, const fs::path& file, Geometry& geometry) {
   const std::string uri = mesh.child_value("uri");
-  geometry.shape = Shape::kMesh;
+  geometry.shape = ShapeKind::kMesh;
   geometry.mesh = finder_.find(uri, file);
   geometry.submesh = mesh.child("submesh").child_value("name");
   if (mesh.child("scale")) geometry.size = vector_of(mesh.child("scale"), file);
@@ -195,4 +195,4 @@ bool Reader::read_mesh(const pugi::xml_node& mesh, const fs::path& file, Geometr
   return false;
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -8,13 +8,13 @@
 #include "wiw/scene/sdf/model_finder.hpp"
 #include "wiw/scene/sdf/world.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
 /// Walks a world file and the model files it includes.
-class Reader {
+class SdfReader {
  public:
-  Reader(const std::filesystem::path& world, const ImportOptions& options);
-  World read();
+  SdfReader(const std::filesystem::path& world, const ImportOptions& options);
+  SdfWorld read();
 
  private:
   /// One <model> or <include> on the way down from the world.
@@ -45,9 +45,9 @@ class Reader {
   std::filesystem::path path_;
   const ImportOptions& options_;
   ModelFinder finder_;
-  World world_;
+  SdfWorld world_;
   std::map<std::filesystem::path, pugi::xml_document> documents_;
   std::size_t placed_ = 0;
 };
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

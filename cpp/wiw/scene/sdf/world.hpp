@@ -7,12 +7,12 @@
 #include <string>
 #include <vector>
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
-enum class Shape { kMesh, kBox, kSphere, kCylinder, kPlane };
+enum class ShapeKind { kMesh, kBox, kSphere, kCylinder, kPlane };
 
 struct Geometry {
-  Shape shape = Shape::kMesh;
+  ShapeKind shape = ShapeKind::kMesh;
   std::filesystem::path mesh;
   std::string submesh;  // only this part of the mesh, if named
   /// Mesh: scale. Box: lengths. Sphere: radius. Cylinder: radius, length. Plane: lengths along x and y.
@@ -20,7 +20,7 @@ struct Geometry {
   Eigen::Vector3d normal = Eigen::Vector3d::UnitZ();  // of a plane
 };
 
-struct Visual {
+struct ModelVisual {
   Eigen::Isometry3d T_model_visual = Eigen::Isometry3d::Identity();
   Geometry geometry;
   std::optional<Eigen::Vector4f> color;  // replaces a mesh's own materials
@@ -31,14 +31,14 @@ struct Model {
   std::string name;  // of the placement: "ChairA_01_001"
   std::string kind;  // of the model that was placed: "aws_robomaker_residential_ChairA_01"
   Eigen::Isometry3d T_world_model = Eigen::Isometry3d::Identity();
-  std::vector<Visual> visuals;
+  std::vector<ModelVisual> visuals;
 };
 
 /// A world file and all the models it includes, before any mesh is opened. Axes as in the file: Z up.
-struct World {
+struct SdfWorld {
   std::string name;
   std::vector<Model> models;
   std::vector<std::string> warnings;
 };
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -4,7 +4,7 @@
 #include "wiw/core/error.hpp"
 #include "wiw/scene/import/file.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
 pugi::xml_document read_xml(const std::filesystem::path& file, const ImportOptions& options) {
   check_limit(file.string(), "bytes", size_of_file(file), options.limits.file_bytes, "file_bytes");
@@ -18,4 +18,4 @@ pugi::xml_document read_xml(const std::filesystem::path& file, const ImportOptio
   return document;
 }
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -6,9 +6,9 @@
 
 #include "wiw/scene/import.hpp"
 
-namespace wiw::sdf {
+namespace wiw::scene::sdf {
 
 /// Parses a file within the size limit and notes it in the trace. Throws FileError saying where it is not well-formed.
 pugi::xml_document read_xml(const std::filesystem::path& file, const ImportOptions& options);
 
-}  // namespace wiw::sdf
+}  // namespace wiw::scene::sdf

@@ -1,0 +1,48 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/apartment/apartment.hpp"
+
+#include <algorithm>
+#include <array>
+
+#include "wiw/apartment/draft.hpp"
+#include "wiw/core/error.hpp"
+
+namespace wiw::apartment {
+
+namespace {
+
+constexpr std::array<const char*, 3> kSplitNames{"train", "val", "test"};
+
+}  // namespace
+
+Split split_from_name(const std::string& name) {
+  for (std::size_t i = 0; i < kSplitNames.size(); ++i) {
+    if (name == kSplitNames[i]) return static_cast<Split>(i);
+  }
+  throw ArgumentError("split must be 'train', 'val' or 'test', got '" + name + "'");
+}
+
+std::string split_name(Split split) { return kSplitNames[static_cast<std::size_t>(split)]; }
+
+scene::Scene make_apartment(std::uint64_t seed, Split split, ThreadPool& pool) {
+  Draft draft;
+  draft.seed = seed;
+  draft.split = split;
+  draft.plan = make_floor_plan(seed, split);
+  draft.palette = make_palette(seed, split, draft.plan);
+  draft.materials = MaterialTable(seed);
+  build_walls(draft);
+  build_openings(draft);
+  furnish(draft);
+  return bake(draft, pool);
+}
+
+ApartmentIdentity apartment_identity(std::uint64_t seed, Split split) {
+  const FloorPlan plan = make_layout(seed, split);
+  ApartmentIdentity identity{plan.signature, {}};
+  for (const auto& color : make_palette(seed, split, plan).colors()) identity.palette.push_back(hex_code(color));
+  std::sort(identity.palette.begin(), identity.palette.end());
+  return identity;
+}
+
+}  // namespace wiw::apartment

@@ -1,0 +1,272 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "wiw/apartment/lighting.hpp"
+
+#include <array>
+#include <cmath>
+
+#include "wiw/apartment/random.hpp"
+#include "wiw/core/intrinsics.hpp"
+
+namespace wiw::apartment {
+
+namespace {
+
+constexpr float kTurn = 6.2831853f;
+constexpr float kLift = 0.004f;       // of samples above their surface
+constexpr int kBouncePackets = 4;     // of 16 rays a sample
+constexpr float kLampRadius = 0.14f;  // of the ball that stands for a lamp, for soft shadows
+constexpr float kSoftening = 0.12f;   // square metres added to squared distances: no hot spots beside lamps
+constexpr std::size_t kBlock = 256;   // samples a job
+
+/// Additive recurrence of the plastic number: the most even simple sequence of points in the unit square
+/// (M. Roberts, "The unreasonable effectiveness of quasirandom sequences", 2018).
+Vec2 even_point(std::uint32_t i) {
+  const double x = 0.5 + 0.7548776662466927 * i, y = 0.5 + 0.5698402909980532 * i;
+  return {static_cast<float>(x - std::floor(x)), static_cast<float>(y - std::floor(y))};
+}
+
+Vec2 shifted(const Vec2& point, std::uint32_t phase) {
+  const Vec2 p = point + even_point(1000u + phase);
+  return {p.x() - std::floor(p.x()), p.y() - std::floor(p.y())};
+}
+
+struct Frame {
+  Vec3 x, y, z;
+};
+
+/// Orthonormal basis around a normal (T. Duff et al., "Building an orthonormal basis, revisited", JCGT 2017).
+Frame frame_around(const Vec3& n) {
+  const float sign = std::copysign(1.f, n.z()), a = -1.f / (sign + n.z()), b = n.x() * n.y() * a;
+  return {Vec3(1.f + sign * n.x() * n.x() * a, sign * b, -sign * n.x()), Vec3(b, sign + n.y() * n.y() * a, -n.y()), n};
+}
+
+/// Whether the segment from a to b passes the opening's wall inside the opening, or does not pass that wall.
+bool passes(const Opening& o, const Vec3& a, const Vec3& b) {
+  const int across = runs_along_x(o.side) ? 2 : 0, along = 2 - across;
+  const float da = a[across] - o.line, db = b[across] - o.line;
+  if (da * db >= 0.f) return true;
+  const Vec3 at = a + (b - a) * (da / (da - db));
+  return at[along] > o.low && at[along] < o.high && at.y() > o.bottom && at.y() < o.top;
+}
+
+float surface_area(const FloorPlan& plan, std::int32_t room) {
+  const Rect r = plan.rooms[static_cast<std::size_t>(room)].inside();
+  return 2.f * r.area() + 2.f * (r.width() + r.depth()) * plan.ceiling;
+}
+
+}  // namespace
+
+LightSolver::LightSolver(const Draft& draft, const Atlas& atlas, const std::vector<scene::Texture>& textures)
+    : atlas_(atlas), charts_(draft.charts) {
+  std::vector<Rgb> albedo;
+  for (MaterialId id = 0; id < draft.materials.size(); ++id) {
+    const Finish& finish = draft.materials.finish(id);
+    Rgb color = to_linear(finish.color);
+    if (finish.texture != scene::kNone)
+      color = color.cwiseProduct(mean_linear(textures[static_cast<std::size_t>(finish.texture)]));
+    albedo.push_back(finish.emissive ? Rgb(Rgb::Zero()) : color);
+  }
+  add_texels(draft);
+  for (const Object& object : draft.objects) add_object(draft, object, albedo);
+  prepare_lights(draft);
+  tracer_ = std::make_unique<RayTracer>(std::move(vertices_), std::move(triangles_));
+}
+
+void LightSolver::add_texels(const Draft& draft) {
+  samples_.resize(atlas_.texels);
+  std::vector<std::int32_t> rooms(charts_.size(), kOutside);
+  for (const Object& object : draft.objects) {
+    for (const Panel& panel : object.panels) rooms[panel.chart] = object.room;
+  }
+  for (std::size_t c = 0; c < charts_.size(); ++c) {
+    const Chart& chart = charts_[c];
+    const ChartPlace& place = atlas_.places[c];
+    const Vec3 normal = chart.u.cross(chart.v);
+    const Vec2 step = chart.size.cwiseQuotient(Vec2(static_cast<float>(place.columns), static_cast<float>(place.rows)));
+    for (int row = 0; row < place.rows; ++row) {
+      for (int column = 0; column < place.columns; ++column) {
+        const Vec3 at = chart.origin + (static_cast<float>(column) + 0.5f) * step.x() * chart.u +
+                        (static_cast<float>(row) + 0.5f) * step.y() * chart.v;
+        const auto phase = static_cast<std::uint32_t>((column % 4) + 4 * (row % 4));
+        samples_[place.first + static_cast<std::size_t>(row * place.columns + column)] = {at + kLift * normal, normal,
+                                                                                          rooms[c], phase};
+      }
+    }
+  }
+}
+
+/// Samples a little inside the faces around each vertex: right at an edge the neighbour's surface would block them.
+void LightSolver::add_vertices(const Submesh& part, const Object& object) {
+  std::vector<Vec3> middle(part.positions.size(), Vec3::Zero());
+  std::vector<float> count(part.positions.size(), 0.f);
+  for (const scene::Triangle& t : part.triangles) {
+    const Vec3 center = (part.positions[t[0]] + part.positions[t[1]] + part.positions[t[2]]) / 3.f;
+    for (const std::uint32_t corner : {t[0], t[1], t[2]}) middle[corner] += center, count[corner] += 1.f;
+  }
+  for (std::size_t i = 0; i < part.positions.size(); ++i) {
+    const Vec3 inward = count[i] > 0.f ? Vec3(middle[i] / count[i] - part.positions[i]) : Vec3(Vec3::Zero());
+    const float reach = inward.norm();
+    const Vec3 at =
+        part.positions[i] + inward * (reach > 0.f ? std::min(0.25f, 0.015f / reach) : 0.f) + kLift * part.normals[i];
+    samples_.push_back({object.pose * at, object.pose.linear() * part.normals[i], object.room, 0});
+  }
+}
+
+void LightSolver::add_object(const Draft& draft, const Object& object, const std::vector<Rgb>& albedo) {
+  const auto add_part = [&](const Submesh& part, const Eigen::Affine3f& pose, std::int32_t chart,
+                            std::size_t first_sample) {
+    const auto base = static_cast<std::uint32_t>(vertices_.size());
+    for (const Vec3& position : part.positions) vertices_.emplace_back(pose * position);
+    for (const scene::Triangle& t : part.triangles) {
+      const auto sample = static_cast<std::uint32_t>(first_sample);
+      triangles_.emplace_back((t.array() + base).matrix());
+      faces_.push_back({albedo[part.material].cwiseProduct(to_linear(part.tint[t[0]])),
+                        chart,
+                        {sample + t[0], sample + t[1], sample + t[2]}});
+      face_room_.push_back(object.room);
+    }
+  };
+  for (const Panel& panel : object.panels)
+    add_part(panel.part, Eigen::Affine3f::Identity(), static_cast<std::int32_t>(panel.chart), 0);
+  for (const Submesh& part : object.shape.parts()) {
+    const std::size_t first = samples_.size();
+    add_vertices(part, object);
+    if (object.casts_shadow && !draft.materials.finish(part.material).emissive)
+      add_part(part, object.pose, scene::kNone, first);
+  }
+}
+
+/// Scales the lights so that each room gets its share of light for its size, and finds which rooms each one reaches.
+void LightSolver::prepare_lights(const Draft& draft) {
+  lights_ = draft.lights;
+  const auto rooms = static_cast<std::int32_t>(draft.plan.rooms.size());
+  lit_.resize(static_cast<std::size_t>(rooms));
+  for (std::int32_t room = 0; room < rooms; ++room) {
+    Rng rng = stream(draft.seed, Stream::kLight, static_cast<std::uint64_t>(room));
+    float lamps = 0.f, windows = 0.f;
+    for (const Light& light : lights_) {
+      if (light.room == room) (light.one_sided() ? windows : lamps) += light.strength.y();
+    }
+    const float level = range(rng, 0.44f, 0.54f), area = surface_area(draft.plan, room);
+    const float day = windows <= 0.f ? 0.f : lamps <= 0.f ? 1.f : range(rng, 0.4f, 0.6f);
+    const Rgb sky(0.9f, 0.98f, 1.1f);
+    for (Light& light : lights_) {
+      if (light.room != room) continue;
+      if (light.one_sided())
+        light.strength = sky * (light.strength.y() / windows * day * level * area * 2.f / kTurn);
+      else
+        light.strength = light.strength * ((1.f - day) * level * area / (lamps * 2.f * kTurn));
+    }
+    for (std::size_t i = 0; i < lights_.size(); ++i) {
+      if (lights_[i].room == room) lit_[static_cast<std::size_t>(room)].push_back({i});
+    }
+  }
+  for (const Opening& o : draft.plan.openings) {
+    if (!o.passable()) continue;
+    for (std::size_t i = 0; i < lights_.size(); ++i) {
+      if (lights_[i].room == o.room_a) lit_[static_cast<std::size_t>(o.room_b)].push_back({i, &o});
+      if (lights_[i].room == o.room_b) lit_[static_cast<std::size_t>(o.room_a)].push_back({i, &o});
+    }
+  }
+}
+
+Rgb LightSolver::from_light(const Sample& sample, const Lit& lit) const {
+  const Light& light = lights_[lit.light];
+  RayTracer::Directions to;
+  std::array<bool, RayTracer::kWidth> active{};
+  std::array<float, RayTracer::kWidth> weight{};
+  bool any = false;
+  for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
+    const Vec2 p = shifted(even_point(i), sample.phase);
+    Vec3 target;
+    if (light.one_sided()) {
+      target = light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v;
+    } else {
+      const float z = 2.f * p.x() - 1.f, r = std::sqrt(1.f - z * z);
+      target = light.center + kLampRadius * Vec3(r * std::cos(kTurn * p.y()), z, r * std::sin(kTurn * p.y()));
+    }
+    to[i] = target - sample.position;
+    const float square = to[i].squaredNorm(), distance = std::sqrt(square);
+    const float here = to[i].dot(sample.normal) / distance;
+    const float there = light.one_sided() ? -to[i].dot(light.axis) / distance : 0.6f + 0.4f * to[i].y() / distance;
+    active[i] = here > 0.f && there > 0.f && (lit.through == nullptr || passes(*lit.through, sample.position, target));
+    weight[i] = here * there / (square + kSoftening);
+    any = any || active[i];
+  }
+  if (!any) return Rgb::Zero();
+  const auto blocked = tracer_->blocked(sample.position, to, active);
+  float sum = 0.f;
+  for (std::size_t i = 0; i < RayTracer::kWidth; ++i) sum += blocked[i] ? 0.f : weight[i];
+  return light.strength * (sum / RayTracer::kWidth);
+}
+
+Rgb LightSolver::direct(const Sample& sample) const {
+  Rgb sum = Rgb::Zero();
+  if (sample.room == kOutside) return sum;
+  for (const Lit& lit : lit_[static_cast<std::size_t>(sample.room)]) sum += from_light(sample, lit);
+  return sum;
+}
+
+Rgb LightSolver::bounced(const Sample& sample, const std::vector<Rgb>& direct_light,
+                         const std::vector<Rgb>& ambient) const {
+  const Frame frame = frame_around(sample.normal);
+  Rgb sum = Rgb::Zero();
+  for (std::uint32_t packet = 0; packet < kBouncePackets; ++packet) {
+    RayTracer::Directions directions;
+    for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
+      const Vec2 p = shifted(even_point(packet * RayTracer::kWidth + i), sample.phase);
+      const float r = std::sqrt(p.x());
+      directions[i] = r * std::cos(kTurn * p.y()) * frame.x + r * std::sin(kTurn * p.y()) * frame.y +
+                      std::sqrt(1.f - p.x()) * frame.z;
+    }
+    const auto hits = tracer_->trace(sample.position, directions);
+    for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
+      if (hits[i].triangle < 0) continue;
+      const Face& face = faces_[static_cast<std::size_t>(hits[i].triangle)];
+      Rgb light;
+      if (face.chart != scene::kNone) {
+        const auto chart = static_cast<std::size_t>(face.chart);
+        light = direct_light[atlas_.texel_at(charts_[chart], atlas_.places[chart],
+                                             sample.position + hits[i].distance * directions[i])];
+      } else {
+        light = (1.f - hits[i].u - hits[i].v) * direct_light[face.vertices[0]] +
+                hits[i].u * direct_light[face.vertices[1]] + hits[i].v * direct_light[face.vertices[2]];
+      }
+      const std::int32_t room = face_room_[static_cast<std::size_t>(hits[i].triangle)];
+      if (room != kOutside) light += ambient[static_cast<std::size_t>(room)];
+      sum += face.albedo.cwiseProduct(light);
+    }
+  }
+  return sum / (kBouncePackets * RayTracer::kWidth);
+}
+
+/// Light of the second and later bounces: a geometric series with the mean light and a middling albedo.
+std::vector<Rgb> LightSolver::ambient(const std::vector<Rgb>& direct_light, std::size_t rooms) const {
+  std::vector<Rgb> sum(rooms, Rgb::Zero());
+  std::vector<float> count(rooms, 0.f);
+  for (std::size_t i = 0; i < atlas_.texels; ++i) {
+    if (samples_[i].room == kOutside) continue;
+    const auto room = static_cast<std::size_t>(samples_[i].room);
+    sum[room] += direct_light[i];
+    count[room] += 1.f;
+  }
+  constexpr float kAlbedo = 0.45f;
+  for (std::size_t room = 0; room < rooms; ++room) sum[room] *= kAlbedo / (1.f - kAlbedo) / std::max(count[room], 1.f);
+  return sum;
+}
+
+std::vector<Rgb> LightSolver::solve(ThreadPool& pool) const {
+  const std::size_t blocks = (samples_.size() + kBlock - 1) / kBlock;
+  std::vector<Rgb> first(samples_.size()), total(samples_.size());
+  const auto for_all = [&](const auto& body) {
+    pool.parallel_for(blocks, [&](std::size_t block) {
+      for (std::size_t i = block * kBlock; i < std::min(samples_.size(), (block + 1) * kBlock); ++i) body(i);
+    });
+  };
+  for_all([&](std::size_t i) { first[i] = direct(samples_[i]); });
+  const std::vector<Rgb> later = ambient(first, lit_.size());
+  for_all([&](std::size_t i) { total[i] = first[i] + bounced(samples_[i], first, later); });
+  return total;
+}
+
+}  // namespace wiw::apartment

@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+#pragma once
+
+#include <embree3/rtcore.h>
+
+#include <array>
+#include <vector>
+
+#include "wiw/apartment/shape.hpp"
+
+namespace wiw::apartment {
+
+/// Where a ray ends: triangle number (-1: nowhere) and barycentric coordinates of its second and third corner.
+struct Hit {
+  std::int32_t triangle = -1;
+  float u = 0.f, v = 0.f, distance = 0.f;
+};
+
+/// Sixteen rays from one point against a fixed triangle soup.
+class RayTracer {
+ public:
+  static constexpr int kWidth = 16;
+  using Directions = std::array<Vec3, kWidth>;
+
+  RayTracer(std::vector<Vec3> vertices, std::vector<scene::Triangle> triangles);
+  ~RayTracer();
+  RayTracer(const RayTracer&) = delete;
+  RayTracer& operator=(const RayTracer&) = delete;
+
+  /// Which of the active segments origin + (0, 1] * direction are blocked.
+  [[nodiscard]] std::array<bool, kWidth> blocked(const Vec3& origin, const Directions& directions,
+                                                 const std::array<bool, kWidth>& active) const;
+  [[nodiscard]] std::array<Hit, kWidth> trace(const Vec3& origin, const Directions& directions) const;
+
+ private:
+  std::vector<Vec3> vertices_;
+  std::vector<scene::Triangle> triangles_;
+  RTCDevice device_ = nullptr;
+  RTCScene scene_ = nullptr;
+};
+
+}  // namespace wiw::apartment
