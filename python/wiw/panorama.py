@@ -55,7 +55,7 @@ def _unbatch(images: Image, ndim: int) -> Image:
     return images[0] if ndim == 3 else images[0, ..., 0]
 
 
-def _reshaped_view(out: Image, shape: tuple[int, ...]) -> Image:
+def _reshape_view(out: Image, shape: tuple[int, ...]) -> Image:
     """``out`` with the axes of size 1 that the caller left out; never a copy."""
     if out.size != np.prod(shape) or not out.flags.c_contiguous:
         raise ArgumentError(f"out: expected a C-contiguous array of {shape}, got {list(out.shape)}")
@@ -118,7 +118,7 @@ class PerspectivePlan:
             raise ArgumentError(f"yaw_deg: expected a number or a sequence [Y], got {list(yaws.shape)}")
         angles = (self._yaw_sign * yaws.reshape(-1)).tolist()
         shape = (images.shape[0], len(angles), *self.size, images.shape[3])
-        views = self._plan(images, angles, interpolation, None if out is None else _reshaped_view(out, shape))
+        views = self._plan(images, angles, interpolation, None if out is None else _reshape_view(out, shape))
         if yaws.ndim == 0:
             views = views[:, 0]
         return _unbatch(views, ndim)

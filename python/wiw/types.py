@@ -33,7 +33,7 @@ class Key:
         return Key(self.seed, self.episode, decision)
 
 
-def checked_seed(seed: Any) -> int:
+def check_seed(seed: Any) -> int:
     """A seed, as it was given.
 
     Raises:
@@ -106,10 +106,10 @@ class Observation:
         values: dict[str, Any] = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
         if self.depth is not None:
             values["depth"] = self.depth
-        return values if self.target is None else {**values, **_boxed(self, self.target)}
+        return values if self.target is None else {**values, **_draw_boxes(self, self.target)}
 
 
-def _boxed(observation: Observation, target: Target) -> dict[str, Any]:
+def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
     """Images with the target's box drawn, and the boxes."""
     from wiw import annotate
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.stop import begun_again
+from wiw.cli.stop import announce_resume
 
 
 def collect(
@@ -57,7 +57,7 @@ def collect(
     began = time.monotonic()
     what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
     how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
-    with begun_again(), _Bars() as bars:
+    with announce_resume(), _Bars() as bars:
         made = collect(out, tasks, workers=workers, progress=bars, **what_of_it, **how_seen)
     megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
     failed = sum(made.failed.values())

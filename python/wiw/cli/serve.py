@@ -76,7 +76,7 @@ async def _live(server: Any, name: str) -> None:
         nonlocal signals
         signals += 1
         if signals == 1:
-            left = f"finishing {server.taken} rows that were taken" if server.taken else "ending"
+            left = f"finishing {server.pending_rows} rows that were taken" if server.pending_rows else "ending"
             print(f"\nwiw serve: {left}", file=sys.stderr, flush=True)
             server.end()
         else:

@@ -96,7 +96,7 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
 
 
 @contextmanager
-def begun_again() -> Iterator[None]:
+def announce_resume() -> Iterator[None]:
     """Around work that keeps what it has finished: when it is stopped, says that the same command goes on with it."""
     try:
         yield

@@ -63,7 +63,7 @@ class Demonstrations(Sequence[Demonstration]):
         self.folder = Path(folder)
         self.config = read_manifest(self.folder)
         """Options of the collection."""
-        paths = [path for task in self._asked(tasks) for path in shard_paths(self.folder, self.config, task)]
+        paths = [path for task in self._resolve_tasks(tasks) for path in shard_paths(self.folder, self.config, task)]
         self._shards = [Shard(path) for path in paths if not partial or path.exists()]
         self._ends = list(accumulate(len(shard) for shard in self._shards))
 
@@ -107,7 +107,7 @@ class Demonstrations(Sequence[Demonstration]):
         facts = self._shards[0].facts["camera"]
         return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
 
-    def _asked(self, tasks: str | Sequence[str]) -> list[str]:
+    def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:
         known = self.config["tasks"]
         names = known if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)
         if unknown := [name for name in names if name not in known]:
@@ -145,14 +145,14 @@ def shard_range(number: int, episodes: int) -> range:
     return range(SHARD * number, min(SHARD * (number + 1), episodes))
 
 
-def encoded_image(image: NDArray[np.uint8], kind: Format) -> bytes:
+def encode_image(image: NDArray[np.uint8], kind: Format) -> bytes:
     """A picture as JPEG or PNG."""
     fine = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, *fine] if kind == "jpeg" else []
     return bytes(cv2.imencode(f".{kind}", image[..., ::-1], options)[1])
 
 
-def encoded_depth(depth: NDArray[np.float32]) -> bytes:
+def encode_depth(depth: NDArray[np.float32]) -> bytes:
     """Metres as a 16-bit PNG; what is further away than 13 m is as far."""
     units = np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     return bytes(cv2.imencode(".png", units)[1])

@@ -88,7 +88,7 @@ class Shard:
         except FileNotFoundError as error:
             raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
-            raise _damaged(path, error) from error
+            raise _build_damage_error(path, error) from error
         if self.facts.get("format") != FORMAT:
             raise FileError(f"{path}: expected demonstrations of format {FORMAT}, got {self.facts.get('format')}")
 
@@ -107,10 +107,10 @@ class Shard:
             with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
                 return _demonstration(file.read_row_group(index).to_pydict())
         except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
-            raise _damaged(self.path, error) from error
+            raise _build_damage_error(self.path, error) from error
 
 
-def _damaged(path: Path, error: Exception) -> FileError:
+def _build_damage_error(path: Path, error: Exception) -> FileError:
     return FileError(
         f"{path}: expected a whole file of demonstrations, got a damaged one ({error}); delete it, then `wiw collect`, "
         "asked for the same again, makes it anew"

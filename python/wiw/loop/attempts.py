@@ -101,7 +101,7 @@ class Attempted(WorldModel):
             try:
                 return self.once(observations, controls, seeds)
             except Exception as error:
-                said.append(_said(error))
+                said.append(_describe_error(error))
                 in_vain = isinstance(error, ContractError) and said.count(said[-1]) > 1
                 if attempt + 1 == TRIES or in_vain:
                     raise self._failure(error, said) from error
@@ -246,7 +246,7 @@ def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
         del errand  # else its frames would stay until the next one comes
 
 
-def _said(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
 

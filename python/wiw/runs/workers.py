@@ -88,7 +88,7 @@ class RowSink:
         """These episodes begin anew."""
         self._send(AgainRow(self._job.arm, tuple(episodes)))
 
-    def lost(self, spent: Mapping[str, float]) -> None:
+    def record_lost(self, spent: Mapping[str, float]) -> None:
         """A decision has failed."""
         self._send(LostRow(self._job.arm, dict(spent)))
 
@@ -139,14 +139,14 @@ def run_in_workers(plan: Plan, jobs: Iterable[Job], desk: Desk, workers: int) ->
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
-    crew = _Crew(_pickled(plan), deque(jobs), desk, workers)
+    crew = _Crew(_pickle_plan(plan), deque(jobs), desk, workers)
     try:
         crew.run()
     finally:
         crew.stop()
 
 
-def _pickled(plan: Plan) -> bytes:
+def _pickle_plan(plan: Plan) -> bytes:
     try:
         return pickle.dumps(plan)
     except Exception as error:
@@ -287,7 +287,7 @@ def _work(pipe: Connection) -> None:
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:
-        pipe.send(_portable(error))
+        pipe.send(_make_portable(error))
     pipe.close()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -312,7 +312,7 @@ def _serve(pipe: Connection) -> None:
         runner.run(pipe.recv(), pipe.send)
 
 
-def _portable(error: Exception) -> Exception:
+def _make_portable(error: Exception) -> Exception:
     """The exception itself where it survives pickling and is ours; else its text."""
     if isinstance(error, Error):
         try:

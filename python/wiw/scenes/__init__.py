@@ -82,7 +82,7 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
         return store.Sources(tuple(read), tuple(absent))
 
     if cache:
-        return store.imported(file, options, build)
+        return store.load_imported(file, options, build)
     if not isolate:
         return _core.scene.import_scene(file, **options)[0]
     return store.temporary(build)
@@ -101,7 +101,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
         _log.info("apartment %s/%s made in %.1f s", split, seed, time.perf_counter() - started)
         return scene
 
-    return store.generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
+    return store.load_generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
 
 
 SPLIT_SIZE = 1000

@@ -98,13 +98,13 @@ class Queue:
         with self._changed:
             self._owed[client] += 1
 
-    def answered(self, client: Hashable) -> None:
+    def count_answer(self, client: Hashable) -> None:
         """A client has one answer more."""
         with self._changed:
             if client in self._owed:
                 self._owed[client] -= 1
 
-    def expired(self) -> list[Job]:
+    def take_expired(self) -> list[Job]:
         """Takes out the jobs whose clients wait no more."""
         with self._changed:
             now = self._clock()

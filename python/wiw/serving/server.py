@@ -158,7 +158,7 @@ class Server:
         return len(self._owed)
 
     @property
-    def taken(self) -> int:
+    def pending_rows(self) -> int:
         """Rows that wait or are computed."""
         return len(self._jobs)
 
@@ -190,7 +190,7 @@ class Server:
             ticking = asyncio.ensure_future(self._tick())
             await self._ending.wait()
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._finished(), self.settings.grace)
+                await asyncio.wait_for(self._finish_rows(), self.settings.grace)
             ticking.cancel()
             self.queue.end()
 
@@ -337,7 +337,7 @@ class Server:
         """Tells all who asked."""
         self._jobs.pop(job.id, None)
         for client in [client for client in self._owed if client in job.askers]:  # others have gone
-            self.queue.answered(client)
+            self.queue.count_answer(client)
             outbox, message = self._outboxes[client], answer
             if not outbox.takes(len(answer)):
                 message = encode(Wait(job.id, self._pause(), "earlier answers wait to be read"))
@@ -362,12 +362,12 @@ class Server:
                     leaving.add(client)
                     self.refused += 1
                     self._start(self._send_away(client, outbox))
-            for job in self.queue.expired():
+            for job in self.queue.take_expired():
                 self._settle(
                     job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
                 )
 
-    async def _finished(self) -> None:
+    async def _finish_rows(self) -> None:
         while self._jobs or self._tasks or any(self._outboxes.values()):
             await asyncio.sleep(TICK)
 

@@ -18,7 +18,7 @@ from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import agent_recipe, arm_recipes, task_recipe
-from wiw.runs.store import RunStore, removed_if_empty
+from wiw.runs.store import RunStore, remove_if_empty
 from wiw.studies.run_log import RunLog
 
 
@@ -152,7 +152,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes)
-        with removed_if_empty(store.path):
+        with remove_if_empty(store.path):
             return _finish(store, task, agents, settings.workers, settings.progress)
     return _finish(store, task, agents, settings.workers, settings.progress)
 

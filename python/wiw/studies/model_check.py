@@ -22,7 +22,7 @@ from wiw.errors import ArgumentError, ConstructionError, ContractError
 from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
 from wiw.loop.history import Frame, stack_histories
 from wiw.loop.plan_space import plan_space
-from wiw.studies.frame_faults import altered, exchange_turns, mean_correlation, share_of_jumps
+from wiw.studies.frame_faults import describe_alteration, exchange_turns, mean_correlation, share_of_jumps
 from wiw.studies.model_networks import place_of_computation, training_networks
 from wiw.studies.questions import Frames, Questions, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
@@ -170,7 +170,7 @@ def examine_model(
         made = make_model(model, deadline, **options)
     except ConstructionError as error:
         cause = error.__cause__
-        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_told(cause)}."
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_locate(cause)}."
         return _only(Finding(error.kind, text))
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
@@ -245,11 +245,11 @@ class _Check:
             )
         except ExitError as error:
             text = (
-                f"`rollout` raised {_told(error.__cause__ or error)}. A model that cannot answer raises an Exception."
+                f"`rollout` raised {_locate(error.__cause__ or error)}. A model that cannot answer raises an Exception."
             )
             finding = Finding("raised", text)
         except Exception as error:
-            finding = Finding("raised", f"`rollout` raised {_told(error)}.")
+            finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
         where = finding.kind if finding.kind in CHECKS else PICTURES.get(finding.kind, name)
         if where != name:
             self._done[name] = Check(name)
@@ -309,7 +309,7 @@ class _Check:
             )
             return
         truth = self.asking.true_frames(self.rows, [row.plan for row in self.rows])
-        if fault := altered(truth, own):
+        if fault := describe_alteration(truth, own):
             yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
 
     def _own(self) -> list[Frames]:
@@ -441,7 +441,7 @@ class _Check:
         try:
             json.dumps(self.model.describe())
         except Exception as error:
-            yield Finding("describe", f"`describe` gives no JSON for the run's record: {_told(error)}.")
+            yield Finding("describe", f"`describe` gives no JSON for the run's record: {_locate(error)}.")
         if self.accepts.cacheable and not self.model.fingerprint():
             yield Finding(
                 "version",
@@ -508,7 +508,7 @@ def _share(off: NDArray[np.int16]) -> str:
     return f"{sum(bool(row.any()) for row in off)} of {len(off)} rows"
 
 
-def _told(error: BaseException) -> str:
+def _locate(error: BaseException) -> str:
     """What was raised, and where: the last line before libraries were entered, which is the model's own."""
     frames = traceback.extract_tb(error.__traceback__)
     place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]

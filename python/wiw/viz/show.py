@@ -58,14 +58,14 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     goal = decision.goal
     has_image = goal is not None and goal.image is not None
     columns = place.subgridspec(1, 2, width_ratios=[4, 1]) if has_image else place.subgridspec(1, 1)
-    _picture(figure.add_subplot(columns[0, 0]), *_seen(decision.observation))
+    _picture(figure.add_subplot(columns[0, 0]), *_choose_picture(decision.observation))
     if goal is not None and goal.image is not None:
         _picture(figure.add_subplot(columns[0, 1]), goal.image, "goal")
     if goal is not None and goal.text:
         figure.suptitle(goal.text)
 
 
-def _seen(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
+def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
     """A picture of where the agent is, and what it is."""
     if isinstance(observation, ArmObservation):
         return observation.front, "seen from the front"
@@ -73,7 +73,7 @@ def _seen(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8],
     return part(panorama, BAND, (0, 1)), "seen, all around"
 
 
-def _told(decision: Decision, index: int) -> str:
+def _describe_plan(decision: Decision, index: int) -> str:
     """A plan in signs."""
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
@@ -89,7 +89,7 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
     label = figure.add_subplot(columns[0, 0])
     label.axis("off")
     label.set(xlim=(0, 1), ylim=(0, 1))
-    label.text(0, 0.68, _told(decision, index), fontsize=12, weight="bold")
+    label.text(0, 0.68, _describe_plan(decision, index), fontsize=12, weight="bold")
     low, high = np.nanmin(scores), np.nanmax(scores)
     share = 1.0 if high <= low else (scores[index] - low) / (high - low)
     label.barh([0.42, 0.42], [1, share], height=0.08, color=["#e4e2db", color])

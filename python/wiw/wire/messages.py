@@ -121,13 +121,13 @@ def decode(data: Any) -> Message:
     version, name = values.pop("v", None), values.pop("type", None)
     if version != VERSION or type(version) is not int:
         raise RemoteError(
-            f"this side speaks version {VERSION} of the protocol, the other one {_shown(version)}; install the same "
+            f"this side speaks version {VERSION} of the protocol, the other one {_quote(version)}; install the same "
             "version of wiw on both",
             "version",
         )
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise RemoteError(f"expected a message of type {', '.join(KINDS)}, got {_shown(name)}", "message")
+        raise RemoteError(f"expected a message of type {', '.join(KINDS)}, got {_quote(name)}", "message")
     return kind(**read_fields(f"{name}", values, {field.name: READERS[str(field.type)] for field in fields(kind)}))
 
 
@@ -218,6 +218,6 @@ def _of_type(name: str, value: Any, kind: type) -> Any:
     return value
 
 
-def _shown(value: Any) -> str:
+def _quote(value: Any) -> str:
     shown = repr(value)
     return shown if len(shown) < 40 else f"{shown[:40]}..."

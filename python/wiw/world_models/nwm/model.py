@@ -119,11 +119,15 @@ class NWM(WorldModel):
         import torch
 
         steps = np.stack([motions(c.trajectory, self.spacing, self.rollout_convention) for c in controls])
-        with torch.inference_mode(), self._mixed(), devices.memory_guard(f"NWM with batch={self.batch}", "lower batch"):
+        with (
+            torch.inference_mode(),
+            self._use_precision(),
+            devices.memory_guard(f"NWM with batch={self.batch}", "lower batch"),
+        ):
             motion = torch.from_numpy(steps).float().to(self._place)
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)
 
-    def _mixed(self) -> Any:
+    def _use_precision(self) -> Any:
         """Where the precision is lower, products are computed in it."""
         import torch
 
@@ -146,7 +150,7 @@ class NWM(WorldModel):
             rows = np.flatnonzero(lengths > k)
             pixels = self._next(context[rows], motion[rows, k], [generators[row] for row in rows])
             frames[rows, k + 1] = to_frames(pixels, *image.shape[1:3])
-            context[rows] = torch.cat([context[rows, 1:], self._encoded(pixels)[:, None]], dim=1)
+            context[rows] = torch.cat([context[rows, 1:], self._encode(pixels)[:, None]], dim=1)
         return frames
 
     def _first_context(self, observations: Conditioning) -> Tensor:
@@ -159,7 +163,7 @@ class NWM(WorldModel):
         else:
             images = context_images(observations.history, count)
         images = images.reshape(-1, *images.shape[2:])
-        return self._encoded(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
+        return self._encode(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
 
     def _next(self, context: Tensor, motion: Tensor, generators: list[Any]) -> Tensor:
         """The frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""
@@ -175,6 +179,6 @@ class NWM(WorldModel):
         )
         return self._codec.decode(latents / self._codec.config.scaling_factor).sample.clamp(-1, 1)
 
-    def _encoded(self, pixels: Tensor) -> Tensor:
+    def _encode(self, pixels: Tensor) -> Tensor:
         """Latents [B, C, h, w]: the codec's mean."""
         return self._codec.encode(pixels).latent_dist.mode().float() * self._codec.config.scaling_factor
