@@ -15,7 +15,7 @@ from wiw.serving.server import Server, Settings
 
 @contextmanager
 def serve_in_background(model: Any, **settings: Any) -> Iterator[Server]:
-    """Serves a world model (name, class or instance) while the block runs, at a free port: `server.address`.
+    """Serve a world model (name, class or instance) while the block runs, at a free port: `server.address`.
 
         with serve_in_background(MyModel()) as server:
             model = wiw.world_model(f"remote:{server.address}")
