@@ -105,14 +105,14 @@ KINDS: Mapping[str, type[Message]] = {
 
 
 def encode(message: Message) -> bytes:
-    """The message in bytes."""
+    """Return the message in bytes."""
     values = {field.name: getattr(message, field.name) for field in fields(message)}
     arrays = {name: pack_array(value) for name, value in values.items() if isinstance(value, np.ndarray)}
     return bytes(msgpack.packb({"v": VERSION, "type": type(message).__name__.lower(), **values, **arrays}))
 
 
 def decode(data: Any) -> Message:
-    """The message behind some bytes.
+    """Return the message behind some bytes.
 
     Raises:
         RemoteError: another version of the protocol (kind "version"), or no message of it (kind "message").
@@ -132,7 +132,7 @@ def decode(data: Any) -> Message:
 
 
 def unpack_map(what: str, data: Any) -> dict[Any, Any]:
-    """A msgpack map whose parts are no larger than the bytes that came.
+    """Return a msgpack map whose parts are no larger than the bytes that came.
 
     Raises:
         RemoteError: anything else.
@@ -167,7 +167,7 @@ Reader = Callable[[str, Any], Any]
 
 
 def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Reader]) -> dict[str, Any]:
-    """Each value as its reader takes it.
+    """Return each value as its reader takes it.
 
     Raises:
         RemoteError: fields are missing, there are others, or one is of another type.
@@ -179,24 +179,24 @@ def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Read
 
 
 def text(name: str, value: Any) -> str:
-    """A string."""
+    """Read a string."""
     return str(_of_type(name, value, str))
 
 
 def blob(name: str, value: Any) -> bytes:
-    """Bytes."""
+    """Read bytes."""
     return bytes(_of_type(name, value, bytes))
 
 
 def whole(name: str, value: Any) -> int:
-    """A number from 0 to 2**64 - 1."""
+    """Read a number from 0 to 2**64 - 1."""
     if _of_type(name, value, int) < 0:
         raise RemoteError(f"{name}: expected a number of at least 0, got {value}", "message")
     return int(value)
 
 
 def seconds(name: str, value: Any) -> float:
-    """A finite number of at least 0."""
+    """Read a finite number of at least 0."""
     if not math.isfinite(_of_type(name, value, float)) or value < 0:
         raise RemoteError(f"{name}: expected seconds of at least 0, got {value}", "message")
     return float(value)
