@@ -39,7 +39,7 @@ REPEATED = ("task", "instruction", "places")
 
 
 def require_pyarrow() -> None:
-    """Sees that files can be read and written.
+    """Check that files can be read and written.
 
     Raises:
         DependencyError: pyarrow is not installed.
@@ -51,7 +51,7 @@ def require_pyarrow() -> None:
 
 
 def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[str, Any]) -> None:
-    """Writes a file, which is there whole or not at all.
+    """Write a file, which is there whole or not at all.
 
     Args:
         path: of the file; what it held is replaced.
@@ -96,7 +96,7 @@ class Shard:
         return int(self._metadata.num_row_groups)
 
     def __getitem__(self, index: int) -> Demonstration:
-        """A demonstration, whose pictures are not yet decoded.
+        """Return a demonstration, whose pictures are not yet decoded.
 
         Raises:
             FileError: the file is damaged.
@@ -147,7 +147,7 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
 
 
 def _features(types: Mapping[str, Any]) -> dict[str, Any]:
-    """What the library `datasets` is told of columns, so that it decodes pictures by itself."""
+    """Return what the library `datasets` is told of columns, so that it decodes pictures by itself."""
     import pyarrow as pa
 
     def feature(kind: Any) -> dict[str, Any]:
