@@ -28,7 +28,7 @@ def collect(
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Collects demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
+    """Collect demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
 
     $ wiw collect manipulation --out demos --workers 4
     $ wiw collect manipulation --tasks push_buttons,stack_cups --episodes 20 --size 128 --frames 60 --depth --out few

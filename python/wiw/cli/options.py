@@ -55,7 +55,7 @@ def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) 
 
 
 def _make_absolute(value: str) -> str | None:
-    """The absolute path of a file or folder that is there."""
+    """Return the absolute path of a file or folder that is there."""
     try:
         path = Path(value).expanduser()
         return str(path.resolve()) if value and path.exists() else None
@@ -64,7 +64,7 @@ def _make_absolute(value: str) -> str | None:
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """What `--world-model-option` gives a world model.
+    """Return what `--world-model-option` gives a world model.
 
     Raises:
         ArgumentError: options without a model to take them.
@@ -79,7 +79,7 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
 def policy_options(
     policy: str, pairs: Sequence[str], beside: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Mapping[str, Any]]:
-    """What policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
+    """Return what policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
     from wiw.registry import POLICIES
 
     if not pairs:
@@ -91,7 +91,7 @@ def policy_options(
 
 
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """What `--semantics-option` gives a source of semantics.
+    """Return what `--semantics-option` gives a source of semantics.
 
     Raises:
         ArgumentError: options without a source to take them.
@@ -104,7 +104,7 @@ def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any
 
 
 def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
-    """What a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
+    """Return what a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
 
     Raises:
         ArgumentError: an option that has a flag of its own.
@@ -119,7 +119,7 @@ def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> d
 
 
 def default_policy(task: str) -> str:
-    """What runs a task where `--policy` names nothing.
+    """Return what runs a task where `--policy` names nothing.
 
     Raises:
         ArgumentError: the task names none either.
