@@ -43,13 +43,13 @@ class Sources:
 
 
 def folder() -> Path:
-    """Where scenes are kept: `$WIW_CACHE/scenes`, or `~/.cache/wiw/scenes`. Deleting it is always safe."""
+    """Return where scenes are kept: `$WIW_CACHE/scenes`, or `~/.cache/wiw/scenes`. Deleting it is always safe."""
     root = os.environ.get("WIW_CACHE")
     return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "scenes"
 
 
 def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sources]) -> _core.scene.Scene:
-    """The scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
+    """Return the scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
 
     `build(path)` imports the scene and writes it to `path`. Paths in `options` must be absolute. A link to a source
     counts as another source: its textures are looked for beside the link. Where the folder cannot be written, a
@@ -83,7 +83,7 @@ def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path],
 
 
 def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
-    """The scene that `build(path)` writes, mapped from a file that is removed at once; the mapping outlives it."""
+    """Map the scene that `build(path)` writes from a file that is removed at once; the mapping outlives it."""
     with TemporaryDirectory(prefix="wiw-scene-") as place:
         build(Path(place) / "scene")
         return _core.scene.map_cache(Path(place) / "scene")
@@ -103,12 +103,12 @@ def load_generated(identity: Iterable[str | int], make: Callable[[], _core.scene
 
 @cache
 def build_digest() -> str:
-    """Digest of the compiled core, which names every version of the generators in it."""
+    """Return the digest of the compiled core, which names every version of the generators in it."""
     return _digest(Path(_core.__file__))
 
 
 def limit() -> float:
-    """Most bytes that scenes may take on disk.
+    """Return the most bytes that scenes may take on disk.
 
     Raises:
         ArgumentError: `$WIW_CACHE_GB` is not a number of gigabytes.
@@ -124,7 +124,7 @@ def limit() -> float:
 
 
 def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
-    """The scene mapped from its new file; the scene itself where the file cannot be written."""
+    """Return the scene mapped from its new file; the scene itself where the file cannot be written."""
     try:
         _core.scene.write_cache(scene, path)
         _trim(path)
@@ -136,7 +136,7 @@ def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
 
 @contextmanager
 def _turn(path: Path) -> Iterator[None]:
-    """Lets one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
+    """Let one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
     name = path.with_suffix(".lock")
     lock = _open_lock(name)
     try:
@@ -163,7 +163,7 @@ def _open_lock(name: Path) -> IO[str] | None:
 
 
 def _map_scene(path: Path) -> _core.scene.Scene | None:
-    """The scene kept at `path`, marked as used now; None where there is none, or, with a warning, a damaged one."""
+    """Map the scene kept at `path` and mark it as used; None where there is none or, with a warning, a damaged one."""
     if not path.exists():
         return None
     try:
@@ -177,7 +177,7 @@ def _map_scene(path: Path) -> _core.scene.Scene | None:
 
 
 def _trim(newest: Path) -> None:
-    """Removes scenes, those unused for longest first, until the others fit the limit; never `newest`."""
+    """Remove scenes, those unused for longest first, until the others fit the limit; never `newest`."""
     scenes = []
     for path in newest.parent.glob("*.wiwscene"):
         with suppress(FileNotFoundError):  # another process trims as well
@@ -228,7 +228,7 @@ def _is_unchanged(entry: dict[str, Any]) -> bool:
 
 
 def _find_known(manifest: Path) -> _core.scene.Scene | None:
-    """The mapped scene of a manifest that still holds; None if it has to be built."""
+    """Return the mapped scene of a manifest that still holds; None if it has to be built."""
     try:
         facts = json.loads(manifest.read_text())
         if not all(map(_is_unchanged, facts["read"])) or any(Path(path).exists() for path in facts["absent"]):
