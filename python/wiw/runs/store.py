@@ -403,7 +403,7 @@ class RunStore:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def close(self) -> None:
-        """Close the file and lets others write."""
+        """Close the file and let others write."""
         self._connection.close()
         if self._lock is not None:
             self._lock.close()
@@ -442,7 +442,7 @@ class RunStore:
             return [dict(row) for row in self._connection.execute(query, values)]
 
     def _convert_types(self, table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The rows of a table, held to the types of its columns.
+        """Return the rows of a table, held to the types of its columns.
 
         Raises:
             StoreError: a value is of another type.
@@ -469,7 +469,7 @@ class RunStore:
 
 @contextmanager
 def remove_if_empty(path: Path) -> Iterator[None]:
-    """Around the work on a new run: where an error ends it before anything was recorded, the run is removed.
+    """Remove a new run where an error ends the work on it before anything was recorded.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.

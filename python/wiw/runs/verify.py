@@ -72,7 +72,7 @@ Facts = list[tuple[str, dict[str, Any]]]
 
 
 def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
-    """Runs `episodes` random episodes of a run again, in every arm that has ended them, and compares.
+    """Run `episodes` random episodes of a run again, in every arm that has ended them, and compare.
 
     Args:
         run: the run's folder.
