@@ -79,7 +79,7 @@ def run_arms(
 def resume_run(
     run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False
 ) -> RunLog:
-    """Goes on with a run of named parts: only episodes that have not ended are run.
+    """Go on with a run of named parts: only episodes that have not ended are run.
 
     Args:
         run: the run's folder.
@@ -166,7 +166,7 @@ def _finish(
     *,
     retry_errors: bool = False,
 ) -> RunLog:
-    """Runs what is missing, closes the store and opens it for reading."""
+    """Run what is missing, close the store and open it for reading."""
     pending = {arm: store.pending(arm, retry_errors) for arm in agents}
     run_pending(store, task, agents, pending, workers, progress)
     return RunLog(RunStore.read(store.path))
