@@ -21,16 +21,16 @@ class Sink(Protocol):
     """Receives what happens, in any order over episodes and in order within one."""
 
     def decision(self, record: DecisionRecord) -> None:
-        """One decision was taken and carried out."""
+        """Record a decision that was taken and carried out."""
 
     def episode(self, result: EpisodeResult) -> None:
-        """One episode has ended, or its infrastructure has failed."""
+        """Record that an episode has ended, or its infrastructure has failed."""
 
     def again(self, episodes: Sequence[int]) -> None:
-        """These episodes begin anew; what was reported of them does not count."""
+        """Note that these episodes begin anew; what was reported of them does not count."""
 
     def record_lost(self, spent: Mapping[str, float]) -> None:
-        """A decision has failed; what was asked for it, and its "seconds"."""
+        """Record that a decision has failed; what was asked for it, and its "seconds"."""
 
 
 @dataclass
