@@ -99,7 +99,7 @@ class NWM(WorldModel):
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
 
     def describe(self) -> dict[str, Any]:
-        """Options, what tells the weights from others, and the versions of libraries."""
+        """Return options, what tells the weights from others, and the versions of libraries."""
         from wiw.world_models.nwm.weights import digest
 
         return {**super().describe(), "digest": digest(self._network, self._codec), **versions()}
@@ -109,13 +109,13 @@ class NWM(WorldModel):
         return {**super().identity(), "device": self._place.type}
 
     def __reduce__(self) -> Any:
-        """As options: another process loads the weights itself."""
+        """Pickle as options: another process loads the weights itself."""
         return partial(type(self), **{field.name: getattr(self, field.name) for field in fields(self)}), ()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Frames one by one; frames of padding are left black."""
+        """Imagine frames one by one; frames of padding are left black."""
         import torch
 
         steps = np.stack([motions(c.trajectory, self.spacing, self.rollout_convention) for c in controls])
@@ -128,7 +128,7 @@ class NWM(WorldModel):
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)
 
     def _use_precision(self) -> Any:
-        """Where the precision is lower, products are computed in it."""
+        """Compute products in the lower precision, where there is one."""
         import torch
 
         dtype = getattr(torch, str(self.precision))
@@ -154,7 +154,7 @@ class NWM(WorldModel):
         return frames
 
     def _first_context(self, observations: Conditioning) -> Tensor:
-        """Latents [B, N, C, h, w] of what was observed before and now."""
+        """Return latents [B, N, C, h, w] of what was observed before and now."""
         from wiw.world_models.nwm.images import to_network
 
         count = self._network.size.context
@@ -166,7 +166,7 @@ class NWM(WorldModel):
         return self._encode(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
 
     def _next(self, context: Tensor, motion: Tensor, generators: list[Any]) -> Tensor:
-        """The frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""
+        """Return the frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""
         from wiw.world_models.nwm.diffusion import sample
 
         shift = motion.new_full((len(motion),), SHIFT)
@@ -180,5 +180,5 @@ class NWM(WorldModel):
         return self._codec.decode(latents / self._codec.config.scaling_factor).sample.clamp(-1, 1)
 
     def _encode(self, pixels: Tensor) -> Tensor:
-        """Latents [B, C, h, w]: the codec's mean."""
+        """Return latents [B, C, h, w]: the codec's mean."""
         return self._codec.encode(pixels).latent_dist.mode().float() * self._codec.config.scaling_factor

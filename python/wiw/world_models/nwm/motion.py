@@ -20,13 +20,13 @@ SHIFT = 1 / 128
 
 
 def normalise_steps(steps: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
-    """[..., 3] in metres and radians to what the network takes; turns are wrapped to [-pi, pi)."""
+    """Convert [..., 3] in metres and radians to what the network takes; turns are wrapped to [-pi, pi)."""
     plane = 2 * (steps[..., :2] / spacing - LOW) / (HIGH - LOW) - 1
     return np.concatenate([plane, _wrap_angle(steps[..., 2:])], axis=-1)
 
 
 def motions(trajectory: NDArray[np.float64], spacing: float, rollout_convention: bool = False) -> NDArray[np.float64]:
-    """What leads from each frame of a rollout to the next, float64 [K, 3].
+    """Return what leads from each frame of a rollout to the next, float64 [K, 3].
 
     Args:
         trajectory: [K, 3], the pose after each action in the frame of the start: x forward, y left, azimuth.
@@ -44,7 +44,7 @@ def motions(trajectory: NDArray[np.float64], spacing: float, rollout_convention:
 
 
 def _steps(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each pose seen from the one before."""
+    """Return each pose seen from the one before."""
     change, azimuth = np.diff(poses, axis=0), poses[:-1, 2]
     cos, sin = np.cos(azimuth), np.sin(azimuth)
     forward = cos * change[:, 0] + sin * change[:, 1]
