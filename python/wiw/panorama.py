@@ -202,13 +202,13 @@ def resize(images: Image, size: Size) -> Image:
 
 
 def directions(size: Size) -> NDArray[np.float32]:
-    """Unit vectors ``[H, W, 3]`` through the pixel centres of a panorama: Y up, front -Z, right +X."""
+    """Return unit vectors ``[H, W, 3]`` through the pixel centres of a panorama: Y up, front -Z, right +X."""
     return _core.directions((int(size[0]), int(size[1])))
 
 
 @lru_cache(maxsize=8)
 def _ray_lengths(size: Size, hfov_deg: float) -> NDArray[np.float32]:
-    """Length of the ray [x, y, -1] of each pixel of a perspective view."""
+    """Return the length of the ray [x, y, -1] of each pixel of a perspective view."""
     height, width = size
     pitch = 2.0 * np.tan(np.radians(hfov_deg) / 2.0) / width
     x = (np.arange(width) + 0.5 - width / 2.0) * pitch
@@ -219,7 +219,7 @@ def _ray_lengths(size: Size, hfov_deg: float) -> NDArray[np.float32]:
 
 
 def distance_to_planar(distance: NDArray[np.float32], hfov_deg: float) -> NDArray[np.float32]:
-    """Planar depth (along the optical axis) of perspective views ``[..., h, w]`` of distances along the ray.
+    """Return planar depth (along the optical axis) of perspective views ``[..., h, w]`` of distances along the ray.
 
     A view cut out of a panorama's depth holds distances; perspective cameras report planar depth. Both in metres; 0,
     where nothing is hit, stays 0.

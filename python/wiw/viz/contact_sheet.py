@@ -20,12 +20,12 @@ CAMERA_HEIGHT = 1.0
 
 
 def short_name(scene: str) -> str:
-    """A scene's name without its folders; specs such as "apartments:val/3" as they are."""
+    """Return a scene's name without its folders; specs such as "apartments:val/3" as they are."""
     return Path(scene).name if Path(scene).suffix else scene
 
 
 def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") -> Image.Image:
-    """One row a scene: seen from above, then `views` panoramas from places far apart.
+    """Draw one row per scene: seen from above, then `views` panoramas from places far apart.
 
     Args:
         worlds: loaded scenes with "name", "scene", "renderer", "navmesh" and "ground".

@@ -34,7 +34,7 @@ class DecisionFigure(Figure):
 
 
 def show(decision: Decision) -> DecisionFigure:
-    """Draws a decision; returns a matplotlib figure, which Jupyter displays and `.savefig(path)` writes.
+    """Draw a decision; return a matplotlib figure, which Jupyter displays and `.savefig(path)` writes.
 
     Raises:
         ArgumentError: the decision carries no observation (one that was read back from a run store does not).
@@ -66,7 +66,7 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
 
 
 def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
-    """A picture of where the agent is, and what it is."""
+    """Return a picture of where the agent is, and what it is."""
     if isinstance(observation, ArmObservation):
         return observation.front, "seen from the front"
     panorama = observation.as_dict()["panorama"]
@@ -74,7 +74,7 @@ def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[
 
 
 def _describe_plan(decision: Decision, index: int) -> str:
-    """A plan in signs."""
+    """Return a plan in signs."""
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
         return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
@@ -109,7 +109,7 @@ def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) ->
 
 
 def _front(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The first of several views; of a panorama the part towards which the agent looks."""
+    """Return the first of several views; of a panorama the part towards which the agent looks."""
     view = frame[0] if frame.ndim == 4 else frame
     height, width = view.shape[:2]
     return view if width <= 1.6 * height else part(view, BAND, FRONT)
@@ -123,7 +123,7 @@ def _picture(axes: Axes, image: NDArray[np.uint8], title: str, size: int = 9) ->
 
 
 def _scores(decision: Decision) -> NDArray[np.float64]:
-    """The reviser's scores, or the proposing policy's own preferences."""
+    """Return the reviser's scores, or the proposing policy's own preferences."""
     if decision.scores is not None:
         return np.asarray(decision.scores, np.float64)
     return np.array([proposal.prior for proposal in decision.proposals])
