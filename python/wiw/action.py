@@ -118,7 +118,7 @@ def to_text(
     template: TextTemplate | GripperTextTemplate | None = None,
     space: ActionSpace | None = None,
 ) -> str:
-    """The plan as a prompt for image-and-text-to-video models.
+    """Return the plan as a prompt for image-and-text-to-video models.
 
     Args:
         actions: ids [K], or poses float [K, 7].
@@ -144,7 +144,7 @@ def to_text(
 def to_trajectory(
     actions: ArrayLike, space: ActionSpace | None = None, *, include_start: bool = False
 ) -> NDArray[np.float64]:
-    """The plan as a camera trajectory: the pose after each action in the frame of the start.
+    """Return the plan as a camera trajectory: the pose after each action in the frame of the start.
 
     Args:
         actions: ids [K] or a batch [..., K].
@@ -170,7 +170,7 @@ def to_viewpoints(
 def to_controls(
     actions: ArrayLike, vocabulary: Vocabulary | GripperVocabulary, *, null_first: bool = False
 ) -> NDArray[np.int64] | NDArray[np.float64]:
-    """The plan in a model's own vocabulary.
+    """Return the plan in a model's own vocabulary.
 
     Args:
         actions: ids [K] or [..., K]; poses float [K, 7] with a `GripperVocabulary`.

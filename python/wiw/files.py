@@ -20,7 +20,7 @@ def whole_file(path: Path) -> Iterator[Path]:
         FileError: it cannot be written, for instance because the disk is full; `path` is as it was.
     """
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with _written(path, draft):
+    with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent, path.name)
         yield draft
@@ -42,7 +42,7 @@ def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: Fa
     if path.exists() and (not path.is_dir() or (any(path.iterdir()) and not replace(path))):
         raise FileError(f"{path} holds something already; expected a folder that is new or empty: name another")
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with _written(path, draft):
+    with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
         sweep(path.parent, path.name)
         draft.mkdir()
@@ -54,7 +54,7 @@ def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: Fa
 
 
 @contextmanager
-def _written(path: Path, draft: Path) -> Iterator[None]:
+def _write_draft(path: Path, draft: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:

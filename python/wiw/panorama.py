@@ -55,7 +55,7 @@ def _unbatch(images: Image, ndim: int) -> Image:
     return images[0] if ndim == 3 else images[0, ..., 0]
 
 
-def _reshaped_view(out: Image, shape: tuple[int, ...]) -> Image:
+def _reshape_view(out: Image, shape: tuple[int, ...]) -> Image:
     """``out`` with the axes of size 1 that the caller left out; never a copy."""
     if out.size != np.prod(shape) or not out.flags.c_contiguous:
         raise ArgumentError(f"out: expected a C-contiguous array of {shape}, got {list(out.shape)}")
@@ -118,7 +118,7 @@ class PerspectivePlan:
             raise ArgumentError(f"yaw_deg: expected a number or a sequence [Y], got {list(yaws.shape)}")
         angles = (self._yaw_sign * yaws.reshape(-1)).tolist()
         shape = (images.shape[0], len(angles), *self.size, images.shape[3])
-        views = self._plan(images, angles, interpolation, None if out is None else _reshaped_view(out, shape))
+        views = self._plan(images, angles, interpolation, None if out is None else _reshape_view(out, shape))
         if yaws.ndim == 0:
             views = views[:, 0]
         return _unbatch(views, ndim)
@@ -202,13 +202,13 @@ def resize(images: Image, size: Size) -> Image:
 
 
 def directions(size: Size) -> NDArray[np.float32]:
-    """Unit vectors ``[H, W, 3]`` through the pixel centres of a panorama: Y up, front -Z, right +X."""
+    """Return unit vectors ``[H, W, 3]`` through the pixel centres of a panorama: Y up, front -Z, right +X."""
     return _core.directions((int(size[0]), int(size[1])))
 
 
 @lru_cache(maxsize=8)
 def _ray_lengths(size: Size, hfov_deg: float) -> NDArray[np.float32]:
-    """Length of the ray [x, y, -1] of each pixel of a perspective view."""
+    """Return the length of the ray [x, y, -1] of each pixel of a perspective view."""
     height, width = size
     pitch = 2.0 * np.tan(np.radians(hfov_deg) / 2.0) / width
     x = (np.arange(width) + 0.5 - width / 2.0) * pitch
@@ -219,7 +219,7 @@ def _ray_lengths(size: Size, hfov_deg: float) -> NDArray[np.float32]:
 
 
 def distance_to_planar(distance: NDArray[np.float32], hfov_deg: float) -> NDArray[np.float32]:
-    """Planar depth (along the optical axis) of perspective views ``[..., h, w]`` of distances along the ray.
+    """Return planar depth (along the optical axis) of perspective views ``[..., h, w]`` of distances along the ray.
 
     A view cut out of a panorama's depth holds distances; perspective cameras report planar depth. Both in metres; 0,
     where nothing is hit, stays 0.

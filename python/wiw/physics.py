@@ -76,12 +76,12 @@ PANDA_READY = np.array([0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 
 
 @cache
 def panda() -> Articulation:
-    """The Franka Panda with its hand, of simple shapes (`configs/robots/panda.urdf`): 7 joints and 2 fingers."""
+    """Return the Franka Panda with its hand, of simple shapes (`configs/robots/panda.urdf`): 7 joints and 2 fingers."""
     return Articulation(Path(__file__).parent / "configs" / "robots" / "panda.urdf")
 
 
 def place(x: float = 0, y: float = 0, z: float = 0, rpy: Sequence[float] = (0, 0, 0)) -> NDArray[np.float64]:
-    """Pose [4, 4] at a position in metres, turned by R = Rz(yaw) Ry(pitch) Rx(roll) in radians."""
+    """Return the pose [4, 4] at a position in metres, turned by R = Rz(yaw) Ry(pitch) Rx(roll) in radians."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     pose = np.eye(4)
     pose[:3, 3] = x, y, z

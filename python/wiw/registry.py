@@ -56,7 +56,7 @@ class Registry:
         """
         if name in self.names():
             raise RegistryError(f"the {self.kind} '{name}' is there already; choose another name")
-        self.registered[name] = self._checked(name, thing)
+        self.registered[name] = self._check_kind(name, thing)
 
     def find(self, name: str) -> Any:
         """The class or factory behind a name or path.
@@ -92,7 +92,7 @@ class Registry:
             ConstructionError: the constructor raised something else than an error of wiw (the cause).
         """
         found = self.fitting(what, **options)
-        return self._checked(what, self._construct(what, found, options) if _makes(found) else found)
+        return self._check_kind(what, self._construct(what, found, options) if _makes(found) else found)
 
     def fitting(self, what: Any, **options: Any) -> Any:
         """What `make` would call with these options, or the instance that it would return.
@@ -133,9 +133,9 @@ class Registry:
             raise RegistryError(
                 f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
             ) from error
-        return self._checked(name, found) if inspect.isclass(found) else found
+        return self._check_kind(name, found) if inspect.isclass(found) else found
 
-    def _checked(self, name: Any, thing: Any) -> Any:
+    def _check_kind(self, name: Any, thing: Any) -> Any:
         """The class or instance, if it is of this kind; None stands for "without"."""
         if not self.base or thing is None:
             return thing

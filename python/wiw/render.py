@@ -55,7 +55,7 @@ class Renderer:
         outputs: Sequence[Output] = OUTPUTS,
         out: Mapping[str, NDArray[Any]] | None = None,
     ) -> dict[str, NDArray[Any]]:
-        """Pinhole views.
+        """Render pinhole views.
 
         T_world_camera: float [B, 4, 4] (or [4, 4], a batch of one), cameras look down -Z with +Y up. size: (H, W).
         hfov_deg spans the outer pixel edges, pixels are square. `out` gives arrays to write into instead of new ones,
@@ -72,7 +72,7 @@ class Renderer:
         outputs: Sequence[Output] = OUTPUTS,
         out: Mapping[str, NDArray[Any]] | None = None,
     ) -> dict[str, NDArray[Any]]:
-        """Equirectangular views: columns cover 360 degrees with the front at the centre, rows 180 degrees.
+        """Render equirectangular views: columns cover 360 degrees with the front at the centre, rows 180 degrees.
 
         Arguments as in `perspective`.
         """
@@ -81,7 +81,7 @@ class Renderer:
         return pictures
 
     def set_poses(self, instance_ids: ArrayLike, T_world_instance: ArrayLike) -> None:
-        """Moves instances; the others stay where they are. Ids [N], transforms float [N, 4, 4]."""
+        """Move instances; the others stay where they are. Ids [N], transforms float [N, 4, 4]."""
         ids = np.asarray(instance_ids)
         if ids.size and (not np.issubdtype(ids.dtype, np.integer) or ids.min() < 0 or ids.max() > 0xFFFFFFFF):
             raise ArgumentError(f"expected instance_ids as unsigned integers [N], got {ids.dtype} {list(ids.shape)}")
@@ -90,7 +90,7 @@ class Renderer:
 
 @cache
 def resolve_backend(backend: Literal["auto", "cpu", "gpu"]) -> Literal["cpu", "gpu"]:
-    """The back end that "auto" stands for on this machine; the others as they are."""
+    """Return the back end that "auto" stands for on this machine; the others as they are."""
     if backend != "auto":
         return backend
     triangle = Scene.from_arrays([{"positions": np.eye(3, dtype=np.float32), "triangles": np.array([[0, 1, 2]])}])

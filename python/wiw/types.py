@@ -29,12 +29,12 @@ class Key:
     decision: int = 0
 
     def at(self, decision: int) -> Key:
-        """The key of another decision of the same episode."""
+        """Return the key of another decision of the same episode."""
         return Key(self.seed, self.episode, decision)
 
 
-def checked_seed(seed: Any) -> int:
-    """A seed, as it was given.
+def check_seed(seed: Any) -> int:
+    """Return a seed as it is, once it is checked.
 
     Raises:
         ArgumentError: it is no whole number from 0 to 2**64 - 1.
@@ -98,7 +98,7 @@ class Observation:
     """Where the task points something out."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The observation as gymnasium spaces see it; `depth` only where present.
+        """Return the observation as gymnasium spaces see it; `depth` only where present.
 
         Where something is pointed out, its box is drawn in red on the images and given as "panorama_box" and
         "front_box", float32 [4], all -1 where nothing of it is visible; the mask is left out.
@@ -106,11 +106,11 @@ class Observation:
         values: dict[str, Any] = {"panorama": self.panorama, "front": self.front, "odometry": self.odometry}
         if self.depth is not None:
             values["depth"] = self.depth
-        return values if self.target is None else {**values, **_boxed(self, self.target)}
+        return values if self.target is None else {**values, **_draw_boxes(self, self.target)}
 
 
-def _boxed(observation: Observation, target: Target) -> dict[str, Any]:
-    """Images with the target's box drawn, and the boxes."""
+def _draw_boxes(observation: Observation, target: Target) -> dict[str, Any]:
+    """Return images with the target's box drawn, and the boxes."""
     from wiw import annotate
 
     values: dict[str, Any] = {}
@@ -137,7 +137,7 @@ class ArmObservation:
     """float64 [4, 4] by name: the objects' exact poses, which the paper gives policies that cannot see them so well."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The observation as gymnasium spaces see it; `depth` only where present."""
+        """Return the observation as gymnasium spaces see it; `depth` only where present."""
         values: dict[str, Any] = {"front": self.front, "pose": self.pose}
         return values if self.depth is None else {**values, "depth": self.depth}
 
@@ -323,7 +323,7 @@ class Fidelity:
     """float64 [M]: the same of perspective views, lower is truer; None where it is not measured."""
 
     def regret(self, chosen: int | None) -> float:
-        """By how much the true future of the chosen plan scores less than the best one; NaN for a plan made anew."""
+        """Return how much less than the best the chosen plan scores in truth; NaN for a plan made anew."""
         return float("nan") if chosen is None else float(self.scores.max() - self.scores[chosen])
 
 

@@ -24,7 +24,7 @@ from wiw import panorama
 from wiw.errors import ArgumentError
 from wiw.policies.vlm.prompt_images import VIEW
 from wiw.runs.recipes import AgentRecipe
-from wiw.serving.background import served
+from wiw.serving.background import serve_in_background
 from wiw.serving.vlm_server import VlmServer
 from wiw.vlm.messages import Call
 from wiw.vlm.mock import MockClient
@@ -107,7 +107,7 @@ def made(world_model_options: Any) -> Iterator[Callable[..., Any]]:
 
         def make(name: str, kind: str = "discrete") -> Any:
             if name == "remote:":
-                return wiw.world_model(name + stack.enter_context(served("copy")).address)
+                return wiw.world_model(name + stack.enter_context(serve_in_background("copy")).address)
             return wiw.world_model(name, **({} if name == "none" else world_model_options(name, kind)))
 
         yield make

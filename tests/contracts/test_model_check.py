@@ -14,7 +14,7 @@ import pytest
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError, RegistryError
-from wiw.serving.background import served
+from wiw.serving.background import serve_in_background
 from wiw.studies.model_check import CHECKS, examine_model
 from wiw.types import Conditioning
 from wiw.world_models.warp import Warp
@@ -375,13 +375,13 @@ def test_a_function_and_a_served_model_are_checked_as_any(two_rooms):
         return Honest().rollout(observations, controls, seeds)
 
     assert found(rollout, two_rooms, accepts=Honest.accepts) == {}
-    with served(Honest) as server:
+    with serve_in_background(Honest) as server:
         assert found(f"remote:{server.address}", two_rooms) == {}
-    with served(Arm) as server:
+    with serve_in_background(Arm) as server:
         assert found(f"remote:{server.address}", "nowhere") == {}
-    with served(spoilt(by_chance)) as server:
+    with serve_in_background(spoilt(by_chance)) as server:
         assert set(found(f"remote:{server.address}", two_rooms)) == {"random"}
-    with served(spoilt(lambda frames, *_: frames[:, 1:])) as server:
+    with serve_in_background(spoilt(lambda frames, *_: frames[:, 1:])) as server:
         assert set(found(f"remote:{server.address}", two_rooms)) == {"frames"}
 
 

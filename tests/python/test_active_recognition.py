@@ -129,7 +129,7 @@ class Sink:
     def again(self, episodes: Any) -> None:
         raise AssertionError(episodes)
 
-    def lost(self, spent: Any) -> None:
+    def record_lost(self, spent: Any) -> None:
         raise AssertionError(spent)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from wiw.cli import main
 from wiw.cli.doctor import examine
-from wiw.cli.options import parsed
+from wiw.cli.options import parse_options
 from wiw.errors import ArgumentError
 from wiw.studies.run_log import load_run
 from wiw.tasks.imagenav import ImageNav
@@ -198,13 +198,13 @@ def test_files_in_options_are_named_from_the_root_on(tmp_path, monkeypatch):
     for name in ("w: 1", "auto"):
         (tmp_path / name).touch()
     there = str(tmp_path / "w: 1")
-    options = parsed(["weights=w: 1", "prompts=~/w: 1", "cache=auto", "text=auto"], factory, "--x")
+    options = parse_options(["weights=w: 1", "prompts=~/w: 1", "cache=auto", "text=auto"], factory, "--x")
     assert options == {"weights": there, "prompts": there, "cache": "auto", "text": "auto"}
     given = ["weights=w: 1", "checkpoint=auto", "folder=./auto"]
     auto = str(tmp_path / "auto")
-    assert parsed(given, other, "--x") == {"weights": there, "checkpoint": auto, "folder": auto}
+    assert parse_options(given, other, "--x") == {"weights": there, "checkpoint": auto, "folder": auto}
     missing = ["weights=hub/none", "checkpoint=", "folder=null"]
-    assert parsed(missing, other, "--x") == {"weights": "hub/none", "checkpoint": "", "folder": None}
+    assert parse_options(missing, other, "--x") == {"weights": "hub/none", "checkpoint": "", "folder": None}
 
 
 def test_a_task_takes_options(tmp_path, two_rooms, short, capsys):
@@ -253,10 +253,10 @@ def test_errors_are_one_clean_line(tmp_path, capsys):
 
 def test_a_run_that_could_not_begin_leaves_nothing_behind(tmp_path, capsys, monkeypatch):
     """The server wants another token: once it has the right one, the same command begins the run."""
-    from wiw.serving.background import served
+    from wiw.serving.background import serve_in_background
 
     monkeypatch.delenv("WIW_TOKEN", raising=False)
-    with served("copy", token="right") as server:
+    with serve_in_background("copy", token="right") as server:
         asked = ["--revision", "matcher", "--world-model", f"remote:{server.address}", "--episodes", 1]
         asked += ["--no-report", "--out", tmp_path / "run"]
         for token in (None, "wrong"):

@@ -25,8 +25,8 @@ from wiw.datasets.demonstrations import (
     DEPTH_UNITS,
     Demonstration,
     Demonstrations,
-    encoded_depth,
-    encoded_image,
+    encode_depth,
+    encode_image,
     shard_range,
 )
 from wiw.errors import ArgumentError, DependencyError, FileError, InfrastructureError
@@ -154,9 +154,9 @@ def made_up(rng: np.random.Generator, frames: int, episode: int, depth: bool, ki
         keys=rng.integers(0, 9, frames).astype(np.int32),
         ended=rng.integers(0, 2, frames).astype(bool),
         encoded_images=tuple(
-            encoded_image(rng.integers(0, 256, (8, 8, 3)).astype(np.uint8), kind) for _ in range(frames)
+            encode_image(rng.integers(0, 256, (8, 8, 3)).astype(np.uint8), kind) for _ in range(frames)
         ),
-        encoded_depths=tuple(encoded_depth(rng.random((8, 8)).astype(np.float32)) for _ in range(frames))
+        encoded_depths=tuple(encode_depth(rng.random((8, 8)).astype(np.float32)) for _ in range(frames))
         if depth
         else None,
     )
@@ -368,8 +368,8 @@ def test_a_damaged_picture_is_told(collected: Path) -> None:
     with pytest.raises(FileError, match="picture of a demonstration is damaged"):
         _ = broken.images
     rng = np.random.default_rng(0)
-    small, large = (encoded_image(rng.integers(0, 256, (n, n, 3)).astype(np.uint8), "png") for n in (8, 9))
-    depths = tuple(encoded_depth(np.ones((n, n), np.float32)) for n in (8, 9))
+    small, large = (encode_image(rng.integers(0, 256, (n, n, 3)).astype(np.uint8), "png") for n in (8, 9))
+    depths = tuple(encode_depth(np.ones((n, n), np.float32)) for n in (8, 9))
     broken = replace(broken, encoded_images=(small, large), encoded_depths=depths)
     for name in ("images", "depths"):
         with pytest.raises(FileError, match="picture of a demonstration is damaged"):

@@ -35,7 +35,7 @@ class Records:
     def again(self, episodes) -> None:
         raise AssertionError
 
-    def lost(self, spent) -> None:
+    def record_lost(self, spent) -> None:
         raise AssertionError
 
 

@@ -25,7 +25,7 @@ from wiw.loop.scheduler import run_episodes
 from wiw.loop.search import move
 from wiw.policies.base import FrameSpec, Situation
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.serving.background import served
+from wiw.serving.background import serve_in_background
 from wiw.tasks.imagenav import ImageNav
 from wiw.types import ArmObservation, Goal, History, Key, Observation, Proposal
 
@@ -188,7 +188,7 @@ class Recorder:
     def again(self, episodes):
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
-    def lost(self, spent):
+    def record_lost(self, spent):
         pass
 
 
@@ -216,7 +216,7 @@ def test_nor_on_workers_or_the_wire(two_rooms: str, tmp_path: Path) -> None:
     here = f"{Path(__file__).with_name('history_models.py')}:Recalling"
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 3})
     agent = AgentRecipe("heuristic", here, reviser="matcher")
-    with served(Recalling) as server:
+    with serve_in_background(Recalling) as server:
         arms = [here, f"remote:{server.address}"]
         one = wiw.evaluate(task, agent, 3, out=tmp_path / "1", live=3, arms=arms, cache="off", progress=False)
     two = wiw.evaluate(task, agent, 3, out=tmp_path / "2", workers=2, live=1, progress=False)

@@ -36,7 +36,7 @@ class Recorder:
     def again(self, episodes) -> None:
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
-    def lost(self, spent) -> None:
+    def record_lost(self, spent) -> None:
         self.wasted.update(spent)
 
 

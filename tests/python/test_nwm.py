@@ -19,7 +19,7 @@ from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, WeightsError
 from wiw.types import Conditioning, Control, Goal, History, Key, Observation, Proposal
 from wiw.world_models.nwm.context import nearest_frames
-from wiw.world_models.nwm.motion import motions, normalised
+from wiw.world_models.nwm.motion import motions, normalise_steps
 
 pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
 
@@ -163,7 +163,7 @@ def test_every_input_of_the_network_counts_and_rows_are_apart() -> None:
 
 
 def test_standing_still_is_not_zero() -> None:
-    np.testing.assert_allclose(normalised(np.zeros((1, 3)), 0.25), [[-1 / 3, 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(normalise_steps(np.zeros((1, 3)), 0.25), [[-1 / 3, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(motions(action.to_trajectory([STOP, STOP]), 0.25), [[-1 / 3, 0, 0]] * 2, atol=1e-12)
     still = motions(action.to_trajectory([STOP, STOP]), 0.25, rollout_convention=True)
     np.testing.assert_allclose(still, [[-1 / 3, 0, 0], [0, 0, 0]], atol=1e-12)  # only the first step carries the offset

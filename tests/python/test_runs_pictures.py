@@ -11,7 +11,7 @@ from fakes import LineAgent, LineTask
 
 from wiw.report.episodes import read_stories
 from wiw.report.story import Album
-from wiw.runs.pictures import choose_episodes, pictured_episodes, pool_episodes, spread_evenly
+from wiw.runs.pictures import choose_episodes, choose_pictured_episodes, pool_episodes, spread_evenly
 from wiw.runs.store import RunStore, store_path
 from wiw.studies.evaluate import run_arms
 
@@ -97,7 +97,7 @@ def test_a_stopped_run_chooses_at_its_end(tmp_path, monkeypatch):
         patch.setattr(RunStore, "write", stop)
         run_arms(LineTask(), AGENTS, 20, out=tmp_path / "run", progress=False)
     with RunStore.read(tmp_path / "run") as store:
-        assert len(store.info["pictures"]) == 12 and len(pictured_episodes(store)) == 2
+        assert len(store.info["pictures"]) == 12 and len(choose_pictured_episodes(store)) == 2
     log = run_arms(LineTask(), AGENTS, 20, out=tmp_path / "run", progress=False, resume=True)
     whole = run_arms(LineTask(), AGENTS, 20, out=tmp_path / "whole", progress=False)
     assert log.store.info["pictures"] == whole.store.info["pictures"]

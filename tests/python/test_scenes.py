@@ -238,7 +238,7 @@ def test_the_cache_is_used_and_follows_its_sources(tmp_path: Path, own_cache: Pa
             _core.scene.write_cache(scene, out)
             return scenes.store.Sources(tuple(read), tuple(absent))
 
-        return scenes.store.imported(mesh, options, build)
+        return scenes.store.load_imported(mesh, options, build)
 
     time.sleep(0.02)  # a file written while it is read is not remembered
     assert len(load().warnings) == 1
@@ -355,7 +355,7 @@ def test_generated_scenes_are_kept_by_identity(own_cache: Path) -> None:
         return scenes.Scene.from_arrays([{"positions": SQUARE, "triangles": TWO}])
 
     for identity in (["maker", 1, 7], ["maker", 1, 7], ["maker", 2, 7]):
-        assert scenes.store.generated(identity, make).triangle_count == 2
+        assert scenes.store.load_generated(identity, make).triangle_count == 2
     assert len(made) == 2
     assert not list((own_cache / "scenes").glob("*.lock"))
 
@@ -402,13 +402,13 @@ def test_an_apartment_is_kept_by_seed_split_and_build(monkeypatch: pytest.Monkey
 
 
 def test_the_cache_forgets_what_was_not_used_for_longest(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes.store.generated(["size"], flat)
+    scenes.store.load_generated(["size"], flat)
     (first,) = (own_cache / "scenes").glob("*.wiwscene")
     monkeypatch.setenv("WIW_CACHE_GB", str(3.5 * first.stat().st_size / 2**30))
     made: list[int] = []
 
     def ask(number: int) -> None:
-        scenes.store.generated([number], lambda: made.append(number) or flat())
+        scenes.store.load_generated([number], lambda: made.append(number) or flat())
         time.sleep(0.02)
 
     for number in (1, 2, 1, 3, 1, 4, 1):  # 2 goes when 4 comes
@@ -441,13 +441,13 @@ def test_a_scene_that_cannot_be_kept_is_used_all_the_same(
         raise FileError(f"{path}: cannot be written (is the disk full?)")
 
     monkeypatch.setattr(_core.scene, "write_cache", full)
-    assert scenes.store.generated(["full"], flat).triangle_count == 2
+    assert scenes.store.load_generated(["full"], flat).triangle_count == 2
     assert "disk full" in caplog.text and "made again the next time" in caplog.text
     monkeypatch.undo()
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("WIW_CACHE", str(tmp_path / "file"))
     caplog.clear()
-    assert scenes.store.generated(["nowhere"], flat).triangle_count == 2
+    assert scenes.store.load_generated(["nowhere"], flat).triangle_count == 2
     assert "not kept" in caplog.text
 
 

@@ -31,7 +31,7 @@ from wiw.loop import attempts
 from wiw.loop.attempts import Attempted
 from wiw.serving import outbox
 from wiw.serving import server as serving
-from wiw.serving.background import served
+from wiw.serving.background import serve_in_background
 from wiw.serving.known import Known
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
@@ -143,7 +143,7 @@ def ask(model, batch=4, start=0, count=5):
 
 @contextlib.contextmanager
 def remote(model, **options):
-    with served(model, **options) as server:
+    with serve_in_background(model, **options) as server:
         client = Remote(server.address, options.get("token"))
         try:
             yield client, server
@@ -376,7 +376,7 @@ def test_a_lost_connection_is_mended_and_no_row_is_computed_twice():
 
 def test_a_server_that_comes_back_is_not_asked_for_what_was_answered():
     gate = threading.Event()
-    with served(first := Plain()) as server, ThreadPoolExecutor(1) as pool:
+    with serve_in_background(first := Plain()) as server, ThreadPoolExecutor(1) as pool:
         port = int(server.address.rpartition(":")[2])
         client = Remote(server.address)
         first.act = lambda observations: None if len(first.rows) == 1 else gate.wait(20) and None
@@ -386,7 +386,7 @@ def test_a_server_that_comes_back_is_not_asked_for_what_was_answered():
         object.__setattr__(server.settings, "grace", 0.0)
         server._loop.call_soon_threadsafe(server.end)
         wait_for(lambda: not server.clients)
-        with served(second := Plain(), port=port):
+        with serve_in_background(second := Plain(), port=port):
             np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
         gate.set()
     client.close()
@@ -394,15 +394,15 @@ def test_a_server_that_comes_back_is_not_asked_for_what_was_answered():
 
 
 def test_a_server_that_comes_back_with_another_model_is_refused():
-    with served(Plain(name="first")) as server:
+    with serve_in_background(Plain(name="first")) as server:
         port = int(server.address.rpartition(":")[2])
         client = Remote(server.address)
         ask(client)
-    with served(Plain(name="second"), port=port):
+    with serve_in_background(Plain(name="second"), port=port):
         with pytest.raises(RemoteError, match="has come back with another") as caught:
             ask(client, start=50)
         assert caught.value.kind == "model"
-    with served(Plain(name="first"), port=port):
+    with serve_in_background(Plain(name="first"), port=port):
         ask(client, start=60)
     client.close()
 
@@ -414,7 +414,7 @@ def test_nobody_there():
     ) as caught:
         Remote("ws://127.0.0.1:1", patience=0.3)
     assert caught.value.kind == "connection" and time.monotonic() - begin < 5
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         client = Remote(server.address)
     with pytest.raises(RemoteError, match="could not be reached in time") as caught, patience(0.5):
         ask(client)
@@ -431,10 +431,13 @@ def test_addresses_that_are_none(address):
 
 def test_a_client_that_was_closed_says_so_at_once():
     gate = threading.Event()
-    with served(Plain(lambda observations: gate.wait(20) and None)) as server, ThreadPoolExecutor(1) as pool:
+    with (
+        serve_in_background(Plain(lambda observations: gate.wait(20) and None)) as server,
+        ThreadPoolExecutor(1) as pool,
+    ):
         client = Remote(server.address)
         waiting = pool.submit(ask, client)
-        wait_for(lambda: server.taken)
+        wait_for(lambda: server.pending_rows)
         begin = time.monotonic()
         client.close()
         for question in (waiting.result, lambda: ask(client)):
@@ -457,7 +460,7 @@ def test_a_row_that_is_too_large_is_told_of_at_once():
 
 def test_clients_threads_end_with_them():
     gc.collect()  # those of other tests
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         before = threading.active_count()
         clients = [Remote(server.address) for _ in range(3)]
         assert threading.active_count() == before + 3
@@ -493,7 +496,7 @@ def test_settings_out_of_range(wrong):
 
 
 def test_the_token_opens_and_no_other(monkeypatch):
-    with served(Plain(), token="secret") as server:
+    with serve_in_background(Plain(), token="secret") as server:
         for token in (None, "", "Secret", "secret2", "é"):
             with pytest.raises(RemoteError, match="wants another token"):
                 Remote(server.address, token).close()
@@ -506,13 +509,13 @@ def test_the_token_opens_and_no_other(monkeypatch):
 
 
 def test_no_web_page_may_ask():
-    with served(Plain()) as server, pytest.raises(InvalidStatus, match="403"):
+    with serve_in_background(Plain()) as server, pytest.raises(InvalidStatus, match="403"):
         connect(server.address, origin="http://somewhere", proxy=None)
 
 
 def test_more_clients_than_a_server_takes(monkeypatch):
     monkeypatch.setattr(serving, "CLIENTS", 1)
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         client = Remote(server.address)
         with pytest.raises(InvalidStatus, match="503"):
             connect(server.address, proxy=None)
@@ -520,9 +523,9 @@ def test_more_clients_than_a_server_takes(monkeypatch):
 
 
 def test_a_port_that_is_taken():
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         port = int(server.address.rpartition(":")[2])
-        with pytest.raises(InfrastructureError, match="cannot listen"), served(Plain(), port=port):
+        with pytest.raises(InfrastructureError, match="cannot listen"), serve_in_background(Plain(), port=port):
             pass
 
 
@@ -530,7 +533,10 @@ def test_a_port_that_is_taken():
 def test_certificates_that_are_none_are_named(tmp_path):
     (tmp_path / "text.pem").write_text("no certificate")
     for name, reason in (("nowhere.pem", "No such file"), ("text.pem", "PEM")):
-        with pytest.raises(ArgumentError, match=rf"{name}: .*{reason}"), served(Plain(), certificate=tmp_path / name):
+        with (
+            pytest.raises(ArgumentError, match=rf"{name}: .*{reason}"),
+            serve_in_background(Plain(), certificate=tmp_path / name),
+        ):
             pass
     with pytest.raises(ArgumentError, match="nothing would be encrypted"):
         Settings(key=tmp_path / "key.pem")
@@ -552,7 +558,7 @@ def test_behind_tls(tmp_path, monkeypatch):
     ]
     command += ["-subj", "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1"]
     subprocess.run([*command, "-keyout", files["key"], "-out", files["certificate"]], check=True, capture_output=True)
-    with served(Plain(), **files) as server:
+    with serve_in_background(Plain(), **files) as server:
         assert server.address.startswith("wss://")
         with pytest.raises(RemoteError, match="SSLCertVerificationError"):
             Remote(server.address, patience=0.5)
@@ -583,7 +589,7 @@ def row(count=5, **changes):
 
 def test_another_version_is_refused_at_the_handshake():
     later = msgpack.packb({**msgpack.unpackb(encode(Hello("wiw 9.9"))), "v": 9})
-    with served(Plain()) as server, raw(server) as connection:
+    with serve_in_background(Plain()) as server, raw(server) as connection:
         connection.send(later)
         said = decode(connection.recv())
         assert isinstance(said, Refusal) and said.kind == "version" and "version 1" in said.text and " 9" in said.text
@@ -614,7 +620,7 @@ def test_a_server_that_says_nothing_is_given_up_when_patience_ends(monkeypatch):
 
 @pytest.mark.parametrize("description", ["no JSON", "[" * 100_000 + "]" * 100_000, '"a name"'])
 def test_a_server_that_describes_its_model_in_nonsense_is_refused(description):
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         server._welcome = replace(server._welcome, model=description)
         with pytest.raises(RemoteError, match="description of its model") as caught:
             Remote(server.address)
@@ -631,7 +637,7 @@ def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
         "missing are": b"\x80",
     }
     model = Plain()
-    with served(model) as server, raw(server) as connection:
+    with serve_in_background(model) as server, raw(server) as connection:
         assert isinstance(greeted(connection), Welcome)
         for text, data in wrong.items():
             connection.send(encode(Ask(row_id(data), data, 5.0, 0)))
@@ -654,7 +660,7 @@ def test_fixed_lengths_and_needs_are_held_to():
     class Fixed(Mixing):
         accepts = wiw.accepts("action", size=SIZE, frames=4, needs=("depth",))
 
-    with served(Fixed()) as server, raw(server) as connection:
+    with serve_in_background(Fixed()) as server, raw(server) as connection:
         greeted(connection)
         for text, data in {
             "row.depth: missing": row(3),
@@ -677,7 +683,7 @@ def test_fixed_lengths_and_needs_are_held_to():
     ],
 )
 def test_what_is_no_hello_ends_the_connection_with_a_reason(first):
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         with raw(server) as connection:
             connection.send(first)
             said = decode(connection.recv())
@@ -688,7 +694,7 @@ def test_what_is_no_hello_ends_the_connection_with_a_reason(first):
 
 
 def test_an_id_that_is_not_the_rows_is_refused():
-    with served(Plain()) as server, raw(server) as connection:
+    with serve_in_background(Plain()) as server, raw(server) as connection:
         greeted(connection)
         connection.send(encode(Ask(b"1", row(), 5.0, 0)))
         assert "digest" in decode(connection.recv()).text
@@ -703,7 +709,7 @@ def alive(server):
 
 @pytest.fixture(scope="module")
 def target():
-    with served(Plain()) as server:
+    with serve_in_background(Plain()) as server:
         yield server
 
 
@@ -768,7 +774,7 @@ def test_after_all_that_it_still_answers_and_has_taken_no_memory(target):
 
 def test_a_client_that_says_nothing_is_sent_away(monkeypatch):
     monkeypatch.setattr(serving, "HANDSHAKE", 0.2)
-    with served(Plain()) as server, raw(server) as connection:
+    with serve_in_background(Plain()) as server, raw(server) as connection:
         with pytest.raises(ConnectionClosed):
             connection.recv(timeout=20)
         alive(server)
@@ -782,7 +788,7 @@ def test_told_to_end_it_finishes_what_it_has_taken_and_takes_no_more():
     model = Plain(lambda observations: gate.wait(20) and None)
     with remote(model) as (client, server), ThreadPoolExecutor(1) as pool:
         answer = pool.submit(ask, client, 8)
-        wait_for(lambda: server.taken == 8 and len(model.rows) == 1)
+        wait_for(lambda: server.pending_rows == 8 and len(model.rows) == 1)
         server._loop.call_soon_threadsafe(server.end)
         with raw(server) as late:
             greeted(late)
@@ -866,7 +872,7 @@ def test_what_nobody_waits_for_is_not_begun():
     queue = filled(job(0, expires=1.0), job(1, expires=3.0), clock=clock)
     clock.now = 2.0
     assert [one.id for one in queue.due()[0]] == [b"1"]
-    assert [one.id for one in queue.expired()] == [b"0"]
+    assert [one.id for one in queue.take_expired()] == [b"0"]
     assert len(queue) == 1
 
 
@@ -932,13 +938,13 @@ def test_a_client_that_does_not_read_fills_no_memory_and_is_sent_away(monkeypatc
     monkeypatch.setattr(outbox, "UNSENT_BYTES", 3 * ANSWER)
     monkeypatch.setattr(serving, "UNREAD", 1.0)
     peak = 0
-    with served(Pictures()) as server, unread(server) as client:
+    with serve_in_background(Pictures()) as server, unread(server) as client:
 
         def insist():
             with contextlib.suppress(ConnectionClosed):
                 if known:
                     client.send(encode(large_ask(0)))
-                    wait_for(lambda: server.worker.rows == 1 and not server.taken)
+                    wait_for(lambda: server.worker.rows == 1 and not server.pending_rows)
                 for number in range(100):
                     client.send(encode(large_ask(0, 0 if known else number)))
 
@@ -958,11 +964,11 @@ def test_a_client_that_does_not_read_fills_no_memory_and_is_sent_away(monkeypatc
 
 def test_a_client_that_reads_late_gets_all_answers(monkeypatch):
     monkeypatch.setattr(outbox, "UNSENT_BYTES", 2 * ANSWER)
-    with served(Pictures()) as server, unread(server) as client:
+    with serve_in_background(Pictures()) as server, unread(server) as client:
         asks = {said.id: said for said in (large_ask(shade) for shade in range(8))}
         for said in asks.values():
             client.send(encode(said))
-        wait_for(lambda: server.taken == 0 and server.worker.rows == len(asks))
+        wait_for(lambda: server.pending_rows == 0 and server.worker.rows == len(asks))
         answers, waited = {}, 0
         while len(answers) < len(asks):
             heard = decode(client.recv(20))

@@ -16,7 +16,7 @@ from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.sources import require_sources, source_digests
 from wiw.runs.store import store_path
 from wiw.runs.verify import verify
-from wiw.serving.background import served
+from wiw.serving.background import serve_in_background
 from wiw.studies.evaluate import evaluate, resume_run
 
 MODEL = """
@@ -142,6 +142,6 @@ def test_a_served_model_without_a_version_is_told_apart_by_its_files(folder: Pat
     said = []
     for text in (MODEL, MODEL, MODEL + "# edited\n"):
         (folder / "own.py").write_text(text)
-        with served(wiw.world_model(f"{folder}/own.py:Own")) as server:
+        with serve_in_background(wiw.world_model(f"{folder}/own.py:Own")) as server:
             said.append(wiw.world_model(f"remote:{server.address}").describe()["model"]["sources"])
     assert said[0] == said[1] != said[2] and set(said[0]) == {"own.py", "shades.py"}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from wiw.errors import PromptError
-from wiw.policies.vlm.prompts import ARM_SLOTS, FOLDER, SLOTS, Prompts, tasks
+from wiw.policies.vlm.prompts import ARM_SLOTS, FOLDER, SLOTS, Prompts, list_tasks
 
 LOOP = "{% for a in range(99999) %}"
 
@@ -60,7 +60,7 @@ def test_raw_and_comment_blocks_that_end_are_fine(tmp_path: Path) -> None:
     assert Prompts(tmp_path).text("imagenav", "planner", **SLOTS) == "{{ braces }} 1"
 
 
-@pytest.mark.parametrize("task", tasks())
+@pytest.mark.parametrize("task", list_tasks())
 def test_shipped_templates_say_the_same_as_a_users(tmp_path: Path, task: str) -> None:
     slots = ARM_SLOTS if task == "manipulation" else SLOTS
     (tmp_path / task).mkdir()

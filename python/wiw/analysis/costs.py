@@ -99,7 +99,7 @@ class Costs:
 def costs(run: Run) -> list[Costs]:
     """Return the costs of each arm of a run; arms without an ended episode are left out."""
     calls, spent, seconds = (run.store.totals(column) for column in ("calls", "spent", "seconds"))
-    lost = run.store.lost()
+    lost = run.store.sum_lost_costs()
     ended: dict[str, list[float]] = {}
     for outcome in run.store.outcomes():
         ended.setdefault(outcome["arm"], []).append(float(outcome["metrics"].get("success", 0.0)))

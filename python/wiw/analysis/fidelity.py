@@ -76,7 +76,7 @@ def fidelity(run: Run) -> list[ArmFidelity]:
     return [line for arm in run.arms if (line := _arm(run, arm)) is not None]
 
 
-def shown_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
+def choose_columns(lines: Sequence[ArmFidelity]) -> list[Column]:
     """Return all columns, without LPIPS where no arm has it."""
     return [column for column in COLUMNS if column.name != "lpips" or not all(math.isnan(o.lpips) for o in lines)]
 

@@ -103,7 +103,7 @@ RENAMED_OPTIONS = {"--retry-failed": "--retry-errors"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code: 0, 1 (the run is invalid), 2 (error), 75 or 130 (stopped)."""
+    """Run one command and return its exit code: 0, 1 (the run is invalid), 2 (error), 75 or 130 (stopped)."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in given
     given = [RENAMED_OPTIONS.get(argument, argument) for argument in given if argument != "--debug"]

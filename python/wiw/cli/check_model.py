@@ -25,7 +25,7 @@ def check_model(
     scenes: Annotated[str, arg(metavar="SPEC")] = "apartments:val:1",
     deadline: Annotated[float, arg(metavar="SECONDS")] = 300.0,
 ) -> int:
-    """Asks a world model a few rollouts, and says in plain words what is wrong with its answers.
+    """Ask a world model a few rollouts, and say in plain words what is wrong with its answers.
 
     $ wiw check-model my_model.py:MyModel
     $ wiw check-model svd --world-model-option steps=2

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.stop import begun_again
+from wiw.cli.stop import announce_resume
 
 
 def collect(
@@ -28,7 +28,7 @@ def collect(
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Collects demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
+    """Collect demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
 
     $ wiw collect manipulation --out demos --workers 4
     $ wiw collect manipulation --tasks push_buttons,stack_cups --episodes 20 --size 128 --frames 60 --depth --out few
@@ -57,7 +57,7 @@ def collect(
     began = time.monotonic()
     what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
     how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
-    with begun_again(), _Bars() as bars:
+    with announce_resume(), _Bars() as bars:
         made = collect(out, tasks, workers=workers, progress=bars, **what_of_it, **how_seen)
     megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
     failed = sum(made.failed.values())

@@ -78,7 +78,7 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
 
 
 def _run(part: Part, folder: Path) -> int:
-    """One part, with its table and report; its exit code."""
+    """Run one part, with its table and report; return its exit code."""
     from wiw.cli.run import finish
     from wiw.cli.stop import stoppable
     from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -95,7 +95,7 @@ def _run(part: Part, folder: Path) -> int:
 
 
 def _arms(names: tuple[str, ...]) -> list[str]:
-    """Those that can run here; says which is left out, and why."""
+    """Return the arms that can run here; say which is left out, and why."""
     from wiw.registry import WORLD_MODELS
 
     arms = []

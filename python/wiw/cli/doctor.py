@@ -24,7 +24,7 @@ class Finding:
 
 
 def doctor() -> int:
-    """Says what this machine can do, line by line, with a remedy where something is missing.
+    """Say what this machine can do, line by line, with a remedy where something is missing.
 
     $ wiw doctor
     """
@@ -45,7 +45,7 @@ def doctor() -> int:
 
 
 def examine() -> Iterator[Finding]:
-    """All findings, in the order in which they are shown."""
+    """Return all findings, in the order in which they are shown."""
     yield from _software()
     yield from _processor()
     yield _memory()
@@ -115,7 +115,7 @@ def _rendering() -> Iterator[Finding]:
 
 
 def _torch() -> Finding:
-    """Whether torch is there, without importing it: that takes seconds."""
+    """Return whether torch is there, without importing it: that takes seconds."""
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
     return Finding("torch", _version("torch") or "of unknown version")
@@ -130,7 +130,7 @@ def _writable(name: str, folder: Path) -> Finding:
 
 
 def _cache() -> Finding:
-    """The folder of imported and generated scenes: where it is, what it holds, whether it can grow."""
+    """Return the folder of imported and generated scenes: where it is, what it holds, whether it can grow."""
     from wiw.scenes.store import folder, limit
 
     cache = folder()

@@ -24,7 +24,7 @@ def episodes(
     task_option: Options = (),
     overwrite: bool = False,
 ) -> int:
-    """Generates the episodes of a task and writes them to a file, which `wiw run --episode-file` takes.
+    """Generate the episodes of a task and write them to a file, which `wiw run --episode-file` takes.
 
     $ wiw episodes imagenav --scenes apartments:val:20 --episodes 100 --out val.json.gz
     $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json

@@ -19,7 +19,7 @@ FILES = ("weights", "checkpoint", "vae")
 """Options that are files or folders although they are annotated as text, since they may be names on a hub too."""
 
 
-def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict[str, Any]:
+def parse_options(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict[str, Any]:
     """`["steps=30", "size=[480, 480]"]` as options of a factory.
 
     A value is read as YAML (number, true, [list], text); it stays text where the factory's parameter is annotated as
@@ -46,7 +46,7 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
             value = f"[{value}]"
         default = parameters[name].default if name in parameters else None
         names_files = (name in FILES or re.search(r"\bPath\b", annotation)) and value != default
-        path = _rooted(value) if names_files else None
+        path = _make_absolute(value) if names_files else None
         try:
             options[name] = path or (value if annotation.startswith("str") else yaml.safe_load(value))
         except yaml.YAMLError as error:
@@ -54,8 +54,8 @@ def parsed(pairs: Sequence[str], factory: Callable[..., Any], flag: str) -> dict
     return options
 
 
-def _rooted(value: str) -> str | None:
-    """The absolute path of a file or folder that is there."""
+def _make_absolute(value: str) -> str | None:
+    """Return the absolute path of a file or folder that is there."""
     try:
         path = Path(value).expanduser()
         return str(path.resolve()) if value and path.exists() else None
@@ -64,7 +64,7 @@ def _rooted(value: str) -> str | None:
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """What `--world-model-option` gives a world model.
+    """Return what `--world-model-option` gives a world model.
 
     Raises:
         ArgumentError: options without a model to take them.
@@ -73,22 +73,25 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
 
     if pairs and model is None:
         raise ArgumentError("--world-model-option: name the model that takes it with --world-model")
-    return parsed(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
+    return parse_options(pairs, WORLD_MODELS.find(model), "--world-model-option") if model and pairs else {}
 
 
 def policy_options(
     policy: str, pairs: Sequence[str], beside: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Mapping[str, Any]]:
-    """What policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
+    """Return what policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
     from wiw.registry import POLICIES
 
     if not pairs:
         return dict(beside)
-    return {**beside, policy: {**beside.get(policy, {}), **parsed(pairs, POLICIES.find(policy), "--policy-option")}}
+    return {
+        **beside,
+        policy: {**beside.get(policy, {}), **parse_options(pairs, POLICIES.find(policy), "--policy-option")},
+    }
 
 
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """What `--semantics-option` gives a source of semantics.
+    """Return what `--semantics-option` gives a source of semantics.
 
     Raises:
         ArgumentError: options without a source to take them.
@@ -97,18 +100,18 @@ def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any
 
     if pairs and source in (None, "simulator"):
         raise ArgumentError("--semantics-option: name the source that takes it with --semantics, such as rednet")
-    return parsed(pairs, SEMANTICS.find(str(source)), "--semantics-option") if pairs else {}
+    return parse_options(pairs, SEMANTICS.find(str(source)), "--semantics-option") if pairs else {}
 
 
 def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
-    """What a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
+    """Return what a task is made with: what its `flags` say, and what `--task-option` gives beyond them.
 
     Raises:
         ArgumentError: an option that has a flag of its own.
     """
     from wiw.registry import TASKS
 
-    options = parsed(pairs, TASKS.find(task), "--task-option") if pairs else {}
+    options = parse_options(pairs, TASKS.find(task), "--task-option") if pairs else {}
     for name in options:
         if name in flags:
             raise ArgumentError(f"--task-option: '{name}' has a flag of its own, --{name.replace('_', '-')}")
@@ -116,7 +119,7 @@ def task_options(task: str, pairs: Sequence[str], flags: Mapping[str, Any]) -> d
 
 
 def default_policy(task: str) -> str:
-    """What runs a task where `--policy` names nothing.
+    """Return what runs a task where `--policy` names nothing.
 
     Raises:
         ArgumentError: the task names none either.

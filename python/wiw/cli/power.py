@@ -56,16 +56,16 @@ def power(
     """
     from wiw.analysis.power import power as plan
 
-    def planned(points: float | None, scenes: int | None = None) -> Power:
+    def plan_power(points: float | None, scenes: int | None = None) -> Power:
         return plan(
             points, scenes=scenes, base=base, losses=losses, correlation=correlation, per_scene=per_scene,
             chance=chance, arms=arms,
         )  # fmt: skip
 
     if difference is not None or scenes is not None:
-        print(planned(difference, scenes))
+        print(plan_power(difference, scenes))
         return 0
-    _table([planned(points) for points in USUAL if base + points + losses <= 100], chance)
+    _table([plan_power(points) for points in USUAL if base + points + losses <= 100], chance)
     return 0
 
 

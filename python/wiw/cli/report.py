@@ -15,7 +15,7 @@ def report(
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Print the tables of a run and writes its HTML report: one self-contained file.
+    """Print the tables of a run and write its HTML report: one self-contained file.
 
     $ wiw report runs/first
     $ wiw report runs/first --out first.html

@@ -56,7 +56,7 @@ def run(
     search: Annotated[AgentConfig, arg(name="")] = SEARCH,
     config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
-    """Runs an agent on a task, with one world model or with several on the same episodes.
+    """Run an agent on a task, with one world model or with several on the same episodes.
 
     $ wiw run imagenav --world-model warp --episodes 50
     $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
@@ -142,7 +142,7 @@ def resume(
     retry_errors: bool = False,
     report: bool = True,
 ) -> int:
-    """Goes on with a run that was stopped: only the episodes that have not ended are run.
+    """Go on with a run that was stopped: only the episodes that have not ended are run.
 
     $ wiw resume runs/first
 
@@ -181,7 +181,7 @@ def finish(log: Any, report: bool) -> int:
 
 
 def vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
-    """Options of policy vlm; its own address, so that the record says where it asked."""
+    """Return options of policy vlm; its own address, so that the record says where it asked."""
     from wiw.errors import ArgumentError
 
     named = {name: value for name, value in given.items() if value is not None}

@@ -17,7 +17,7 @@ def scenes(
     views: Annotated[int, arg(metavar="N")] = 2,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
 ) -> int:
-    """Loads scenes, says how large they are, and draws a sheet: each from above, and panoramas from inside.
+    """Load scenes, say how large they are, and draw a sheet: each from above, and panoramas from inside.
 
     $ wiw scenes apartments:val:4
     $ wiw scenes house.glb --out house.png

@@ -32,7 +32,7 @@ def serve(
     key: Annotated[Path | None, arg(metavar="FILE")] = None,
     grace: Annotated[float, arg(metavar="SECONDS")] = 30.0,
 ) -> int:
-    """Serves a world model to runs in other processes or on other machines.
+    """Serve a world model to runs in other processes or on other machines.
 
     $ wiw serve warp
     $ wiw run imagenav --world-model remote:ws://127.0.0.1:8765 --workers 4 --live 8
@@ -67,7 +67,7 @@ def serve(
 
 
 async def _live(server: Any, name: str) -> None:
-    """Serves until a signal comes, and says how it goes."""
+    """Serve until a signal comes, and say how it goes."""
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
     serving = asyncio.ensure_future(server.run(ready.set))
@@ -76,7 +76,7 @@ async def _live(server: Any, name: str) -> None:
         nonlocal signals
         signals += 1
         if signals == 1:
-            left = f"finishing {server.taken} rows that were taken" if server.taken else "ending"
+            left = f"finishing {server.pending_rows} rows that were taken" if server.pending_rows else "ending"
             print(f"\nwiw serve: {left}", file=sys.stderr, flush=True)
             server.end()
         else:

@@ -14,7 +14,7 @@ def serve_vlm(
     port: Annotated[int, arg(metavar="N")] = 8000,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Serves a vision-language model to this machine, in the way of OpenAI and vLLM, for tests and trials.
+    """Serve a vision-language model to this machine, in the way of OpenAI and vLLM, for tests and trials.
 
       $ wiw serve-vlm
       $ wiw serve-vlm --model my_script.py:answer --port 8001

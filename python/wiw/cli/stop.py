@@ -43,7 +43,7 @@ def end_process(code: int) -> NoReturn:
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Raises `Terminated` at the first SIGTERM; ends the process where the work does not get to it, as inside a model.
+    """Raise `Terminated` at the first SIGTERM; end the process where the work does not get to it, as inside a model.
 
     Python runs signal handlers between two of its own instructions, so a thread, told through a pipe, watches over it.
     """
@@ -96,8 +96,8 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
 
 
 @contextmanager
-def begun_again() -> Iterator[None]:
-    """Around work that keeps what it has finished: when it is stopped, says that the same command goes on with it."""
+def announce_resume() -> Iterator[None]:
+    """Run work that keeps what it has finished; when it is stopped, say that the same command goes on with it."""
     try:
         yield
     except (KeyboardInterrupt, Terminated):

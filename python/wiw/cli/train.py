@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from wiw.cli.stop import begun_again
+from wiw.cli.stop import announce_resume
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet"), ("armnet",), ("armnet", "diffuser")
@@ -117,7 +117,7 @@ def train(
     rules, recipe = _drop_none({"places": places}), _drop_none({"epochs": epochs})
     if what in ON_SCENES:
         _check_scenes(data.scenes, data.val)
-    with begun_again():
+    with announce_resume():
         if what == "recogniser":
             _train_recogniser(out, data, categories, minutes, rules, recipe)
         elif what == "diffuser":

@@ -16,7 +16,7 @@ def verify(
     episodes: Annotated[int, arg(metavar="K")] = 3,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Runs some episodes of a run again, in all its arms, and compares what is decided and measured with the record.
+    """Run some episodes of a run again, in all its arms, and compare what is decided and measured with the record.
 
     $ wiw verify runs/first
     $ wiw verify runs/first --episodes 10 --seed 1

@@ -167,7 +167,7 @@ def generate(
                 made.append(episode)
                 tally[category] += 1
             if len(made) == count:
-                return [_numbered(episode, first + i) for i, episode in enumerate(made)]
+                return [_number_episode(episode, first + i) for i, episode in enumerate(made)]
     raise ArgumentError(
         f"{world.name}: only {len(made)} of {count} targets and starts satisfy {rules}; ask for fewer in a scene"
     )
@@ -329,7 +329,7 @@ def _reachable(
     return world.ground.put_down(np.stack(found)).astype(np.float64), np.array(spent)
 
 
-def _numbered(episode: Episode, index: int) -> Episode:
+def _number_episode(episode: Episode, index: int) -> Episode:
     return replace(episode, episode_id=f"{index:04d}")
 
 

@@ -63,7 +63,7 @@ class Demonstrations(Sequence[Demonstration]):
         self.folder = Path(folder)
         self.config = read_manifest(self.folder)
         """Options of the collection."""
-        paths = [path for task in self._asked(tasks) for path in shard_paths(self.folder, self.config, task)]
+        paths = [path for task in self._resolve_tasks(tasks) for path in shard_paths(self.folder, self.config, task)]
         self._shards = [Shard(path) for path in paths if not partial or path.exists()]
         self._ends = list(accumulate(len(shard) for shard in self._shards))
 
@@ -71,7 +71,7 @@ class Demonstrations(Sequence[Demonstration]):
         return self._ends[-1] if self._ends else 0
 
     def __getitem__(self, index: Any) -> Any:
-        """One demonstration, or a list of those of a slice.
+        """Return one demonstration, or a list of those of a slice.
 
         Raises:
             FileError: its file is damaged.
@@ -97,7 +97,7 @@ class Demonstrations(Sequence[Demonstration]):
 
     @property
     def camera(self) -> FrontCamera:
-        """Of the front view.
+        """Camera of the front view.
 
         Raises:
             FileError: nothing has been collected yet.
@@ -107,7 +107,7 @@ class Demonstrations(Sequence[Demonstration]):
         facts = self._shards[0].facts["camera"]
         return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
 
-    def _asked(self, tasks: str | Sequence[str]) -> list[str]:
+    def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:
         known = self.config["tasks"]
         names = known if tasks == "all" else tasks.split(",") if isinstance(tasks, str) else list(tasks)
         if unknown := [name for name in names if name not in known]:
@@ -116,7 +116,7 @@ class Demonstrations(Sequence[Demonstration]):
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """What was asked for when a folder was collected.
+    """Return the settings with which a folder was collected.
 
     Raises:
         FileError: there is no manifest, or none that can be read.
@@ -136,23 +136,23 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def shard_paths(folder: Path, config: Mapping[str, Any], task: str) -> list[Path]:
-    """The files of a task, of `SHARD` demonstrations each but for the last."""
+    """Return the files of a task, of `SHARD` demonstrations each but for the last."""
     return [folder / f"{task}-{number:05d}.parquet" for number in range(-(-config["episodes"] // SHARD))]
 
 
 def shard_range(number: int, episodes: int) -> range:
-    """Which of so many demonstrations are in a file."""
+    """Return the range of demonstrations in a file, of so many in all."""
     return range(SHARD * number, min(SHARD * (number + 1), episodes))
 
 
-def encoded_image(image: NDArray[np.uint8], kind: Format) -> bytes:
-    """A picture as JPEG or PNG."""
+def encode_image(image: NDArray[np.uint8], kind: Format) -> bytes:
+    """Encode a picture as JPEG or PNG."""
     fine = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY, *fine] if kind == "jpeg" else []
     return bytes(cv2.imencode(f".{kind}", image[..., ::-1], options)[1])
 
 
-def encoded_depth(depth: NDArray[np.float32]) -> bytes:
-    """Metres as a 16-bit PNG; what is further away than 13 m is as far."""
+def encode_depth(depth: NDArray[np.float32]) -> bytes:
+    """Encode metres as a 16-bit PNG; what is further away than 13 m is as far."""
     units = np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16)
     return bytes(cv2.imencode(".png", units)[1])

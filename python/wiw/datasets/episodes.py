@@ -58,7 +58,7 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
 
 
 def _scene(name: str, folder: Path, where: str) -> str:
-    """The spec of one scene, from its name in a file whose paths are relative to `folder`."""
+    """Return the spec of one scene, from its name in a file whose paths are relative to `folder`."""
     try:
         if is_generated(name) and resolve(name) != [name]:
             raise ValueError("expected a single one, such as apartments:val/3")

@@ -22,7 +22,7 @@ _UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeErr
 
 
 def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
-    """Heading in radians, left positive, of a rotation about the vertical.
+    """Return the heading in radians, left positive, of a rotation about the vertical.
 
     Raises:
         FileError: not four numbers, not of unit length, or tilted by more than 5 degrees; names `where`.
@@ -39,18 +39,18 @@ def yaw_of(quaternion: Sequence[float], order: Order, where: str) -> float:
 
 
 def is_habitat(body: Any) -> bool:
-    """Whether a parsed file has the layout of habitat-lab's navigation episodes."""
+    """Return whether a parsed file has the layout of habitat-lab's navigation episodes."""
     return "start_rotation" in _first(body, "episodes")
 
 
 def _first(body: Any, name: str) -> Mapping[str, Any]:
-    """The first object of a list in a parsed file; an empty one where there is no such list."""
+    """Return the first object of a list in a parsed file; an empty one where there is no such list."""
     items = body.get(name) if isinstance(body, Mapping) else None
     return items[0] if isinstance(items, list) and items and isinstance(items[0], Mapping) else {}
 
 
 def read_habitat(body: Mapping[str, Any], path: str) -> list[Episode]:
-    """Episodes of habitat-lab (`start_rotation` in order xyzw); scenes are relative to its scene folder.
+    """Read episodes of habitat-lab (`start_rotation` in order xyzw); scenes are relative to its scene folder.
 
     Habitat derives an ImageNav goal's heading from a hash that differs between processes. Here it is the heading of
     `goals[0].rotation` where the file has one, else a function of the episode's id.
@@ -81,7 +81,7 @@ def _habitat(item: Mapping[str, Any], where: str) -> Episode:
 
 
 def is_world_in_world(body: Any) -> bool:
-    """Whether a parsed file has the layout of World-in-World's published ImageNav episodes."""
+    """Return whether a parsed file has the layout of World-in-World's published ImageNav episodes."""
     return "goal_image_relpath" in _first(body, "data")
 
 
@@ -115,12 +115,12 @@ def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
 
 
 def is_active_recognition(body: Any) -> bool:
-    """Whether a parsed file has the layout of World-in-World's published Active Recognition episodes."""
+    """Return whether a parsed file has the layout of World-in-World's published Active Recognition episodes."""
     return "target_id" in _first(body, "episodes")
 
 
 def read_active_recognition(body: Mapping[str, Any], path: str) -> list[Episode]:
-    """Episodes of the published AR file (`start_rotation` in order wxyz, the category's key misspelt).
+    """Read episodes of the published AR file (`start_rotation` in order wxyz, the category's key misspelt).
 
     Scene paths are those of the authors' disk, so that only folder and file name are kept, relative to the scene
     folder. The place of a target is known by its instance alone; until the scene tells, the goal's position is NaN.
@@ -152,5 +152,5 @@ def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
 
 
 def heading_of(name: str) -> float:
-    """A heading in [0, 2 pi) that is a function of an episode's id, the same on every machine and in every process."""
+    """Derive a heading in [0, 2 pi) from an episode's id, the same on every machine and in every process."""
     return float(2 * np.pi * core.uniform(core.fold_key(list(name.encode())), 1)[0])

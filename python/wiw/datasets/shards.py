@@ -39,7 +39,7 @@ REPEATED = ("task", "instruction", "places")
 
 
 def require_pyarrow() -> None:
-    """Sees that files can be read and written.
+    """Check that files can be read and written.
 
     Raises:
         DependencyError: pyarrow is not installed.
@@ -51,7 +51,7 @@ def require_pyarrow() -> None:
 
 
 def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[str, Any]) -> None:
-    """Writes a file, which is there whole or not at all.
+    """Write a file, which is there whole or not at all.
 
     Args:
         path: of the file; what it held is replaced.
@@ -88,7 +88,7 @@ class Shard:
         except FileNotFoundError as error:
             raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
         except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
-            raise _damaged(path, error) from error
+            raise _build_damage_error(path, error) from error
         if self.facts.get("format") != FORMAT:
             raise FileError(f"{path}: expected demonstrations of format {FORMAT}, got {self.facts.get('format')}")
 
@@ -96,7 +96,7 @@ class Shard:
         return int(self._metadata.num_row_groups)
 
     def __getitem__(self, index: int) -> Demonstration:
-        """A demonstration, whose pictures are not yet decoded.
+        """Return a demonstration, whose pictures are not yet decoded.
 
         Raises:
             FileError: the file is damaged.
@@ -107,10 +107,10 @@ class Shard:
             with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
                 return _demonstration(file.read_row_group(index).to_pydict())
         except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
-            raise _damaged(self.path, error) from error
+            raise _build_damage_error(self.path, error) from error
 
 
-def _damaged(path: Path, error: Exception) -> FileError:
+def _build_damage_error(path: Path, error: Exception) -> FileError:
     return FileError(
         f"{path}: expected a whole file of demonstrations, got a damaged one ({error}); delete it, then `wiw collect`, "
         "asked for the same again, makes it anew"
@@ -147,7 +147,7 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
 
 
 def _features(types: Mapping[str, Any]) -> dict[str, Any]:
-    """What the library `datasets` is told of columns, so that it decodes pictures by itself."""
+    """Return what the library `datasets` is told of columns, so that it decodes pictures by itself."""
     import pyarrow as pa
 
     def feature(kind: Any) -> dict[str, Any]:

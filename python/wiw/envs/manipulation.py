@@ -93,7 +93,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self.begin(self.task.episode(int(index)))
         self._next, self._key = int(index) + 1, Key(self.task.seed, int(index))
         info = {"key": self._key, "instruction": self.goal.text, "objects": tuple(self.table.objects)}
-        return self._sensed(), info
+        return self._read_sensors(), info
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Go to one pose, which is a decision of its own.
@@ -107,7 +107,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         info: dict[str, Any] = {"key": segment.key, "refused": segment.refused}
         if segment.terminated or segment.truncated:
             info["result"] = self.result()
-        return self._sensed(), float(segment.terminated), segment.terminated, segment.truncated, info
+        return self._read_sensors(), float(segment.terminated), segment.terminated, segment.truncated, info
 
     def render(self) -> NDArray[np.uint8]:
         """Return the front view."""
@@ -198,7 +198,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self._observation = ArmObservation(self._front["color"], bench.pose, depth, places)
         return self._observation
 
-    def _sensed(self) -> dict[str, Any]:
+    def _read_sensors(self) -> dict[str, Any]:
         """The observation as gymnasium knows it, with what the loop has no use for."""
         return self.sensors.read(self.table.bench, self.table.objects, self._front)
 

@@ -127,7 +127,7 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
 
 
 def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Kendall's tau-b of two scorings of the same plans; NaN where one of them tells nothing apart."""
+    """Return Kendall's tau-b of two scorings of the same plans; NaN where one of them tells nothing apart."""
     from scipy.stats import kendalltau
 
     if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:
@@ -136,7 +136,7 @@ def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> fl
 
 
 def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:
-    """Mean PSNR and SSIM over the frames that were imagined; NaN where all are the real view turned."""
+    """Return mean PSNR and SSIM over the frames that were imagined; NaN where all are the real view turned."""
     made = ~imagined.real
     if not made.any():
         return math.nan, math.nan

@@ -102,7 +102,7 @@ class Agent(BaseAgent):
 
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
-        """What observations must carry beyond images: "depth"."""
+        """Inputs that observations must carry beyond images: "depth"."""
         return self.components.needs
 
     def count_spent(self) -> Counter[str]:

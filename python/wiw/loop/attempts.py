@@ -71,7 +71,7 @@ class Attempted(WorldModel):
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What was asked so far, on top of what the model says itself.
+        """Requests so far, on top of what the model says itself.
 
         `calls` that the model has answered or not, their `rows` and `frames` (padding and frames that other rows answer
         left out), and `retries`, calls that repeat one that gave nothing.
@@ -101,7 +101,7 @@ class Attempted(WorldModel):
             try:
                 return self.once(observations, controls, seeds)
             except Exception as error:
-                said.append(_said(error))
+                said.append(_describe_error(error))
                 in_vain = isinstance(error, ContractError) and said.count(said[-1]) > 1
                 if attempt + 1 == TRIES or in_vain:
                     raise self._failure(error, said) from error
@@ -226,7 +226,7 @@ class _Helper:
         weakref.finalize(self, self._errands.put, None)
 
     def idle(self, seconds: float) -> bool:
-        """Whether the thread is free, or becomes so in time."""
+        """Return whether the thread is free, or becomes so in time."""
         return self._last is None or self._last.ended.wait(seconds)
 
     def do(self, work: Callable[[], Any], seconds: float) -> Any:
@@ -246,13 +246,13 @@ def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
         del errand  # else its frames would stay until the next one comes
 
 
-def _said(error: Exception) -> str:
+def _describe_error(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
 
 
 def _torch_state() -> tuple[bool, bool, int | None] | None:
-    """What torch keeps for each thread: gradients, inference mode, GPU."""
+    """Return what torch keeps for each thread: gradients, inference mode, GPU."""
     torch = sys.modules.get("torch")
     if torch is None:
         return None
@@ -262,7 +262,7 @@ def _torch_state() -> tuple[bool, bool, int | None] | None:
 
 @contextmanager
 def _as_in(state: tuple[bool, bool, int | None] | None) -> Iterator[None]:
-    """The asking thread's torch state, in the helper's."""
+    """Apply the asking thread's torch state, in the helper's."""
     with ExitStack() as stack:
         if state is not None:
             torch, (gradients, inference, gpu) = sys.modules["torch"], state

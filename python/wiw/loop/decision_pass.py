@@ -39,7 +39,7 @@ class Components:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """What observations must carry beyond images: "depth"."""
+        """Inputs that observations must carry beyond images: "depth"."""
         return tuple(sorted({*self.policy.needs, *self.reviser.needs, *self.imaginer.needs}))
 
     def count_spent(self) -> Counter[str]:

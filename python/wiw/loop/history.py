@@ -199,13 +199,13 @@ def stack_histories(rows: Sequence[Sequence[Frame]], most: int) -> History:
     return History(
         images=np.stack([[frame.image for frame in row] for row in padded]),
         poses=poses if poses.shape[-1] == 7 else relative_poses(poses),
-        actions=_padded_actions(padded, lengths),
+        actions=_pad_actions(padded, lengths),
         lengths=lengths,
         count=np.array([len(row) for row in kept], np.int64),
     )
 
 
-def _padded_actions(rows: Sequence[Sequence[Frame]], lengths: NDArray[np.int64]) -> NDArray[Any]:
+def _pad_actions(rows: Sequence[Sequence[Frame]], lengths: NDArray[np.int64]) -> NDArray[Any]:
     longest = max(1, int(lengths.max(initial=0)))
     poses = rows[0][0].actions.ndim == 2
     actions = np.zeros((*lengths.shape, longest, *((7,) if poses else ())), np.float64 if poses else np.int8)

@@ -87,7 +87,7 @@ class NothingImagined(Imagination):
         self.costs: list[Mapping[str, int]] = [{}] * episodes
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
-        """There is nothing to show."""
+        """Show nothing."""
         return [[] for _ in self.rollouts]
 
 
@@ -111,17 +111,17 @@ class Imaginer(ABC):
 
     @property
     def needs(self) -> frozenset[str]:
-        """What observations must carry beyond images: "depth"."""
+        """Inputs that observations must carry beyond images: "depth"."""
         return frozenset() if self.model is None else frozenset(self.model.accepts.needs) & {"depth"}
 
     @property
     def gives(self) -> frozenset[str]:
-        """What the model is given beside its observations: "semantic"."""
+        """Inputs of the model beside its observations: "semantic"."""
         return frozenset()
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What the model was asked for so far, for the cost ledger."""
+        """Requests to the model so far, for the cost ledger."""
         return {} if self.model is None else self.model.spent
 
     def consults(self, key: Key) -> bool:

@@ -108,7 +108,7 @@ def make_model_spec(accepts: Accepts) -> Any:
 
 
 def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:
-    """What each row begins with: the real observation after the plan's leading turns, in the model's view and size."""
+    """Build each row's start: the real observation after the plan's leading turns, in the model's view and size."""
     maker = maker_of(accepts)
     depth = simulators = None
     if "depth" in accepts.needs:
@@ -151,7 +151,7 @@ def _turn(simulator: Any, turns: int) -> Any:
 
 
 def _at_start(whole: Conditioning, part: Any, answers: Sequence[NDArray[np.uint8]], accepts: Accepts) -> Conditioning:
-    """The rows of one call; a call that continues a long plan begins at the frame where the one before ended."""
+    """Return the rows of one call; a call that continues a long plan begins at the frame where the one before ended."""
     if part.first == 0:
         rows = _slice_of(part.rows)
         depth = None if whole.depth is None else whole.depth[rows]
@@ -174,7 +174,7 @@ def _require_own_memory(found: NDArray[np.uint8], before: Sequence[NDArray[np.ui
 
 
 def _slice_of(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
-    """The rows as a slice where they are consecutive, so that taking them copies nothing."""
+    """Return the rows as a slice where they are consecutive, so that taking them copies nothing."""
     first, last = int(rows[0]), int(rows[-1])
     return slice(first, last + 1) if last - first + 1 == len(rows) else rows
 
@@ -227,7 +227,7 @@ def _seeds(batch: Any, keys: Sequence[Key], origins: Sequence[Sequence[int]]) ->
 
 
 def _cost(batch: Any, episodes: int) -> list[dict[str, int]]:
-    """Rows asked of the world model for each episode and frames of them that no other row answers."""
+    """Count rows asked of the world model for each episode and frames of them that no other row answers."""
     rows = np.bincount(batch.row_episode, minlength=episodes)
     frames = np.bincount(batch.row_episode, batch.row_length - batch.row_shared, minlength=episodes)
     return [{"consultations": 1, "rows": int(r), "frames": int(f)} for r, f in zip(rows, frames, strict=True)]

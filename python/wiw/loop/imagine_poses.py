@@ -106,7 +106,7 @@ def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64]) -> Con
 
 
 def _parts(rows: Sequence[_Row], most: int) -> Iterator[list[int]]:
-    """Rows of equal length, in calls of at most `most`."""
+    """Return rows of equal length, in calls of at most `most`."""
     order = sorted(range(len(rows)), key=lambda i: rows[i].control.length)
     for _, same in groupby(order, key=lambda i: rows[i].control.length):
         places = list(same)

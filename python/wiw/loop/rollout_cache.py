@@ -42,7 +42,7 @@ _CHANNELS = 3
 
 
 def default_folder() -> Path:
-    """Where rollouts are kept: `$WIW_CACHE/rollouts`, or `~/.cache/wiw/rollouts`. Deleting it is always safe."""
+    """Return where rollouts are kept: `$WIW_CACHE/rollouts`, or `~/.cache/wiw/rollouts`. Deleting it is always safe."""
     root = os.environ.get("WIW_CACHE")
     return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "rollouts"
 
@@ -65,7 +65,7 @@ class RolloutCache:
         self._writing = True
 
     def get(self, key: str, first: int, frames: NDArray[np.uint8]) -> bool:
-        """Fills `frames` [K, H, W, 3] with frames `first`... of an entry; False where there is none that will do."""
+        """Fill `frames` [K, H, W, 3] with frames `first`... of an entry; False where there is none that will do."""
         path = self._path(key)
         try:
             with path.open("rb", buffering=0) as file:
@@ -83,7 +83,7 @@ class RolloutCache:
         return found
 
     def put(self, key: str, first: int, frames: NDArray[np.uint8]) -> None:
-        """Keeps frames `first`... of a row; where that fails a warning says so, and no more is written."""
+        """Keep frames `first`... of a row; where that fails a warning says so, and no more is written."""
         data = np.ascontiguousarray(frames)
         size = _HEADER.size + data.nbytes
         if not self._writing or size > self.budget:
@@ -111,7 +111,7 @@ class RolloutCache:
         return self.folder / key[:2] / f"{key[2:]}.frames"
 
     def _read(self, file: Any, first: int, frames: NDArray[np.uint8]) -> bool:
-        """Raises ValueError where the file is not what was written."""
+        """Read a file's frames; raise ValueError where it is not what was written."""
         header = file.read(_HEADER.size)
         if len(header) != _HEADER.size or zlib.crc32(header[:-4]) != _HEADER.unpack(header)[-1]:
             raise ValueError("its header is cut off or altered")
@@ -131,7 +131,7 @@ class RolloutCache:
         return True
 
     def _trim(self) -> None:
-        """Looks how large the folder is, and makes it a tenth smaller than its budget where it has outgrown it."""
+        """Look how large the folder is, and make it a tenth smaller than its budget where it has outgrown it."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / ".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -146,7 +146,7 @@ class RolloutCache:
         self._known, self._written = total, 0
 
     def _entries(self) -> list[tuple[int, int, str]]:
-        """Last use, bytes and path of each file; drafts that a dead process left behind go after an hour."""
+        """Return last use, bytes and path of each file; drafts that a dead process left behind go after an hour."""
         found = []
         for folder in os.scandir(self.folder):
             for file in os.scandir(folder.path) if folder.is_dir() else ():
@@ -179,7 +179,7 @@ class Cached(WorldModel):
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What the model was asked, and `cached_rows` that it was not."""
+        """Requests to the model, and `cached_rows` that it was not."""
         return {**self.model.spent, "cached_rows": self._cached_rows}
 
     def describe(self) -> dict[str, Any]:
@@ -232,7 +232,7 @@ def cache_rollouts(model: WorldModel, cache: str | Path = "auto", budget_gb: flo
 
 @lru_cache(None)
 def _warn_unversioned(name: str) -> None:
-    """Says once in a process that a model is not cached."""
+    """Say once in a process that a model is not cached."""
     _log.warning(
         "rollouts of %s are not cached: it declares no version. Give the class one, as `version = '1'`, and raise it "
         "whenever its answers change; or leave the cache off",
@@ -258,7 +258,7 @@ def _key(identity: bytes, observations: Conditioning, row: int, control: Control
 
 
 def _rows(whole: Conditioning, rows: Sequence[int]) -> Conditioning:
-    """Some rows of a batch; the batch itself where it is all of them."""
+    """Return some rows of a batch; the batch itself where it is all of them."""
     if len(rows) == len(whole):
         return whole
     index = list(rows)

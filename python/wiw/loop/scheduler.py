@@ -21,16 +21,16 @@ class Sink(Protocol):
     """Receives what happens, in any order over episodes and in order within one."""
 
     def decision(self, record: DecisionRecord) -> None:
-        """One decision was taken and carried out."""
+        """Record a decision that was taken and carried out."""
 
     def episode(self, result: EpisodeResult) -> None:
-        """One episode has ended, or its infrastructure has failed."""
+        """Record that an episode has ended, or its infrastructure has failed."""
 
     def again(self, episodes: Sequence[int]) -> None:
-        """These episodes begin anew; what was reported of them does not count."""
+        """Note that these episodes begin anew; what was reported of them does not count."""
 
-    def lost(self, spent: Mapping[str, float]) -> None:
-        """A decision has failed; what was asked for it, and its "seconds"."""
+    def record_lost(self, spent: Mapping[str, float]) -> None:
+        """Record that a decision has failed; what was asked for it, and its "seconds"."""
 
 
 @dataclass
@@ -116,7 +116,7 @@ def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) ->
         if asks_to_stop(error):
             raise
         envs.append(env)
-        sink.episode(_failed(index, episode, begin, "environment", error))
+        sink.episode(_build_error_result(index, episode, begin, "environment", error))
         return []
     return [Trial(index, episode, env, Key(seed, index), observation, begin)]
 
@@ -134,24 +134,24 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
         if asks_to_stop(error):
             raise
         kind = _kind(error)
-        sink.lost({**(agent.count_spent() - before), "seconds": time.perf_counter() - begin})
+        sink.record_lost({**(agent.count_spent() - before), "seconds": time.perf_counter() - begin})
         for trial in trials:
             trial.done = True
         if len(trials) > 1:
             sink.again([trial.index for trial in trials])
             return [(trial.index, trial.episode) for trial in trials]
-        sink.episode(_failed(trials[0].index, trials[0].episode, trials[0].begin, kind, error))
+        sink.episode(_build_error_result(trials[0].index, trials[0].episode, trials[0].begin, kind, error))
         return []
     for trial, decision in zip(trials, decisions, strict=True):
         try:
             record = trial.carry_out(decision)
-            result = _finished(trial) if trial.done else None
+            result = _build_result(trial) if trial.done else None
         except BaseException as error:
             if asks_to_stop(error):
                 raise
             trial.done = True
-            sink.lost({**decision.spent, "seconds": sum(decision.seconds.values())})
-            sink.episode(_failed(trial.index, trial.episode, trial.begin, "environment", error))
+            sink.record_lost({**decision.spent, "seconds": sum(decision.seconds.values())})
+            sink.episode(_build_error_result(trial.index, trial.episode, trial.begin, "environment", error))
             continue
         sink.decision(record)
         if result is not None:
@@ -165,13 +165,13 @@ def _kind(error: BaseException) -> str:
     return f"vlm/{error.kind}" if isinstance(error, VlmError) else "agent"
 
 
-def _finished(trial: Trial) -> EpisodeResult:
+def _build_result(trial: Trial) -> EpisodeResult:
     metrics = {**trial.env.result(), "decisions": float(trial.decisions)}
     seconds = time.perf_counter() - trial.begin
     return EpisodeResult(trial.index, trial.episode.episode_id, trial.episode.scene, "done", metrics, seconds)
 
 
-def _failed(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
+def _build_error_result(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:
     text = "".join(traceback.format_exception(error))
     seconds = time.perf_counter() - begin
     return EpisodeResult(index, episode.episode_id, episode.scene, "error", {}, seconds, text, kind)

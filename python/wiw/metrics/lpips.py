@@ -41,7 +41,7 @@ class Weights:
 
     @property
     def name(self) -> str:
-        """Of the file."""
+        """Name of the file."""
         return self.url.rpartition("/")[2]
 
 

@@ -23,7 +23,7 @@ from wiw.report.plans import of_poses, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Picture, Step, Story
-from wiw.runs.pictures import pictured_episodes
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.types import Episode, Wording
 
@@ -32,7 +32,7 @@ def read_stories(store: RunStore, arms: Sequence[str], album: Album) -> tuple[li
     """Return the ended episodes among those chosen for pictures, and the scene maps by id."""
     outcomes = outcomes_by_episode(store, arms)
     episodes, maps = store.episodes(), dict[str, Picture]()
-    kept = [index for index in pictured_episodes(store) if outcomes.get(index)]
+    kept = [index for index in choose_pictured_episodes(store) if outcomes.get(index)]
     return [read_story(store, index, episodes[index], outcomes[index], maps, album) for index in kept], maps
 
 

@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from wiw.analysis.blame import RERUNS, VERDICTS, Blame, read_blame
 from wiw.analysis.costs import cost_columns, costs
-from wiw.analysis.fidelity import ArmFidelity, fidelity, shown_columns
+from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
 from wiw.files import whole_file
@@ -43,7 +43,7 @@ def render(run: Run) -> str:
     album = Album()
     shown, maps = read_stories(run.store, run.arms, album)
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
-    measured, paid = shown_columns(truths), cost_columns(ledger)
+    measured, paid = choose_columns(truths), cost_columns(ledger)
     return (
         environment()
         .get_template("page.html.j2")

@@ -132,7 +132,7 @@ def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
         _outcome_dots(axes, outcomes, colors, words)
     else:
-        _binned_rates(axes, outcomes, colors)
+        _draw_binned_rates(axes, outcomes, colors)
     axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel(f"shortest path {words.way}, m")
@@ -149,7 +149,7 @@ def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str], wor
     axes.figure.suptitle(f"filled: {words.won}, hollow: {words.lost}", x=1, ha="right", fontsize=8, color=INK)
 
 
-def _binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
+def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
     lengths = np.array([row["geodesic"] for rows in outcomes.values() for row in rows])
     edges = np.unique(np.quantile(lengths, np.linspace(0, 1, 5)))
     for shift, (arm, rows) in enumerate(outcomes.items()):

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from wiw.analysis.costs import cost_columns, costs
-from wiw.analysis.fidelity import fidelity, shown_columns
+from wiw.analysis.fidelity import choose_columns, fidelity
 from wiw.analysis.statistics import Estimate
 from wiw.analysis.summary import (
     ArmSummary,
@@ -86,7 +86,7 @@ def print_costs(run: Run) -> None:
 def print_fidelity(run: Run) -> None:
     """Print how accurate each arm's imagination was; nothing where the run did not measure it."""
     lines = fidelity(run)
-    columns = shown_columns(lines)
+    columns = choose_columns(lines)
     titles = [column.title for column in columns]
     print_stacked(
         "Fidelity of imagination, means over decisions",

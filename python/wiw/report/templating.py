@@ -28,7 +28,7 @@ def environment() -> Environment:
     )
     made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
     made.filters["asset"] = _read_asset
-    made.tests |= {"binding": _binding, "known": _known}
+    made.tests |= {"binding": _binding, "known": _is_known}
     return made
 
 
@@ -54,7 +54,7 @@ def _binding(estimate: Estimate) -> bool:
     return estimate.excludes_zero
 
 
-def _known(value: float | None) -> bool:
+def _is_known(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 

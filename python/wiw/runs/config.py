@@ -12,7 +12,7 @@ from tyro.conf import arg
 
 from wiw.errors import ArgumentError
 from wiw.loop.limits import Limits
-from wiw.types import checked_seed
+from wiw.types import check_seed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ class RunConfig(Limits):
             if isinstance(value, int) and value < least:
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
         if self.seed is not None:
-            checked_seed(self.seed)
+            check_seed(self.seed)
 
     def count_pictured(self, episodes: int) -> int:
         """Return how many of a run's episodes keep pictures."""

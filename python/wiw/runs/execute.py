@@ -21,7 +21,7 @@ from wiw.types import Episode, EpisodeResult
 
 
 def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
-    """How a run's task and agents are made again.
+    """Return how a run's task and agents are made again.
 
     Raises:
         StoreError: the run was begun with objects that existed only in memory.
@@ -68,7 +68,7 @@ def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: 
 
 
 def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> None:
-    """Sees that episodes of a run are run with what the others were run with.
+    """Check that episodes of a run are run with what the others were run with.
 
     Raises:
         FileError: a scene is not there.
@@ -164,7 +164,7 @@ class _Desk:
             self._tracker.forget(arm, episode)
 
     def _watch(self, arm: str, result: EpisodeResult) -> None:
-        """Stops a run whose arm begins with nothing but the same failure: a mistake in the set-up, not bad luck."""
+        """Stop a run whose arm begins with nothing but the same failure: a mistake in the set-up, not bad luck."""
         if result.status == "done":
             self._first_errors[arm] = None
         errors = self._first_errors.setdefault(arm, [])

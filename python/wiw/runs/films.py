@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from wiw.runs.pictures import pictured_episodes
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.tabletop.workbench import Workbench
 from wiw.tasks.base import Task
@@ -68,7 +68,7 @@ def encode_film(frames: Sequence[NDArray[np.uint8]]) -> bytes:
 
 def _list_films(store: RunStore) -> Iterator[tuple[str, int]]:
     episodes = store.episodes()
-    first = {episodes[index].kind: index for index in reversed(pictured_episodes(store))}
+    first = {episodes[index].kind: index for index in reversed(choose_pictured_episodes(store))}
     ended = {(row["arm"], row["episode"]) for row in store.outcomes() if row["status"] == "done"}
     yield from ((arm, index) for arm, index in sorted(ended) if index in first.values())
 

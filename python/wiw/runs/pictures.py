@@ -55,7 +55,7 @@ def choose_episodes(
     return [best, *(index for index in chosen if index != best)]
 
 
-def pictured_episodes(store: RunStore) -> list[int]:
+def choose_pictured_episodes(store: RunStore) -> list[int]:
     """Return the episodes to show with pictures; during a run those that would be chosen if it ended now."""
     info = store.info
     if "keep_images" not in info:
@@ -67,7 +67,7 @@ def drop_spare_pictures(store: RunStore) -> None:
     """Drop the pictures of the episodes that are not chosen, once every arm has ended every episode."""
     if "keep_images" not in store.info or any(store.pending(arm["name"]) for arm in store.config["arms"]):
         return
-    store.keep_pictures(pictured_episodes(store))
+    store.keep_pictures(choose_pictured_episodes(store))
 
 
 def _rate_gain(index: int, outcomes: Sequence[Mapping[str, Any]]) -> tuple[int, int]:

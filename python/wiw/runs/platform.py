@@ -24,7 +24,7 @@ def describe_platform() -> dict[str, Any]:
 
 
 def processor_name() -> str:
-    """As Linux names it, e.g. "AMD EPYC 7B13"."""
+    """Return the name as Linux names it, e.g. "AMD EPYC 7B13"."""
     try:
         with open("/proc/cpuinfo", encoding="utf-8") as lines:  # noqa: PTH123 - not a file on disk
             names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -47,13 +47,13 @@ class TaskRecipe:
         return cast(Task, TASKS.make(self.name, **self.options))
 
     def to_json(self) -> dict[str, Any]:
-        """For the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
+        """Return JSON for the run store, the same in any folder; `TaskRecipe(**...)` is the way back."""
         from wiw.registry import task_class
 
         return {"name": absolute(self.name), "options": task_class(self.name).make_portable(self.options)}
 
     def sources(self) -> dict[str, str]:
-        """Digests of the user's own source files, by path."""
+        """Return digests of the user's own source files, by path."""
         from wiw.registry import TASKS
 
         return {} if self.name in TASKS.built_in else source_digests(TASKS.find(self.name))
@@ -233,7 +233,7 @@ class TaskInMemory:
         return self.task
 
     def to_json(self) -> None:
-        """Nothing: an object in memory cannot be written down."""
+        """Return nothing: an object in memory cannot be written down."""
 
     def sources(self) -> dict[str, str]:
         """Return digests of the user's own source files, by path."""
@@ -255,10 +255,10 @@ class AgentInMemory:
         return dict(self.agent.describe())
 
     def require(self, task: Mapping[str, Any]) -> None:
-        """There is no world model to ask."""
+        """Require nothing: there is no world model to ask."""
 
     def to_json(self) -> None:
-        """Nothing: an object in memory cannot be written down."""
+        """Return nothing: an object in memory cannot be written down."""
 
     def sources(self) -> dict[str, str]:
         """Return digests of the user's own source files, by path."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wiw.runs.pictures import pictured_episodes
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.runs.store import RunStore
 from wiw.tasks.base import Task
 
@@ -42,7 +42,7 @@ class View:
 def draw_scene_maps(store: RunStore, task: Task) -> None:
     """Draw the scenes of the episodes that have pictures, where the task has scenes to draw."""
     episodes = store.episodes()
-    for index in pictured_episodes(store):
+    for index in choose_pictured_episodes(store):
         episode = episodes[index]
         if store.scene_map(episode.scene) is None:
             place = task.open_world(episode)

@@ -129,7 +129,7 @@ def _check(value: Any, shape: Any, place: str) -> None:
         _check_either(value, shape, place)
     elif isinstance(shape, tuple):
         if not isinstance(value, shape) or (isinstance(value, bool) and bool not in shape):
-            raise ValueError(f"{place or 'value'}: expected {_named(shape)}, got {type(value).__name__}")
+            raise ValueError(f"{place or 'value'}: expected {_list_names(shape)}, got {type(value).__name__}")
     elif isinstance(shape, list):
         _require(value, list, place)
         for index, item in enumerate(value):
@@ -161,5 +161,5 @@ def _require(value: Any, kind: type, place: str) -> None:
         raise ValueError(f"{place or 'value'}: expected {kind.__name__}, got {type(value).__name__}")
 
 
-def _named(types: Sequence[type]) -> str:
+def _list_names(types: Sequence[type]) -> str:
     return " or ".join("null" if kind is type(None) else kind.__name__ for kind in types)

@@ -88,7 +88,7 @@ def _digest(content: bytes) -> str:
 
 
 def _source_file(thing: Any) -> Path | None:
-    """The file of the user's that defines a class or function."""
+    """Return the file of the user's that defines a class or function."""
     try:
         name = inspect.getsourcefile(thing)
     except (OSError, TypeError):
@@ -102,7 +102,7 @@ def _is_library(path: Path) -> bool:
 
 
 def _with_imports(file: Path) -> set[Path]:
-    """A file and those of the user's that it imports, and they."""
+    """Return a file and those of the user's that it imports, directly or not."""
     found, waiting = set[Path](), [file]
     while waiting:
         path = waiting.pop()
@@ -113,7 +113,7 @@ def _with_imports(file: Path) -> set[Path]:
 
 
 def _imports(file: Path) -> Iterator[Path]:
-    """The files of the user's that a file imports."""
+    """Return the files of the user's that a file imports."""
     try:
         tree = ast.parse(file.read_bytes())
     except (SyntaxError, ValueError):  # no Python, such as an extension's source
@@ -129,7 +129,7 @@ def _imports(file: Path) -> Iterator[Path]:
 
 
 def _roots(file: Path) -> list[Path]:
-    """Folders from which a file imports: its own, as of a script, and that of its outermost package."""
+    """Return the folders from which a file imports: its own, as of a script, and that of its outermost package."""
     package = file.parent
     while (package / "__init__.py").is_file():
         package = package.parent

@@ -86,7 +86,7 @@ class RunStore:
             ) from error
         lock = _lock(path)
         store = cls(path, _connect(path, lock), lock)
-        with store._closed_on_error(), store._writing() as connection:
+        with store._close_on_error(), store._writing() as connection:
             for statement in _SCHEMA.read_text().split(";\n"):
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -117,7 +117,7 @@ class RunStore:
         path = store_path(run)
         lock = _lock(path) if path.exists() else None
         store = cls._open(path, lock)
-        with store._closed_on_error():
+        with store._close_on_error():
             store.require_version()
             if config is not None:
                 _require_same(path, store.config, json.loads(to_json(config)))
@@ -166,7 +166,7 @@ class RunStore:
         if not path.is_file():
             raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
         store = cls(path, _connect(path, lock), lock)
-        with store._closed_on_error():
+        with store._close_on_error():
             store._require_whole()
             store._require_readable()
             store._update_schema()
@@ -229,7 +229,7 @@ class RunStore:
 
     def episodes(self) -> list[Episode]:
         """Return the episodes that every arm runs; their place in the list is their index."""
-        rows = self._typed("episode", self._rows("SELECT * FROM episode ORDER BY episode"))
+        rows = self._convert_types("episode", self._rows("SELECT * FROM episode ORDER BY episode"))
         infos = [parse_column("episode.info", row["info"], self._place("episode", row)) for row in rows]
         return [_episode(row, info) for row, info in zip(rows, infos, strict=True)]
 
@@ -240,7 +240,7 @@ class RunStore:
             "FROM outcome o JOIN episode e USING (episode) "
             "ORDER BY arm, episode"
         )
-        rows = self._typed("outcome", rows)
+        rows = self._convert_types("outcome", rows)
         named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
         return [
             {**row, "metrics": parse_column("metrics", row["metrics"], self._place("outcome", row))} for row in named
@@ -253,7 +253,7 @@ class RunStore:
             "AND (?2 IS NULL OR episode = ?2) ORDER BY arm, episode, decision",
             (arm, episode),
         )
-        for row in self._typed("decision", rows):
+        for row in self._convert_types("decision", rows):
             for column in DECISION_JSON:
                 if row[column] is not None:
                     row[column] = parse_column(column, row[column], self._place("decision", row))
@@ -277,7 +277,7 @@ class RunStore:
             found[row["arm"]][row["key"]] = float(row["total"] or 0)
         return found
 
-    def lost(self) -> dict[str, dict[str, float]]:
+    def sum_lost_costs(self) -> dict[str, dict[str, float]]:
         """Return by arm and name what was spent on decisions that an error interrupted."""
         found: dict[str, dict[str, float]] = {}
         for row in self._rows("SELECT arm, name, value FROM lost"):
@@ -403,7 +403,7 @@ class RunStore:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def close(self) -> None:
-        """Close the file and lets others write."""
+        """Close the file and let others write."""
         self._connection.close()
         if self._lock is not None:
             self._lock.close()
@@ -424,7 +424,7 @@ class RunStore:
             )
 
     @contextmanager
-    def _closed_on_error(self) -> Iterator[None]:
+    def _close_on_error(self) -> Iterator[None]:
         try:
             yield
         except BaseException:
@@ -441,8 +441,8 @@ class RunStore:
         with explain_faults(self.path):
             return [dict(row) for row in self._connection.execute(query, values)]
 
-    def _typed(self, table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-        """The rows of a table, held to the types of its columns.
+    def _convert_types(self, table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        """Return the rows of a table, held to the types of its columns.
 
         Raises:
             StoreError: a value is of another type.
@@ -468,8 +468,8 @@ class RunStore:
 
 
 @contextmanager
-def removed_if_empty(path: Path) -> Iterator[None]:
-    """Around the work on a new run: where an error ends it before anything was recorded, the run is removed.
+def remove_if_empty(path: Path) -> Iterator[None]:
+    """Remove a new run where an error ends the work on it before anything was recorded.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.

@@ -72,7 +72,7 @@ Facts = list[tuple[str, dict[str, Any]]]
 
 
 def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
-    """Runs `episodes` random episodes of a run again, in every arm that has ended them, and compares.
+    """Run `episodes` random episodes of a run again, in every arm that has ended them, and compare.
 
     Args:
         run: the run's folder.
@@ -97,7 +97,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
         arms = [arm["name"] for arm in store.config["arms"]]
         keys = [(arm, index) for index in chosen for arm in arms if (arm, index) in ended]
         return Verification(
-            store.path.parent, tuple(_check(key, _recorded(store, ended[key]), again[key]) for key in keys)
+            store.path.parent, tuple(_check(key, _read_facts(store, ended[key]), again[key]) for key in keys)
         )
 
 
@@ -150,7 +150,7 @@ class _Collected:
         return self._episodes.setdefault(index, [])
 
 
-def _recorded(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
+def _read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
     arm, index = outcome["arm"], outcome["episode"]
     decisions = [
         _decision(row["decision"], row, store.images(arm, index, row["decision"]))

@@ -34,10 +34,10 @@ class Desk(Protocol):
     """What the workers report to."""
 
     def write(self, row: Row) -> None:
-        """An agent was built, a decision was taken, or an episode has ended."""
+        """Write that an agent was built, a decision was taken, or an episode has ended."""
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
-        """These episodes are run again from their beginning."""
+        """Note that these episodes are run again from their beginning."""
 
 
 @dataclass(frozen=True)
@@ -77,19 +77,19 @@ class RowSink:
         self._job, self._plan, self._send = job, plan, send
 
     def decision(self, record: DecisionRecord) -> None:
-        """One decision was taken and carried out."""
+        """Record a decision that was taken and carried out."""
         self._send(decision_row(self._job.arm, record, record.episode in self._plan.pictures))
 
     def episode(self, result: EpisodeResult) -> None:
-        """One episode has ended."""
+        """Record that an episode has ended."""
         self._send(OutcomeRow(self._job.arm, result))
 
     def again(self, episodes: Sequence[int]) -> None:
-        """These episodes begin anew."""
+        """Note that these episodes begin anew."""
         self._send(AgainRow(self._job.arm, tuple(episodes)))
 
-    def lost(self, spent: Mapping[str, float]) -> None:
-        """A decision has failed."""
+    def record_lost(self, spent: Mapping[str, float]) -> None:
+        """Record that a decision has failed."""
         self._send(LostRow(self._job.arm, dict(spent)))
 
 
@@ -103,7 +103,7 @@ class Runner:
         self._agent: Any = None
 
     def run(self, job: Job, send: Any) -> None:
-        """Runs a job's episodes and sends their rows."""
+        """Run a job's episodes and send their rows."""
         from wiw.loop.scheduler import run_episodes
 
         if self._arm != job.arm:
@@ -126,27 +126,27 @@ class Runner:
 
 
 def run_here(plan: Plan, jobs: Iterable[Job], desk: Desk) -> None:
-    """Runs all jobs in this process."""
+    """Run all jobs in this process."""
     runner = Runner(plan)
     for job in jobs:
         runner.run(job, desk.write)
 
 
 def run_in_workers(plan: Plan, jobs: Iterable[Job], desk: Desk, workers: int) -> None:
-    """Runs all jobs in `workers` processes.
+    """Run all jobs in `workers` processes.
 
     Raises:
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
-    crew = _Crew(_pickled(plan), deque(jobs), desk, workers)
+    crew = _Crew(_pickle_plan(plan), deque(jobs), desk, workers)
     try:
         crew.run()
     finally:
         crew.stop()
 
 
-def _pickled(plan: Plan) -> bytes:
+def _pickle_plan(plan: Plan) -> bytes:
     try:
         return pickle.dumps(plan)
     except Exception as error:
@@ -219,7 +219,7 @@ class _Crew:
             self._bury(worker)
 
     def _bury(self, worker: _Worker) -> None:
-        """Runs again what a dead worker left, or records it as failed.
+        """Run again what a dead worker left, or record it as failed.
 
         Raises:
             InfrastructureError: the worker died before it asked for a job, as any other in its place would.
@@ -265,7 +265,7 @@ def _start(plan: bytes, workers: int) -> _Worker:
 
 @contextmanager
 def _threads_shared(workers: int) -> Iterator[None]:
-    """Gives each worker its share of the cores, through variables that it reads when it starts."""
+    """Give each worker its share of the cores, through variables that it reads when it starts."""
     share = str(max(1, len(os.sched_getaffinity(0)) // workers))
     added = [name for name in ("WIW_NUM_THREADS", "OMP_NUM_THREADS") if name not in os.environ]
     os.environ.update(dict.fromkeys(added, share))
@@ -277,7 +277,7 @@ def _threads_shared(workers: int) -> Iterator[None]:
 
 
 def _work(pipe: Connection) -> None:
-    """A worker's life: None means "give me a job"; an end of the pipe means that the parent has gone.
+    """Live as a worker: None means "give me a job"; an end of the pipe means that the parent has gone.
 
     It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
     """
@@ -287,7 +287,7 @@ def _work(pipe: Connection) -> None:
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:
-        pipe.send(_portable(error))
+        pipe.send(_make_portable(error))
     pipe.close()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -312,8 +312,8 @@ def _serve(pipe: Connection) -> None:
         runner.run(pipe.recv(), pipe.send)
 
 
-def _portable(error: Exception) -> Exception:
-    """The exception itself where it survives pickling and is ours; else its text."""
+def _make_portable(error: Exception) -> Exception:
+    """Return the exception itself where it survives pickling and is ours; else its text."""
     if isinstance(error, Error):
         try:
             pickle.loads(pickle.dumps(error))

@@ -82,14 +82,14 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
         return store.Sources(tuple(read), tuple(absent))
 
     if cache:
-        return store.imported(file, options, build)
+        return store.load_imported(file, options, build)
     if not isolate:
         return _core.scene.import_scene(file, **options)[0]
     return store.temporary(build)
 
 
 def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
-    """A furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
+    """Generate a furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
 
     `split` is "train", "val" or "test"; ArgumentError is raised for any other. With `cache` it is made once, in
     seconds, and then mapped from disk like imported scenes, until the compiled core changes.
@@ -101,7 +101,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
         _log.info("apartment %s/%s made in %.1f s", split, seed, time.perf_counter() - started)
         return scene
 
-    return store.generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
+    return store.load_generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
 
 
 SPLIT_SIZE = 1000
@@ -111,18 +111,18 @@ APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9
 
 
 def is_generated(spec: str) -> bool:
-    """Whether a scene spec names generated apartments rather than a file."""
+    """Return whether a scene spec names generated apartments rather than a file."""
     return spec.startswith("apartments:")
 
 
 def absolute(spec: str | PathLike[str]) -> str:
-    """The spec with its path, if it is one, made absolute, so that it means the same in any folder."""
+    """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
     spec = fspath(spec)
     return spec if is_generated(spec) else str(Path(spec).expanduser().absolute())
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
-    """The single scenes that a scene spec names, in order, none of them loaded.
+    """Return the single scenes that a scene spec names, in order, none of them loaded.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
     numbers 40 to 59, each named "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
@@ -166,7 +166,7 @@ def _did_you_mean(spec: str) -> str:
 
 
 def open_scene(name: str) -> Scene:
-    """Loads one scene of `resolve`."""
+    """Load one scene of `resolve`."""
     if is_generated(name):
         split, _, index = name.removeprefix("apartments:").partition("/")
         return apartment(int(index), split)

@@ -72,7 +72,7 @@ def read_in_child(module: str, job: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reply(path: str, child: subprocess.CompletedProcess[bytes]) -> dict[str, Any]:
-    """What the child answers; its errors are raised here."""
+    """Return the child's answer; raise its errors here."""
     try:
         reply = json.loads(child.stdout) if child.returncode == 0 else None
     except ValueError:
@@ -90,7 +90,7 @@ def _out_of_time(path: str) -> FileError:
 
 
 def _environment() -> dict[str, str]:
-    """Our own, with this very package first on the child's path."""
+    """Return our own environment, with this very package first on the child's path."""
     here = str(Path(wiw.__file__).parents[1])
     paths = [here, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}

@@ -43,20 +43,20 @@ class Sources:
 
 
 def folder() -> Path:
-    """Where scenes are kept: `$WIW_CACHE/scenes`, or `~/.cache/wiw/scenes`. Deleting it is always safe."""
+    """Return where scenes are kept: `$WIW_CACHE/scenes`, or `~/.cache/wiw/scenes`. Deleting it is always safe."""
     root = os.environ.get("WIW_CACHE")
     return (Path(root).expanduser() if root else Path.home() / ".cache/wiw") / "scenes"
 
 
-def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sources]) -> _core.scene.Scene:
-    """The scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
+def load_imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sources]) -> _core.scene.Scene:
+    """Return the scene of `source` read with `options`: mapped if it is known and nothing it depends on has changed.
 
     `build(path)` imports the scene and writes it to `path`. Paths in `options` must be absolute. A link to a source
     counts as another source: its textures are looked for beside the link. Where the folder cannot be written, a
     warning says so and the scene is kept for this process alone.
     """
     manifest = folder() / f"{_key([str(source.absolute()), options])}.json"
-    known = _known(manifest)
+    known = _find_known(manifest)
     if known is not None:
         return known
     draft = _draft(manifest)
@@ -83,13 +83,13 @@ def imported(source: Path, options: dict[str, Any], build: Callable[[Path], Sour
 
 
 def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
-    """The scene that `build(path)` writes, mapped from a file that is removed at once; the mapping outlives it."""
+    """Map the scene that `build(path)` writes from a file that is removed at once; the mapping outlives it."""
     with TemporaryDirectory(prefix="wiw-scene-") as place:
         build(Path(place) / "scene")
         return _core.scene.map_cache(Path(place) / "scene")
 
 
-def generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
+def load_generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
     """A scene that is a function of `identity` (generator, its version, seed, ...) alone: mapped, or made and kept.
 
     Processes that ask for the same scene at the same time make it once. Where it cannot be kept, for want of room or
@@ -97,18 +97,18 @@ def generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scen
     """
     path = folder() / f"{_key(list(identity))}.wiwscene"
     with _turn(path):
-        known = _mapped(path)
-        return _kept(make(), path) if known is None else known
+        known = _map_scene(path)
+        return _keep_scene(make(), path) if known is None else known
 
 
 @cache
 def build_digest() -> str:
-    """Digest of the compiled core, which names every version of the generators in it."""
+    """Return the digest of the compiled core, which names every version of the generators in it."""
     return _digest(Path(_core.__file__))
 
 
 def limit() -> float:
-    """Most bytes that scenes may take on disk.
+    """Return the most bytes that scenes may take on disk.
 
     Raises:
         ArgumentError: `$WIW_CACHE_GB` is not a number of gigabytes.
@@ -123,8 +123,8 @@ def limit() -> float:
     return gigabytes * 2**30
 
 
-def _kept(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
-    """The scene mapped from its new file; the scene itself where the file cannot be written."""
+def _keep_scene(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
+    """Return the scene mapped from its new file; the scene itself where the file cannot be written."""
     try:
         _core.scene.write_cache(scene, path)
         _trim(path)
@@ -136,9 +136,9 @@ def _kept(scene: _core.scene.Scene, path: Path) -> _core.scene.Scene:
 
 @contextmanager
 def _turn(path: Path) -> Iterator[None]:
-    """Lets one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
+    """Let one process or thread at a time make what belongs at `path`; where nothing can be locked, all at once."""
     name = path.with_suffix(".lock")
-    lock = _locked(name)
+    lock = _open_lock(name)
     try:
         yield
     finally:
@@ -148,7 +148,7 @@ def _turn(path: Path) -> Iterator[None]:
             lock.close()
 
 
-def _locked(name: Path) -> IO[str] | None:
+def _open_lock(name: Path) -> IO[str] | None:
     try:
         name.parent.mkdir(parents=True, exist_ok=True)
         lock = name.open("w")
@@ -162,8 +162,8 @@ def _locked(name: Path) -> IO[str] | None:
     return lock
 
 
-def _mapped(path: Path) -> _core.scene.Scene | None:
-    """The scene kept at `path`, marked as used now; None where there is none, or, with a warning, a damaged one."""
+def _map_scene(path: Path) -> _core.scene.Scene | None:
+    """Map the scene kept at `path` and mark it as used; None where there is none or, with a warning, a damaged one."""
     if not path.exists():
         return None
     try:
@@ -177,7 +177,7 @@ def _mapped(path: Path) -> _core.scene.Scene | None:
 
 
 def _trim(newest: Path) -> None:
-    """Removes scenes, those unused for longest first, until the others fit the limit; never `newest`."""
+    """Remove scenes, those unused for longest first, until the others fit the limit; never `newest`."""
     scenes = []
     for path in newest.parent.glob("*.wiwscene"):
         with suppress(FileNotFoundError):  # another process trims as well
@@ -217,7 +217,7 @@ def _entry(path: Path) -> dict[str, Any]:
     }
 
 
-def _unchanged(entry: dict[str, Any]) -> bool:
+def _is_unchanged(entry: dict[str, Any]) -> bool:
     try:
         status = Path(entry["path"]).stat()
         if (status.st_size, status.st_mtime_ns) == (entry["bytes"], entry["mtime_ns"]):
@@ -227,13 +227,13 @@ def _unchanged(entry: dict[str, Any]) -> bool:
         return False
 
 
-def _known(manifest: Path) -> _core.scene.Scene | None:
-    """The mapped scene of a manifest that still holds; None if it has to be built."""
+def _find_known(manifest: Path) -> _core.scene.Scene | None:
+    """Return the mapped scene of a manifest that still holds; None if it has to be built."""
     try:
         facts = json.loads(manifest.read_text())
-        if not all(map(_unchanged, facts["read"])) or any(Path(path).exists() for path in facts["absent"]):
+        if not all(map(_is_unchanged, facts["read"])) or any(Path(path).exists() for path in facts["absent"]):
             return None
-        return _mapped(manifest.with_name(facts["scene"]))
+        return _map_scene(manifest.with_name(facts["scene"]))
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -14,10 +14,10 @@ from wiw.serving.server import Server, Settings
 
 
 @contextmanager
-def served(model: Any, **settings: Any) -> Iterator[Server]:
-    """Serves a world model (name, class or instance) while the block runs, at a free port: `server.address`.
+def serve_in_background(model: Any, **settings: Any) -> Iterator[Server]:
+    """Serve a world model (name, class or instance) while the block runs, at a free port: `server.address`.
 
-        with served(MyModel()) as server:
+        with serve_in_background(MyModel()) as server:
             model = wiw.world_model(f"remote:{server.address}")
 
     Raises:

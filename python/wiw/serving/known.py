@@ -18,13 +18,13 @@ class Known:
         self._answers: OrderedDict[bytes, bytes] = OrderedDict()
 
     def get(self, row: bytes) -> bytes | None:
-        """The answer, where it is known."""
+        """Return the answer, where it is known."""
         if row in self._answers:
             self._answers.move_to_end(row)
         return self._answers.get(row)
 
     def put(self, row: bytes, answer: bytes) -> None:
-        """Keeps an answer."""
+        """Keep an answer."""
         self._size += len(answer) - len(self._answers.pop(row, b""))
         self._answers[row] = answer
         while self._size > self._most:

@@ -33,11 +33,11 @@ class Outbox:
         """Of messages that have not left, the one that is being sent included."""
 
     def __len__(self) -> int:
-        """How many messages have not left."""
+        """Return how many messages have not left."""
         return len(self._messages)
 
     def takes(self, size: int) -> bool:
-        """Whether a message of so many bytes may wait; one alone always may."""
+        """Return whether a message of so many bytes may wait; one alone always may."""
         return not self._messages or self.unsent_bytes + size <= UNSENT_BYTES
 
     def put(self, message: bytes, sent: Callable[[], None] = lambda: None) -> None:

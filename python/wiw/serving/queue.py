@@ -59,12 +59,12 @@ class Queue:
         return len(self._jobs)
 
     def join(self, client: Hashable) -> None:
-        """A client is there, and may ask."""
+        """Add a client, which may ask from now on."""
         with self._changed:
             self._coming[client] = 0
 
     def leave(self, client: Hashable) -> list[Job]:
-        """A client has gone. Returns the jobs that nobody wants any more."""
+        """Remove a client that has gone. Return the jobs that nobody wants any more."""
         with self._changed:
             self._coming.pop(client, None)
             self._owed.pop(client, None)
@@ -76,7 +76,7 @@ class Queue:
             return orphans
 
     def put(self, job: Job, client: Hashable, rest: int = 0) -> bool:
-        """Takes a job of a client that announces `rest` more; False where the queue is full."""
+        """Take a job of a client that announces `rest` more; False where the queue is full."""
         with self._changed:
             self._coming[client] = rest
             full = len(self._jobs) >= self.most
@@ -88,24 +88,24 @@ class Queue:
             return not full
 
     def announce(self, client: Hashable, rest: int) -> None:
-        """A client announces `rest` more rows, whatever became of its latest."""
+        """Note that a client announces `rest` more rows, whatever became of its latest."""
         with self._changed:
             self._coming[client] = rest
             self._changed.notify()
 
     def share(self, client: Hashable) -> None:
-        """A client asks what another one has asked already."""
+        """Note that a client asks what another one has asked already."""
         with self._changed:
             self._owed[client] += 1
 
-    def answered(self, client: Hashable) -> None:
-        """A client has one answer more."""
+    def count_answer(self, client: Hashable) -> None:
+        """Count one more answer for a client."""
         with self._changed:
             if client in self._owed:
                 self._owed[client] -= 1
 
-    def expired(self) -> list[Job]:
-        """Takes out the jobs whose clients wait no more."""
+    def take_expired(self) -> list[Job]:
+        """Take out the jobs whose clients wait no more."""
         with self._changed:
             now = self._clock()
             late = [job for job in self._jobs if job.expires <= now]
@@ -114,7 +114,7 @@ class Queue:
             return late
 
     def take(self) -> list[Job] | None:
-        """The next batch, as soon as it is due; None when the queue has ended and is empty."""
+        """Return the next batch, as soon as it is due; None when the queue has ended and is empty."""
         with self._changed:
             while True:
                 batch, wait = self.due()
@@ -127,13 +127,13 @@ class Queue:
                 self._changed.wait(wait if batch else None)
 
     def end(self) -> None:
-        """Nothing more will come."""
+        """End the queue: nothing more will come."""
         with self._changed:
             self._ending = True
             self._changed.notify()
 
     def due(self) -> tuple[list[Job], float]:
-        """The batch as far as it is there, and the seconds until it is taken as it is."""
+        """Return the batch as far as it is there, and the seconds until it is taken as it is."""
         now = self._clock()
         waiting = [job for job in self._jobs if job.expires > now]
         if not waiting:

@@ -100,7 +100,7 @@ class Settings:
 
     @property
     def tls(self) -> ssl.SSLContext | None:
-        """For wss.
+        """TLS settings for wss.
 
         Raises:
             ArgumentError: the certificate or its key cannot be read.
@@ -154,11 +154,11 @@ class Server:
 
     @property
     def clients(self) -> int:
-        """How many are connected."""
+        """Number of connected clients."""
         return len(self._owed)
 
     @property
-    def taken(self) -> int:
+    def pending_rows(self) -> int:
         """Rows that wait or are computed."""
         return len(self._jobs)
 
@@ -168,7 +168,7 @@ class Server:
         return sum(outbox.unsent_bytes for outbox in self._outboxes.values())
 
     async def run(self, ready: Callable[[], None] = lambda: None) -> None:
-        """Serves until `end` is called; then finishes what it has taken.
+        """Serve until `end` is called; then finish what it has taken.
 
         Raises:
             InfrastructureError: the address cannot be listened at.
@@ -190,12 +190,12 @@ class Server:
             ticking = asyncio.ensure_future(self._tick())
             await self._ending.wait()
             with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._finished(), self.settings.grace)
+                await asyncio.wait_for(self._finish_rows(), self.settings.grace)
             ticking.cancel()
             self.queue.end()
 
     def end(self) -> None:
-        """Takes nothing more, finishes, and lets `run` return. To be called from the loop's thread."""
+        """Take nothing more, finish, and let `run` return. To be called from the loop's thread."""
         self._ending.set()
 
     # -- connections ---------------------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ class Server:
         )
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
-        """None lets a client in."""
+        """Return the refusal of a client; None lets it in."""
         if len(self._owed) >= CLIENTS:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are connected already\n")
         token = self.settings.token
@@ -230,7 +230,7 @@ class Server:
         return None
 
     async def _meet(self, client: ServerConnection) -> None:
-        """One client, from its first message to its last."""
+        """Serve one client, from its first message to its last."""
         self._owed[client] = 0
         self.queue.join(client)
         outbox = self._outboxes[client] = Outbox(client, self._welcome.in_flight)
@@ -282,17 +282,17 @@ class Server:
             outbox.put(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
 
     def _cannot(self, client: ServerConnection) -> str:
-        """Why no row of this client is taken now; empty where one is."""
+        """Return why no row of this client is taken now; empty where one is."""
         if self._ending.is_set():
             return "the server is ending"
         return "too many rows unanswered" if self._owed[client] >= self._welcome.in_flight else ""
 
     def _pause(self) -> float:
-        """Seconds in which there may be room: half a batch."""
+        """Return the seconds in which there may be room: half a batch."""
         return min(2.0, max(0.05, self.queue.batch_seconds / 2))
 
     def _take(self, client: ServerConnection, ask: Ask) -> bool:
-        """Queues a row, unless it is queued or computed already; False where the queue is full."""
+        """Queue a row, unless it is queued or computed already; False where the queue is full."""
         job = self._jobs.get(ask.id)
         now = time.monotonic()
         if job is None:
@@ -319,7 +319,7 @@ class Server:
     # -- answers -------------------------------------------------------------------------------------------------------
 
     def _report(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
-        """Called in the model's thread; the encoding is left to another, for the model is to go on."""
+        """Report outcomes from the model's thread; the encoding is left to another, for the model is to go on."""
         assert self._loop is not None
         with contextlib.suppress(RuntimeError):  # the server has ended
             self._loop.call_soon_threadsafe(lambda: self._start(self._answer(jobs, outcomes)))
@@ -334,10 +334,10 @@ class Server:
                 self._settle(job, answer)
 
     def _settle(self, job: Job, answer: bytes) -> None:
-        """Tells all who asked."""
+        """Tell all who asked."""
         self._jobs.pop(job.id, None)
         for client in [client for client in self._owed if client in job.askers]:  # others have gone
-            self.queue.answered(client)
+            self.queue.count_answer(client)
             outbox, message = self._outboxes[client], answer
             if not outbox.takes(len(answer)):
                 message = encode(Wait(job.id, self._pause(), "earlier answers wait to be read"))
@@ -352,7 +352,7 @@ class Server:
         task.add_done_callback(self._tasks.discard)
 
     async def _tick(self) -> None:
-        """Tells those whose rows were not begun in time, and sends those away who read nothing."""
+        """Tell those whose rows were not begun in time, and send those away who read nothing."""
         leaving = set[ServerConnection]()
         while True:
             await asyncio.sleep(TICK)
@@ -362,12 +362,12 @@ class Server:
                     leaving.add(client)
                     self.refused += 1
                     self._start(self._send_away(client, outbox))
-            for job in self.queue.expired():
+            for job in self.queue.take_expired():
                 self._settle(
                     job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
                 )
 
-    async def _finished(self) -> None:
+    async def _finish_rows(self) -> None:
         while self._jobs or self._tasks or any(self._outboxes.values()):
             await asyncio.sleep(TICK)
 

@@ -23,7 +23,7 @@ class Status:
         return self._server.worker.batches != self._before[0]
 
     def line(self) -> str:
-        """Clients, rows waiting, batches, and how busy the model was."""
+        """Return clients, rows waiting, batches, and how busy the model was."""
         server, worker = self._server, self._server.worker
         parts = [
             _count(server.clients, "client"),

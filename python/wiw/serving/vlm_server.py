@@ -57,20 +57,20 @@ class VlmServer:
 
     @property
     def url(self) -> str:
-        """What clients are told, as in "http://127.0.0.1:8000/v1"."""
+        """Address for clients, as in "http://127.0.0.1:8000/v1"."""
         return f"http://127.0.0.1:{self._http.server_address[1]}/v1"
 
     def start(self) -> VlmServer:
-        """Serves in a thread."""
+        """Serve in a thread."""
         threading.Thread(target=self._http.serve_forever, args=(0.05,), daemon=True, name="wiw serve-vlm").start()
         return self
 
     def serve(self) -> None:
-        """Serves until it is interrupted."""
+        """Serve until it is interrupted."""
         self._http.serve_forever()
 
     def stop(self) -> None:
-        """Ends serving."""
+        """End serving."""
         self._http.shutdown()
         self._http.server_close()
 
@@ -113,7 +113,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version = "wiw"
 
     def log_message(self, *_: Any) -> None:
-        """Silence: the server is asked thousands of times."""
+        """Log nothing: the server is asked thousands of times."""
 
     def do_GET(self) -> None:
         server: VlmServer = self.server.server  # type: ignore[attr-defined]
@@ -163,7 +163,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def call_of(body: Mapping[str, Any]) -> Call:
-    """What a request asks for.
+    """Return the call that a request asks for.
 
     Raises:
         ArgumentError: an image that is no data URI, or several completions at once.

@@ -31,7 +31,7 @@ class Worker(threading.Thread):
         self.batches, self.rows, self.busy_seconds = 0, 0, 0.0
 
     def run(self) -> None:
-        """Works until the queue has ended."""
+        """Work until the queue has ended."""
         while (batch := self._queue.take()) is not None:
             begin = self.busy_since = time.monotonic()
             with patience(max(job.expires for job in batch) - begin):
@@ -46,7 +46,7 @@ class Worker(threading.Thread):
             self._report(batch, outcomes)
 
     def _answers(self, rows: Sequence[Row]) -> list[Outcome]:
-        """What the model gives for each row.
+        """Return what the model gives for each row.
 
         Where it raises, each half of the batch is asked again: a row that it cannot do fails alone, and too many rows
         for the memory become fewer.

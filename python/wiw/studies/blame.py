@@ -63,7 +63,7 @@ def blame(
         if value is not None and value < 1:
             raise ArgumentError(f"blame: expected {name} of at least 1, got {value}")
     with RunStore.read(run) as base:
-        wanted = _wanted(base, arms, episodes)
+        wanted = _choose_failures(base, arms, episodes)
         task, agents = _recipes(base, wanted)
         store = _store(base, agents)
         named = {name_rerun(arm, rerun): indices for arm, indices in wanted.items() for rerun in list_reruns(base, arm)}
@@ -74,7 +74,7 @@ def blame(
         return Blame(found.run, tuple(line for line in found.arms if line.arm in wanted))
 
 
-def _wanted(base: RunStore, arms: str | Sequence[str] | None, most: int | None) -> dict[str, set[int]]:
+def _choose_failures(base: RunStore, arms: str | Sequence[str] | None, most: int | None) -> dict[str, set[int]]:
     """Return the failures to be rerun, by arm."""
     known = [one["name"] for one in base.config["arms"]]
     names = known if arms is None else [arms] if isinstance(arms, str) else list(arms)
@@ -144,7 +144,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
         "limits": {name: value for name, value in info["limits"].items() if name not in ("fidelity", "lpips")},
         "command": sys.argv,
         "preparation_seconds": 0.0,
-        "built": _expected_agents(base),
+        "built": _describe_expected_agents(base),
     }
     return RunStore.create(folder, config, info, base.episodes())
 
@@ -153,7 +153,7 @@ def _explicit_options(recipe: AgentRecipe) -> dict[str, Any]:
     return {name: value for name, value in (recipe.to_json() or {}).items() if value not in (None, {})}
 
 
-def _expected_agents(base: RunStore) -> dict[str, Any]:
+def _describe_expected_agents(base: RunStore) -> dict[str, Any]:
     """Return how the agents of reruns must describe themselves, so that weights other than the run's are refused."""
     return {
         name_rerun(arm, stage): {**agent, part: {**agent[part], "ground_truth": stage}}

@@ -18,7 +18,7 @@ from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
-from wiw.runs.store import RunStore, removed_if_empty
+from wiw.runs.store import RunStore, remove_if_empty
 from wiw.studies.run_log import RunLog
 
 
@@ -86,7 +86,7 @@ def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -
 def resume_run(
     run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False
 ) -> RunLog:
-    """Goes on with a run of named parts: only episodes that have not ended are run.
+    """Go on with a run of named parts: only episodes that have not ended are run.
 
     Args:
         run: the run's folder.
@@ -159,7 +159,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes)
-        with removed_if_empty(store.path):
+        with remove_if_empty(store.path):
             return _finish(store, task, agents, settings.workers, settings.progress)
     return _finish(store, task, agents, settings.workers, settings.progress)
 
@@ -173,7 +173,7 @@ def _finish(
     *,
     retry_errors: bool = False,
 ) -> RunLog:
-    """Runs what is missing, closes the store and opens it for reading."""
+    """Run what is missing, close the store and open it for reading."""
     pending = {arm: store.pending(arm, retry_errors) for arm in agents}
     run_pending(store, task, agents, pending, workers, progress)
     return RunLog(RunStore.read(store.path))

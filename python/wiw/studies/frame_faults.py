@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import TURN_LEFT, TURN_RIGHT
-from wiw.world_models.pictures import ALTERED, CHANNELS, OTHER, Picture, correlation, exchanged
+from wiw.world_models.pictures import ALTERED, CHANNELS, OTHER, Picture, are_channels_swapped, correlation
 
 BETTER = 0.15
 """By how much an altered picture has to fit better, in correlation."""
@@ -21,13 +21,13 @@ JUMP = 160
 Frames = NDArray[np.uint8]
 
 
-def altered(truth: Sequence[Frames], found: Sequence[Frames]) -> str:
+def describe_alteration(truth: Sequence[Frames], found: Sequence[Frames]) -> str:
     """Return what was done to all frames [K, H, W, 3] of some rollouts, in words; nothing where they are as they are.
 
     `truth` are frames of the same moments, of any size.
     """
     pairs = _pairs(truth, found)
-    if sum(exchanged(true, frame) for true, frame in pairs) > len(pairs) / 2:
+    if sum(are_channels_swapped(true, frame) for true, frame in pairs) > len(pairs) / 2:
         return CHANNELS
     alike = np.mean([correlation(true, frame) for true, frame in pairs])
     fits = {
@@ -57,11 +57,11 @@ def exchange_turns(plan: NDArray[Any]) -> NDArray[Any]:
 def _pairs(truth: Sequence[Frames], found: Sequence[Frames]) -> list[tuple[Picture, Picture]]:
     """Return frames of the same moments at the size of the true ones."""
     return [
-        (true.astype(np.float32), _resized(frame, true.shape[:2]).astype(np.float32))
+        (true.astype(np.float32), _resize(frame, true.shape[:2]).astype(np.float32))
         for trues, frames in zip(truth, found, strict=True)
         for true, frame in zip(trues, frames, strict=True)
     ]
 
 
-def _resized(image: Frames, size: tuple[int, ...]) -> Frames:
+def _resize(image: Frames, size: tuple[int, ...]) -> Frames:
     return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)

@@ -22,7 +22,7 @@ from wiw.errors import ArgumentError, ConstructionError, ContractError
 from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
 from wiw.loop.history import Frame, stack_histories
 from wiw.loop.plan_space import plan_space
-from wiw.studies.frame_faults import altered, exchange_turns, mean_correlation, share_of_jumps
+from wiw.studies.frame_faults import describe_alteration, exchange_turns, mean_correlation, share_of_jumps
 from wiw.studies.model_networks import place_of_computation, training_networks
 from wiw.studies.questions import Frames, Questions, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
@@ -34,7 +34,7 @@ WALKS = ((FORWARD, TURN_LEFT, FORWARD, FORWARD), (FORWARD, TURN_LEFT, TURN_RIGHT
 
 
 def _poses(*places: tuple[float, float, float]) -> tuple[tuple[float, ...], ...]:
-    """With the hand down, open, and shut at the last."""
+    """Return poses with the hand down, open, and shut at the last."""
     return tuple((*place, np.pi, 0.0, 0.0, float(i + 1 < len(places))) for i, place in enumerate(places))
 
 
@@ -132,7 +132,7 @@ class Check:
 def check_model(
     model: Any, scenes: str | Path = "apartments:val:1", *, deadline: float = DEADLINE, **options: Any
 ) -> list[Finding]:
-    """Asks a world model a few rollouts as the loop would, and tells what is wrong with its answers.
+    """Ask a world model a few rollouts as the loop would, and tell what is wrong with its answers.
 
         for finding in wiw.check_model(MyModel()):
             print(finding)
@@ -170,7 +170,7 @@ def examine_model(
         made = make_model(model, deadline, **options)
     except ConstructionError as error:
         cause = error.__cause__
-        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_told(cause)}."
+        text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_locate(cause)}."
         return _only(Finding(error.kind, text))
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
@@ -184,7 +184,7 @@ def examine_model(
 
 
 def _only(finding: Finding) -> list[Check]:
-    """A first check that leaves nothing to ask."""
+    """Return a first check that leaves nothing to ask."""
     first, *others = CHECKS
     return [Check(first, (finding,)), *(Check(name, skipped="there is no model to ask") for name in others)]
 
@@ -203,7 +203,7 @@ class _Check:
         self._done: dict[str, Check] = {"construction": Check("construction")}
 
     def checks(self) -> list[Check]:
-        """All of them, in order; the first broken answer ends the asking."""
+        """Yield all checks, in order; the first broken answer ends the asking."""
         asked: Mapping[str, Callable[[], Iterable[Finding]]] = {
             "answer": self._answer,
             "frame 0": self._first_frames,
@@ -226,7 +226,7 @@ class _Check:
         return [self._done[name] for name in CHECKS]
 
     def _look(self, name: str, look: Callable[[], Iterable[Finding]], broken: str) -> str:
-        """Looks at one thing; returns why nothing more can be asked, if that is so."""
+        """Look at one thing; return why nothing more can be asked, if that is so."""
         if name in self._done:  # it is what broke
             return ""
         skipped = broken or self._needless(name)
@@ -247,11 +247,11 @@ class _Check:
             )
         except ExitError as error:
             text = (
-                f"`rollout` raised {_told(error.__cause__ or error)}. A model that cannot answer raises an Exception."
+                f"`rollout` raised {_locate(error.__cause__ or error)}. A model that cannot answer raises an Exception."
             )
             finding = Finding("raised", text)
         except Exception as error:
-            finding = Finding("raised", f"`rollout` raised {_told(error)}.")
+            finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
         where = finding.kind if finding.kind in CHECKS else PICTURES.get(finding.kind, name)
         if where != name:
             self._done[name] = Check(name)
@@ -259,7 +259,7 @@ class _Check:
         return "it gave no usable answer"
 
     def _needless(self, name: str) -> str:
-        """Why something need not be looked at, if that is so."""
+        """Return why something need not be looked at, if that is so."""
         if name in ("batch", "causal", "history") and self._done["random"].findings:
             return "every comparison would fail: its answers are random"
         if name == "causal" and not self.accepts.causal:
@@ -311,11 +311,11 @@ class _Check:
             )
             return
         truth = self.asking.true_frames(self.rows, [row.plan for row in self.rows])
-        if fault := altered(truth, own):
+        if fault := describe_alteration(truth, own):
             yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
 
     def _own(self) -> list[Frames]:
-        """The frames of each row that stand for its actions."""
+        """Return the frames of each row that stand for its actions."""
         if self.accepts.space == PRIMITIVES:
             return [frames[1 : 1 + self.steps] for frames in self.frames]
         places = action.frames_of_actions(self.steps, self.frames.shape[1], "resample")[:, 1]
@@ -388,7 +388,7 @@ class _Check:
             )
 
     def _causal(self) -> Iterator[Finding]:
-        """Whether frames of a declared causal model stay the same when later primitives change."""
+        """Check whether frames of a declared causal model stay the same when later primitives change."""
         alike = [
             (one, other)
             for one, other in _pairs(self.rows)
@@ -443,7 +443,7 @@ class _Check:
         try:
             json.dumps(self.model.describe())
         except Exception as error:
-            yield Finding("describe", f"`describe` gives no JSON for the run's record: {_told(error)}.")
+            yield Finding("describe", f"`describe` gives no JSON for the run's record: {_locate(error)}.")
         if self.accepts.cacheable and not self.model.fingerprint():
             yield Finding(
                 "version",
@@ -468,7 +468,7 @@ class _Check:
         return Check("speed", (found,) if hours > LONG_RUN else (), detail=detail)
 
     def _differing(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
-        """A finding, which is no breach where it may be rounding."""
+        """Return a finding, which is no breach where it may be rounding."""
         if off.max() > NOISE:
             return Finding(kind, text)
         where = place_of_computation(self.model)
@@ -496,12 +496,12 @@ def _first_moment(history: History | None) -> History:
 
 
 def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:
-    """Rows with different plans from the same place."""
+    """Return rows with different plans from the same place."""
     return [(one, other) for one, other in combinations(rows, 2) if np.array_equal(one.image, other.image)]
 
 
 def _off(found: Frames, expected: Frames, shared: int, steps: int) -> NDArray[np.int16]:
-    """Absolute differences of the frames that are read."""
+    """Return absolute differences of the frames that are read."""
     read = slice(1 + shared, 1 + steps)
     return np.abs(found[:, read].astype(np.int16) - expected[:, read])
 
@@ -510,8 +510,8 @@ def _share(off: NDArray[np.int16]) -> str:
     return f"{sum(bool(row.any()) for row in off)} of {len(off)} rows"
 
 
-def _told(error: BaseException) -> str:
-    """What was raised, and where: the last line before libraries were entered, which is the model's own."""
+def _locate(error: BaseException) -> str:
+    """Return what was raised, and where: the last line before libraries were entered, which is the model's own."""
     frames = traceback.extract_tb(error.__traceback__)
     place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
     return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno}: {place.line})"

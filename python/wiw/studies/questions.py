@@ -118,7 +118,7 @@ class Questions:
         ]
 
     def ask(self, rows: Sequence[Row], shared: int = 0) -> Frames:
-        """The model's answer, in calls of as many rows as it takes best, held to the contract.
+        """Return the model's answer, in calls of as many rows as it takes best, held to the contract.
 
         With `shared`, the first frames are not asked for: the same question to the model, but not to a server that
         remembers its answers.

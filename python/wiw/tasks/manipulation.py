@@ -23,7 +23,7 @@ from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS, TABLE, Workbench
 from wiw.tasks import presets
 from wiw.tasks.base import Task
-from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Wording, checked_seed
+from wiw.types import GRIPPER_POSES, ArmObservation, Episode, Wording, check_seed
 
 WALKING = ("scenes", "per_scene", "episode_file", "scene_folder", "motion")
 """Options of the tasks in which an agent walks, which mean nothing at a table."""
@@ -88,7 +88,7 @@ class Manipulation(ManipulationSpec, Task):
                 f"manipulation: {', '.join(walking)}: this is for tasks in which an agent walks; "
                 "tables are set by `tasks` and `seed`"
             )
-        self.tasks, self.seed, self.backend = _parse_tasks(tasks), checked_seed(seed), backend
+        self.tasks, self.seed, self.backend = _parse_tasks(tasks), check_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
         self.rules = presets.load_rules(ManipulationRules, presets.find_owner(type(self)), preset, rules)
 

@@ -19,7 +19,7 @@ from wiw.render import resolve_backend
 from wiw.scenes import absolute, resolve
 from wiw.tasks import presets
 from wiw.tasks.base import Task
-from wiw.types import Episode, checked_seed
+from wiw.types import Episode, check_seed
 
 
 class NavigationTask(NavigationSpec, Task):
@@ -62,7 +62,7 @@ class NavigationTask(NavigationSpec, Task):
         self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
         self._generator_rules = {name: value for name, value in rules.items() if name not in own}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
-        self.scenes, self.seed = absolute(scenes), checked_seed(seed)
+        self.scenes, self.seed = absolute(scenes), check_seed(seed)
         self.backend, self.per_scene = backend, per_scene
         self.episode_file = None if episode_file is None else str(Path(episode_file).expanduser().absolute())
         self.scene_folder = str(Path(scene_folder).expanduser().absolute()) if scene_folder else ""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import core
-from wiw.datasets.demonstrations import Demonstration, Format, encoded_depth, encoded_image
+from wiw.datasets.demonstrations import Demonstration, Format, encode_depth, encode_image
 from wiw.errors import ArgumentError, InfrastructureError
 from wiw.render import Output
 from wiw.tabletop.base import TableSetup, TabletopTask
@@ -113,8 +113,8 @@ class _ExpertRun:
             seen = moment.render_view("front", (collection.size, collection.size), outputs)
             seconds.append(moment.seconds - self._start.seconds)
             poses.append(moment.pose)
-            images.append(encoded_image(seen["color"], collection.format))
-            depths += [encoded_depth(seen["depth"])] if collection.depth else []
+            images.append(encode_image(seen["color"], collection.format))
+            depths += [encode_depth(seen["depth"])] if collection.depth else []
         return Demonstration(
             **named,
             instruction=self._setup.instruction,

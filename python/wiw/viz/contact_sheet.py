@@ -20,12 +20,12 @@ CAMERA_HEIGHT = 1.0
 
 
 def short_name(scene: str) -> str:
-    """A scene's name without its folders; specs such as "apartments:val/3" as they are."""
+    """Return a scene's name without its folders; specs such as "apartments:val/3" as they are."""
     return Path(scene).name if Path(scene).suffix else scene
 
 
 def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") -> Image.Image:
-    """One row a scene: seen from above, then `views` panoramas from places far apart.
+    """Draw one row per scene: seen from above, then `views` panoramas from places far apart.
 
     Args:
         worlds: loaded scenes with "name", "scene", "renderer", "navmesh" and "ground".
@@ -43,7 +43,7 @@ def contact_sheet(worlds: Sequence[Any], views: int = 2, backend: str = "auto") 
 
 
 def _row(world: Any, views: int, backend: str) -> Image.Image:
-    places = _spread(world, views)
+    places = _spread_places(world, views)
     pictures = [_from_above(world, float(places[0][1]), backend)] + [_panorama(world, place) for place in places]
     row = Image.new("RGB", (sum(p.width + GAP for p in pictures) - GAP, CAPTION + HEIGHT), PAPER)
     ImageDraw.Draw(row).text((0, 2), short_name(world.name), INK, ImageFont.load_default(16))
@@ -54,7 +54,7 @@ def _row(world: Any, views: int, backend: str) -> Image.Image:
     return row
 
 
-def _spread(world: Any, count: int) -> NDArray[np.float64]:
+def _spread_places(world: Any, count: int) -> NDArray[np.float64]:
     """Places on the largest island, the first amid the others, each next one as far from those before as can be."""
     points = np.asarray(world.ground.put_down(world.navmesh.sample(256, 1)), np.float64)
     chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]

@@ -34,7 +34,7 @@ class DecisionFigure(Figure):
 
 
 def show(decision: Decision) -> DecisionFigure:
-    """Draws a decision; returns a matplotlib figure, which Jupyter displays and `.savefig(path)` writes.
+    """Draw a decision; return a matplotlib figure, which Jupyter displays and `.savefig(path)` writes.
 
     Raises:
         ArgumentError: the decision carries no observation (one that was read back from a run store does not).
@@ -58,23 +58,23 @@ def _top(figure: Figure, place: Any, decision: Decision) -> None:
     goal = decision.goal
     has_image = goal is not None and goal.image is not None
     columns = place.subgridspec(1, 2, width_ratios=[4, 1]) if has_image else place.subgridspec(1, 1)
-    _picture(figure.add_subplot(columns[0, 0]), *_seen(decision.observation))
+    _picture(figure.add_subplot(columns[0, 0]), *_choose_picture(decision.observation))
     if goal is not None and goal.image is not None:
         _picture(figure.add_subplot(columns[0, 1]), goal.image, "goal")
     if goal is not None and goal.text:
         figure.suptitle(goal.text)
 
 
-def _seen(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
-    """A picture of where the agent is, and what it is."""
+def _choose_picture(observation: Observation | ArmObservation) -> tuple[NDArray[np.uint8], str]:
+    """Return a picture of where the agent is, and what it is."""
     if isinstance(observation, ArmObservation):
         return observation.front, "seen from the front"
     panorama = observation.as_dict()["panorama"]
     return part(panorama, BAND, (0, 1)), "seen, all around"
 
 
-def _told(decision: Decision, index: int) -> str:
-    """A plan in signs."""
+def _describe_plan(decision: Decision, index: int) -> str:
+    """Return a plan in signs."""
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
         return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
@@ -89,7 +89,7 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
     label = figure.add_subplot(columns[0, 0])
     label.axis("off")
     label.set(xlim=(0, 1), ylim=(0, 1))
-    label.text(0, 0.68, _told(decision, index), fontsize=12, weight="bold")
+    label.text(0, 0.68, _describe_plan(decision, index), fontsize=12, weight="bold")
     low, high = np.nanmin(scores), np.nanmax(scores)
     share = 1.0 if high <= low else (scores[index] - low) / (high - low)
     label.barh([0.42, 0.42], [1, share], height=0.08, color=["#e4e2db", color])
@@ -109,7 +109,7 @@ def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) ->
 
 
 def _front(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The first of several views; of a panorama the part towards which the agent looks."""
+    """Return the first of several views; of a panorama the part towards which the agent looks."""
     view = frame[0] if frame.ndim == 4 else frame
     height, width = view.shape[:2]
     return view if width <= 1.6 * height else part(view, BAND, FRONT)
@@ -123,7 +123,7 @@ def _picture(axes: Axes, image: NDArray[np.uint8], title: str, size: int = 9) ->
 
 
 def _scores(decision: Decision) -> NDArray[np.float64]:
-    """The reviser's scores, or the proposing policy's own preferences."""
+    """Return the reviser's scores, or the proposing policy's own preferences."""
     if decision.scores is not None:
         return np.asarray(decision.scores, np.float64)
     return np.array([proposal.prior for proposal in decision.proposals])

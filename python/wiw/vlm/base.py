@@ -106,7 +106,7 @@ class Client(ABC):
         return digest.hexdigest()
 
     def _complete(self, calls: Sequence[Call], names: Sequence[str]) -> list[Completion]:
-        found = [None if self.cache is None else self.cache.get(self._kept_as(name)) for name in names]
+        found = [None if self.cache is None else self.cache.get(self._make_cache_name(name)) for name in names]
         missing = [place for place, completion in enumerate(found) if completion is None]
         fresh = self.complete([calls[place] for place in missing]) if missing else []
         for place, completion in zip(missing, fresh, strict=True):
@@ -127,7 +127,7 @@ class Client(ABC):
         """Cache the answers that were used; unusable ones are requested again next time."""
         if self.cache is not None:
             said = [each for reply in replies for each in reply.said if each.used]
-            self.cache.put({self._kept_as(each.call): each.completion for each in said})
+            self.cache.put({self._make_cache_name(each.call): each.completion for each in said})
 
-    def _kept_as(self, name: str) -> str:
+    def _make_cache_name(self, name: str) -> str:
         return f"{self.manner} {name}"

@@ -94,7 +94,7 @@ class OpenAIClient(Client):
             VlmError: the server cannot be reached, or offers none or several.
         """
         if self._model is None:
-            names = [str(each.id) for each in self._asked_for(lambda: list(self._sdk.models.list()))]
+            names = [str(each.id) for each in self._ask_with_retries(lambda: list(self._sdk.models.list()))]
             if len(names) != 1:
                 raise VlmError(
                     f"{self.base_url} offers {', '.join(names) or 'no models'}; name one as model=", "refused"
@@ -117,7 +117,7 @@ class OpenAIClient(Client):
                         images[id(part)] = to_data_uri(part, self.image_format)
         bodies = [self._body(call, images) for call in calls]
         with ThreadPoolExecutor(min(self.concurrency, len(bodies))) as pool:
-            sent = [pool.submit(self._sent, body) for body in bodies]
+            sent = [pool.submit(self._request_completion, body) for body in bodies]
             try:
                 return [each.result() for each in sent]
             except BaseException:
@@ -166,12 +166,12 @@ class OpenAIClient(Client):
             body["response_format"] = {"type": "json_schema", "json_schema": schema}
         return {**body, "extra_body": extra} if extra else body
 
-    def _sent(self, body: dict[str, Any]) -> Completion:
+    def _request_completion(self, body: dict[str, Any]) -> Completion:
         retries = _Retries()
-        completion = self._asked_for(lambda: self._received(body), retries)
+        completion = self._ask_with_retries(lambda: self._receive_completion(body), retries)
         return replace(completion, retries=retries.count)
 
-    def _received(self, body: dict[str, Any]) -> Completion:
+    def _receive_completion(self, body: dict[str, Any]) -> Completion:
         """One request; the body is read piece by piece, so that neither its length nor its pace has the last word."""
         until = time.monotonic() + self.timeout
         data = bytearray()
@@ -184,7 +184,7 @@ class OpenAIClient(Client):
                     raise TimeoutError(f"the reply was not complete within {self.timeout:g} s")
         return _completion(bytes(data))
 
-    def _asked_for(self, work: Any, retries: _Retries | None = None) -> Any:
+    def _ask_with_retries(self, work: Any, retries: _Retries | None = None) -> Any:
         """Work that asks the server, done again where the server may come round.
 
         Raises:
@@ -201,7 +201,7 @@ class OpenAIClient(Client):
                 said, kind, wait = (
                     f"{error.status_code} {_short(error)}",
                     "status" if passing else "refused",
-                    _asked_wait(error),
+                    _read_retry_after(error),
                 )
             except (openai.APITimeoutError, TimeoutError) as error:
                 passing, said, kind, wait = (
@@ -300,7 +300,7 @@ def _short(error: Exception) -> str:
     return " ".join(str(error).split())[:300]
 
 
-def _asked_wait(error: Any) -> float | None:
+def _read_retry_after(error: Any) -> float | None:
     """Seconds that the server asks to wait: `Retry-After`, in seconds or as a date."""
     value = error.response.headers.get("retry-after")
     if value is None:

@@ -16,7 +16,7 @@ DIMENSIONS = 5
 
 
 def pack_array(array: NDArray[Any]) -> dict[str, Any]:
-    """A map of dtype, shape and bytes (little-endian, C order).
+    """Return a map of dtype, shape and bytes (little-endian, C order).
 
     Raises:
         RemoteError: a dtype that cannot be sent.
@@ -29,7 +29,7 @@ def pack_array(array: NDArray[Any]) -> dict[str, Any]:
 
 
 def unpack_array(name: str, value: Any) -> NDArray[Any]:
-    """The array behind such a map: a read-only view of its bytes.
+    """Return the array behind such a map: a read-only view of its bytes.
 
     Raises:
         RemoteError: no such map, an unknown dtype, or bytes that are not as many as dtype and shape say.

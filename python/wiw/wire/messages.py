@@ -105,14 +105,14 @@ KINDS: Mapping[str, type[Message]] = {
 
 
 def encode(message: Message) -> bytes:
-    """The message in bytes."""
+    """Return the message in bytes."""
     values = {field.name: getattr(message, field.name) for field in fields(message)}
     arrays = {name: pack_array(value) for name, value in values.items() if isinstance(value, np.ndarray)}
     return bytes(msgpack.packb({"v": VERSION, "type": type(message).__name__.lower(), **values, **arrays}))
 
 
 def decode(data: Any) -> Message:
-    """The message behind some bytes.
+    """Return the message behind some bytes.
 
     Raises:
         RemoteError: another version of the protocol (kind "version"), or no message of it (kind "message").
@@ -121,18 +121,18 @@ def decode(data: Any) -> Message:
     version, name = values.pop("v", None), values.pop("type", None)
     if version != VERSION or type(version) is not int:
         raise RemoteError(
-            f"this side speaks version {VERSION} of the protocol, the other one {_shown(version)}; install the same "
+            f"this side speaks version {VERSION} of the protocol, the other one {_quote(version)}; install the same "
             "version of wiw on both",
             "version",
         )
     kind = KINDS.get(name) if isinstance(name, str) else None
     if kind is None:
-        raise RemoteError(f"expected a message of type {', '.join(KINDS)}, got {_shown(name)}", "message")
+        raise RemoteError(f"expected a message of type {', '.join(KINDS)}, got {_quote(name)}", "message")
     return kind(**read_fields(f"{name}", values, {field.name: READERS[str(field.type)] for field in fields(kind)}))
 
 
 def unpack_map(what: str, data: Any) -> dict[Any, Any]:
-    """A msgpack map whose parts are no larger than the bytes that came.
+    """Return a msgpack map whose parts are no larger than the bytes that came.
 
     Raises:
         RemoteError: anything else.
@@ -167,7 +167,7 @@ Reader = Callable[[str, Any], Any]
 
 
 def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Reader]) -> dict[str, Any]:
-    """Each value as its reader takes it.
+    """Return each value as its reader takes it.
 
     Raises:
         RemoteError: fields are missing, there are others, or one is of another type.
@@ -179,24 +179,24 @@ def read_fields(what: str, values: Mapping[Any, Any], readers: Mapping[str, Read
 
 
 def text(name: str, value: Any) -> str:
-    """A string."""
+    """Read a string."""
     return str(_of_type(name, value, str))
 
 
 def blob(name: str, value: Any) -> bytes:
-    """Bytes."""
+    """Read bytes."""
     return bytes(_of_type(name, value, bytes))
 
 
 def whole(name: str, value: Any) -> int:
-    """A number from 0 to 2**64 - 1."""
+    """Read a number from 0 to 2**64 - 1."""
     if _of_type(name, value, int) < 0:
         raise RemoteError(f"{name}: expected a number of at least 0, got {value}", "message")
     return int(value)
 
 
 def seconds(name: str, value: Any) -> float:
-    """A finite number of at least 0."""
+    """Read a finite number of at least 0."""
     if not math.isfinite(_of_type(name, value, float)) or value < 0:
         raise RemoteError(f"{name}: expected seconds of at least 0, got {value}", "message")
     return float(value)
@@ -218,6 +218,6 @@ def _of_type(name: str, value: Any, kind: type) -> Any:
     return value
 
 
-def _shown(value: Any) -> str:
+def _quote(value: Any) -> str:
     shown = repr(value)
     return shown if len(shown) < 40 else f"{shown[:40]}..."

@@ -45,7 +45,7 @@ class Row:
 
 
 def pack_row(observations: Conditioning, row: int, control: Control, seed: int) -> bytes:
-    """One row of what `WorldModel.rollout` is given."""
+    """Return one row of what `WorldModel.rollout` is given."""
     seen = {name: getattr(observations, name) for name in SEEN}
     arrays = {name: None if values is None else values[row] for name, values in seen.items()}
     arrays |= {name: getattr(control, name) for name in PLAN}
@@ -56,17 +56,17 @@ def pack_row(observations: Conditioning, row: int, control: Control, seed: int) 
 
 
 def _pack_history(history: History) -> dict[str, Any]:
-    """A map of the arrays of one row, without the padding of actions that others in the batch brought about."""
+    """Return a map of the arrays of one row, without the padding of actions that others in the batch brought about."""
     return {**{name: pack_array(getattr(history, name)[0]) for name in PAST}, "count": int(history.count[0])}
 
 
 def row_id(row: bytes) -> bytes:
-    """The digest of a packed row: 16 bytes that equal questions share."""
+    """Return the digest of a packed row: 16 bytes that equal questions share."""
     return blake2b(row, digest_size=16).digest()
 
 
 def unpack_row(data: bytes) -> Row:
-    """The row behind some bytes.
+    """Return the row behind some bytes.
 
     Raises:
         RemoteError: no such row; names what is wrong with it.
@@ -87,7 +87,7 @@ def unpack_row(data: bytes) -> Row:
 
 
 def stack(rows: Sequence[Row]) -> tuple[Conditioning, list[Control], NDArray[np.uint64]]:
-    """Rows of one shape as `WorldModel.rollout` takes them."""
+    """Return rows of one shape as `WorldModel.rollout` takes them."""
     first = rows[0]
     observations = Conditioning(
         np.stack([row.image for row in rows]),

@@ -107,7 +107,7 @@ def accepts(
         raise ArgumentError(f"accepts: expected best_batch of at least 1, got {best_batch}")
     if template is not None and not isinstance(template, TextTemplate):
         raise ArgumentError(f"accepts: expected template wiw.action.TextTemplate, got {type(template).__name__}")
-    history = _checked_history(history, needs)
+    history = _check_history(history, needs)
     size = (int(size[0]), int(size[1]))
     return Accepts(
         control,
@@ -126,7 +126,7 @@ def accepts(
     )
 
 
-def _checked_history(history: int | None, needs: Sequence[str]) -> int:
+def _check_history(history: int | None, needs: Sequence[str]) -> int:
     if "history" not in needs:
         if history:
             raise ArgumentError(f"accepts: history={history} without needs=('history',); declare both, or neither")

@@ -76,13 +76,13 @@ def check_pictures(
             continue
         if observed.mean() > DARK and own.max() <= 1:
             raise ContractError(f"{name}.rollout: after frame 0, {SCALE}", "scale")
-        if exchanged(expected, own[0].astype(np.float32)):
+        if are_channels_swapped(expected, own[0].astype(np.float32)):
             raise ContractError(f"{name}.rollout: after frame 0, {CHANNELS}", "channels")
 
 
 def first_frame_fault(observed: Picture, found: Picture) -> str:
     """Return what is wrong with a frame 0, in words; nothing where it is the observation, if only by and large."""
-    if exchanged(observed, found):
+    if are_channels_swapped(observed, found):
         return CHANNELS
     alike = correlation(observed, found)
     if alike >= ALIKE or np.abs(observed - found).mean() <= CLOSE:
@@ -93,18 +93,18 @@ def first_frame_fault(observed: Picture, found: Picture) -> str:
     return "" if alike >= OTHER else f"it is another picture (their correlation is {alike:.2f} of 1)"
 
 
-def exchanged(one: Picture, other: Picture) -> bool:
+def are_channels_swapped(one: Picture, other: Picture) -> bool:
     """Return whether two pictures show the same with red and blue exchanged."""
     colors = [picture[..., 0] - picture[..., 2] for picture in (one, other)]
-    return correlation(one, other) >= OTHER and _related(*colors) <= -OTHER
+    return correlation(one, other) >= OTHER and _correlate(*colors) <= -OTHER
 
 
 def correlation(one: Picture, other: Picture) -> float:
     """Return the correlation of the brightness of two pictures [..., H, W, 3]; 0 where one has no structure."""
-    return _related(one.mean(-1), other.mean(-1))
+    return _correlate(one.mean(-1), other.mean(-1))
 
 
-def _related(one: Picture, other: Picture) -> float:
+def _correlate(one: Picture, other: Picture) -> float:
     if min(one.std(), other.std()) <= FLAT:
         return 0.0
     return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])

@@ -33,7 +33,7 @@ class Architecture:
 
     @classmethod
     def of(cls, state: Mapping[str, Tensor]) -> Architecture:
-        """The architecture whose parameters these are. Heads are those of the published size of that width.
+        """Return the architecture whose parameters these are. Heads are those of the published size of that width.
 
         Raises:
             KeyError: `pos_embed` or `x_embedder.proj.weight` is missing.
@@ -74,7 +74,7 @@ class CDiT(nn.Module):
         self.final_layer = FinalLayer(size.width, size.patch**2 * 2 * size.latent_channels)
 
     def forward(self, noisy: Tensor, time: Tensor, motion: Tensor, context: Tensor, shift: Tensor) -> Tensor:
-        """Noise and variance weights, [B, 2 C, H, W].
+        """Return noise and variance weights, [B, 2 C, H, W].
 
         Args:
             noisy: [B, C, H, W], the latent of the future frame at diffusion time `time`.
@@ -94,7 +94,7 @@ class CDiT(nn.Module):
         return self._image(self.final_layer(x, condition))
 
     def _image(self, x: Tensor) -> Tensor:
-        """Patches [B, rows * columns, patch * patch * channels] put side by side."""
+        """Return patches [B, rows * columns, patch * patch * channels] put side by side."""
         side, patch = self.size.latent_side // self.size.patch, self.size.patch
         x = x.unflatten(2, (patch, patch, -1)).unflatten(1, (side, side))
         return x.permute(0, 5, 1, 3, 2, 4).flatten(4, 5).flatten(2, 3)
@@ -112,7 +112,7 @@ class Block(nn.Module):
         self.adaLN_modulation = _modulation(width, 11)
 
     def forward(self, x: Tensor, seen: Tensor, condition: Tensor) -> Tensor:
-        """Patches [B, P, D] after self-attention, a look at the context [B, N P, D] and a feed-forward layer."""
+        """Return patches [B, P, D] after self-attention, a look at the context [B, N P, D] and a feed-forward layer."""
         own, past, ask, mlp = self.adaLN_modulation(condition)[:, None].split(
             [size * x.shape[-1] for size in (3, 2, 3, 3)], dim=-1
         )
@@ -209,7 +209,7 @@ class MotionEmbedder(nn.Module):
 
 
 def modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
-    """Shifted and scaled; at zero it is unchanged."""
+    """Shift and scale; at zero it is unchanged."""
     return x * (1 + scale) + shift
 
 
@@ -218,7 +218,7 @@ def _norm(width: int) -> nn.LayerNorm:
 
 
 def _modulation(width: int, vectors: int) -> nn.Sequential:
-    """Shifts, scales and gates from the condition; zero at first, so that a new block changes nothing."""
+    """Return shifts, scales and gates from the condition; zero at first, so that a new block changes nothing."""
     last = nn.Linear(width, vectors * width)
     nn.init.zeros_(last.weight)
     nn.init.zeros_(last.bias)

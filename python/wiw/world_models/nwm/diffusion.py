@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 
 def scheduler(steps: int) -> DDPMScheduler:
-    """The chain of `steps` out of 1000 diffusion times, the first and the last among them."""
+    """Return the chain of `steps` out of 1000 diffusion times, the first and the last among them."""
     chain = DDPMScheduler(
         num_train_timesteps=1000,
         beta_start=1e-4,
@@ -34,7 +34,7 @@ def sample(
     steps: int,
     device: torch.device,
 ) -> Tensor:
-    """Draws latents [B, C, H, W], each row from its own generator, so that it does not depend on the others.
+    """Draw latents [B, C, H, W], each row from its own generator, so that it does not depend on the others.
 
     `predict` takes noisy latents and diffusion times [B] and gives noise and variance weights [B, 2 C, H, W].
     """

@@ -99,7 +99,7 @@ class NWM(WorldModel):
         self._side = self._network.size.latent_side * 2 ** (len(self._codec.config.block_out_channels) - 1)
 
     def describe(self) -> dict[str, Any]:
-        """Options, what tells the weights from others, and the versions of libraries."""
+        """Return options, what tells the weights from others, and the versions of libraries."""
         from wiw.world_models.nwm.weights import digest
 
         return {**super().describe(), "digest": digest(self._network, self._codec), **versions()}
@@ -109,22 +109,26 @@ class NWM(WorldModel):
         return {**super().identity(), "device": self._place.type}
 
     def __reduce__(self) -> Any:
-        """As options: another process loads the weights itself."""
+        """Pickle as options: another process loads the weights itself."""
         return partial(type(self), **{field.name: getattr(self, field.name) for field in fields(self)}), ()
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Frames one by one; frames of padding are left black."""
+        """Imagine frames one by one; frames of padding are left black."""
         import torch
 
         steps = np.stack([motions(c.trajectory, self.spacing, self.rollout_convention) for c in controls])
-        with torch.inference_mode(), self._mixed(), devices.memory_guard(f"NWM with batch={self.batch}", "lower batch"):
+        with (
+            torch.inference_mode(),
+            self._use_precision(),
+            devices.memory_guard(f"NWM with batch={self.batch}", "lower batch"),
+        ):
             motion = torch.from_numpy(steps).float().to(self._place)
             return self._roll_out(observations, motion, np.array([c.length for c in controls]), seeds)
 
-    def _mixed(self) -> Any:
-        """Where the precision is lower, products are computed in it."""
+    def _use_precision(self) -> Any:
+        """Compute products in the lower precision, where there is one."""
         import torch
 
         dtype = getattr(torch, str(self.precision))
@@ -146,11 +150,11 @@ class NWM(WorldModel):
             rows = np.flatnonzero(lengths > k)
             pixels = self._next(context[rows], motion[rows, k], [generators[row] for row in rows])
             frames[rows, k + 1] = to_frames(pixels, *image.shape[1:3])
-            context[rows] = torch.cat([context[rows, 1:], self._encoded(pixels)[:, None]], dim=1)
+            context[rows] = torch.cat([context[rows, 1:], self._encode(pixels)[:, None]], dim=1)
         return frames
 
     def _first_context(self, observations: Conditioning) -> Tensor:
-        """Latents [B, N, C, h, w] of what was observed before and now."""
+        """Return latents [B, N, C, h, w] of what was observed before and now."""
         from wiw.world_models.nwm.images import to_network
 
         count = self._network.size.context
@@ -159,10 +163,10 @@ class NWM(WorldModel):
         else:
             images = context_images(observations.history, count)
         images = images.reshape(-1, *images.shape[2:])
-        return self._encoded(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
+        return self._encode(to_network(images, self._side).to(self._place)).unflatten(0, (-1, count))
 
     def _next(self, context: Tensor, motion: Tensor, generators: list[Any]) -> Tensor:
-        """The frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""
+        """Return the frame that a motion leads to, pixels [B, 3, side, side] in [-1, 1]."""
         from wiw.world_models.nwm.diffusion import sample
 
         shift = motion.new_full((len(motion),), SHIFT)
@@ -175,6 +179,6 @@ class NWM(WorldModel):
         )
         return self._codec.decode(latents / self._codec.config.scaling_factor).sample.clamp(-1, 1)
 
-    def _encoded(self, pixels: Tensor) -> Tensor:
-        """Latents [B, C, h, w]: the codec's mean."""
+    def _encode(self, pixels: Tensor) -> Tensor:
+        """Return latents [B, C, h, w]: the codec's mean."""
         return self._codec.encode(pixels).latent_dist.mode().float() * self._codec.config.scaling_factor

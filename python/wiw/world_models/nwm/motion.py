@@ -19,14 +19,14 @@ SHIFT = 1 / 128
 """What one step ahead is called in time."""
 
 
-def normalised(steps: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
-    """[..., 3] in metres and radians to what the network takes; turns are wrapped to [-pi, pi)."""
+def normalise_steps(steps: NDArray[np.float64], spacing: float) -> NDArray[np.float64]:
+    """Convert [..., 3] in metres and radians to what the network takes; turns are wrapped to [-pi, pi)."""
     plane = 2 * (steps[..., :2] / spacing - LOW) / (HIGH - LOW) - 1
-    return np.concatenate([plane, _wrapped(steps[..., 2:])], axis=-1)
+    return np.concatenate([plane, _wrap_angle(steps[..., 2:])], axis=-1)
 
 
 def motions(trajectory: NDArray[np.float64], spacing: float, rollout_convention: bool = False) -> NDArray[np.float64]:
-    """What leads from each frame of a rollout to the next, float64 [K, 3].
+    """Return what leads from each frame of a rollout to the next, float64 [K, 3].
 
     Args:
         trajectory: [K, 3], the pose after each action in the frame of the start: x forward, y left, azimuth.
@@ -37,14 +37,14 @@ def motions(trajectory: NDArray[np.float64], spacing: float, rollout_convention:
     """
     poses = np.concatenate([np.zeros((1, 3)), trajectory])
     if rollout_convention:
-        mapped = np.concatenate([np.zeros((1, 3)), normalised(trajectory, spacing)])
+        mapped = np.concatenate([np.zeros((1, 3)), normalise_steps(trajectory, spacing)])
         steps = np.diff(mapped, axis=0)
-        return np.concatenate([steps[:, :2], _wrapped(np.diff(poses[:, 2:], axis=0))], axis=-1)
-    return normalised(_steps(poses), spacing)
+        return np.concatenate([steps[:, :2], _wrap_angle(np.diff(poses[:, 2:], axis=0))], axis=-1)
+    return normalise_steps(_steps(poses), spacing)
 
 
 def _steps(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each pose seen from the one before."""
+    """Return each pose seen from the one before."""
     change, azimuth = np.diff(poses, axis=0), poses[:-1, 2]
     cos, sin = np.cos(azimuth), np.sin(azimuth)
     forward = cos * change[:, 0] + sin * change[:, 1]
@@ -52,5 +52,5 @@ def _steps(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([forward, left, change[:, 2]], axis=-1)
 
 
-def _wrapped(angle: NDArray[np.float64]) -> NDArray[np.float64]:
+def _wrap_angle(angle: NDArray[np.float64]) -> NDArray[np.float64]:
     return (angle + np.pi) % (2 * np.pi) - np.pi

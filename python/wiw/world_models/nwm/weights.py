@@ -21,7 +21,7 @@ CODEC = "stabilityai/sd-vae-ft-ema"
 
 
 def fetch(weights: str, file: str, revision: str | None) -> Path:
-    """The checkpoint on this machine: a file, `file` in a folder, or in a hub repository.
+    """Return the checkpoint on this machine: a file, `file` in a folder, or in a hub repository.
 
     Raises:
         WeightsError: there is none; says what to do.
@@ -43,13 +43,13 @@ def fetch(weights: str, file: str, revision: str | None) -> Path:
 
 
 def codec_beside(checkpoint: Path) -> str:
-    """The codec's folder beside a checkpoint, else the published one on the hub."""
+    """Return the codec's folder beside a checkpoint, else the published one on the hub."""
     folder = checkpoint.with_name("vae")
     return str(folder) if folder.is_dir() else CODEC
 
 
 def load_cdit(path: Path) -> CDiT:
-    """The network with the weights in a file.
+    """Return the network with the weights in a file.
 
     Raises:
         WeightsError: not readable, or not the parameters of a CDiT; says which are missing or too many.
@@ -72,7 +72,7 @@ def load_cdit(path: Path) -> CDiT:
 
 
 def load_codec(vae: str, revision: str | None) -> Any:
-    """The image codec from a local folder or the hub.
+    """Load the image codec from a local folder or the hub.
 
     Raises:
         WeightsError: nothing there, or not a whole AutoencoderKL.
@@ -91,7 +91,7 @@ def load_codec(vae: str, revision: str | None) -> Any:
 
 
 def digest(*networks: torch.nn.Module) -> str:
-    """Hex digest of names, shapes and the first numbers of all parameters: training changes all of a network."""
+    """Digest names, shapes and first numbers of all parameters in hex: training changes them all."""
     total = blake2b(digest_size=20)
     for network in networks:
         for name, value in network.state_dict().items():
@@ -101,7 +101,7 @@ def digest(*networks: torch.nn.Module) -> str:
 
 
 def _state(path: Path) -> dict[str, Tensor]:
-    """The averaged weights of a training checkpoint, or the tensors of a safetensors file."""
+    """Return the averaged weights of a training checkpoint, or the tensors of a safetensors file."""
     if path.suffix == ".safetensors":
         from safetensors import SafetensorError
         from safetensors.torch import load_file

@@ -92,7 +92,7 @@ class Link:
             ContractError: the served model broke its contract.
         """
         if self._closed:
-            raise self._gone()
+            raise self._build_closed_error()
         questions = [_Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
         asked: Future[list[_Question]] = Future()
         self._soon(lambda: asked.set_result([self._submit(question) for question in questions]))
@@ -111,7 +111,7 @@ class Link:
             self._soon(self._loop.stop)
             self._thread.join(5)
 
-    def _gone(self) -> RemoteError:
+    def _build_closed_error(self) -> RemoteError:
         return RemoteError(
             f"the connection to {self.address} was closed on this side; make the model anew", "connection"
         )
@@ -134,7 +134,7 @@ class Link:
         main.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             self._loop.run_until_complete(main)
-        self._give_up(self._gone())
+        self._give_up(self._build_closed_error())
         self._loop.close()
 
     async def _keep(self) -> None:

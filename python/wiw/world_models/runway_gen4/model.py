@@ -89,7 +89,7 @@ class RunwayGen4(WorldModel):
 
     @property
     def credits(self) -> int:  # type: ignore[override]
-        """What the service has charged so far."""
+        """Charges of the service so far."""
         return self._tasks.credits
 
     def rollout(

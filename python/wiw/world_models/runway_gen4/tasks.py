@@ -42,7 +42,7 @@ class Tasks:
 
     @property
     def credits(self) -> int:
-        """What was charged so far."""
+        """Charges so far."""
         return sum(self._charged.values())
 
     def outputs(self, orders: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -85,7 +85,7 @@ class Prompts:
             raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
         path, source = template
         own = self.folder is not None and path.is_relative_to(self.folder)
-        return (self._filling.fill(path, source, slots) if own else worker.filled(source, slots)).strip()
+        return (self._filling.fill(path, source, slots) if own else worker.fill_template(source, slots)).strip()
 
     @cached_property
     def digest(self) -> str:

@@ -41,7 +41,7 @@ class Filling:
         return str(reply["text"])
 
     def _ask(self, job: bytes, path: Path) -> dict[str, str]:
-        process = self._started()
+        process = self._start_process()
         assert process.stdin is not None and process.stdout is not None
         try:
             process.stdin.write(job)
@@ -59,7 +59,7 @@ class Filling:
             )
         raise PromptError(f"{path}: the process that fills it ended with {code}; it takes too much memory or recursion")
 
-    def _started(self) -> subprocess.Popen[bytes]:
+    def _start_process(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             self._process = subprocess.Popen(
                 [sys.executable, worker.__file__],

@@ -44,19 +44,19 @@ def unknown_slot(source: str, slots: Mapping[str, Any]) -> str | None:
 
 
 @cache
-def compiled(source: str) -> Any:
+def compile_template(source: str) -> Any:
     """Return the template of a source."""
     return ENVIRONMENT.from_string(source)
 
 
-def filled(source: str, slots: Mapping[str, Any]) -> str:
+def fill_template(source: str, slots: Mapping[str, Any]) -> str:
     """Return a template with its slots filled.
 
     Raises:
         ValueError: it is too long.
     """
     parts, size = [], 0
-    for part in compiled(source).generate(**slots):
+    for part in compile_template(source).generate(**slots):
         parts.append(part)
         size += len(part)
         if size > CHARACTERS:
@@ -68,7 +68,7 @@ def answer(job: Mapping[str, Any]) -> dict[str, str]:
     """Return what came of a job: "text", "unknown" or "error"."""
     try:
         unknown = unknown_slot(job["source"], job["slots"]) if job["check"] else None
-        return {"text": filled(job["source"], job["slots"])} if unknown is None else {"unknown": unknown}
+        return {"text": fill_template(job["source"], job["slots"])} if unknown is None else {"unknown": unknown}
     except MemoryError:
         return {"error": f"MemoryError: expected a prompt that takes at most {MEMORY >> 20} MiB to fill"}
     except Exception as error:  # an expression can raise anything
