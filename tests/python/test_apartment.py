@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The apartment generator as users meet it; its geometry and light are tested in cpp/tests/apartment/apartment_test.cpp."""
+"""The apartment generator as users meet it; cpp/tests/apartment tests its geometry and light."""
 
 from __future__ import annotations
 
