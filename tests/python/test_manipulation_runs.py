@@ -80,9 +80,9 @@ def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
         TaskRecipe("manipulation", SHORT),
         agent,
         4,
-        0,
-        tmp_path / "two",
-        2,
+        seed=0,
+        out=tmp_path / "two",
+        workers=2,
         progress=False,
         live=1,
         fidelity=True,
@@ -108,8 +108,8 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
             TaskRecipe("manipulation", SHORT),
             agent,
             4,
-            0,
-            tmp_path,
+            seed=0,
+            out=tmp_path,
             progress=False,
             live=1,
             fidelity=True,
@@ -178,7 +178,7 @@ def test_failures_have_a_stage_to_blame(tmp_path: Path) -> None:
     """One push is within four poses of one who is told the truth; two are not, whoever is told."""
     agent = AgentRecipe(POLICY, "copy", candidates=2)
     options = {"tasks": "push_buttons", "actions": 4, "seed": 3}
-    log = evaluate(TaskRecipe("manipulation", options), agent, 2, 3, tmp_path, progress=False, keep_images=0)
+    log = evaluate(TaskRecipe("manipulation", options), agent, 2, seed=3, out=tmp_path, progress=False, keep_images=0)
     assert [episode["metrics"]["success"] for episode in log.episodes] == [0.0, 0.0]
     found = wiw.blame(tmp_path, progress=False)["copy"]
     assert found.verdicts["beyond"] == 1 and sum(found.verdicts.values()) == 2
@@ -223,6 +223,6 @@ def test_refused_ways_are_on_record(tmp_path: Path) -> None:
 
 def test_intervals_say_that_every_episode_has_a_table_of_its_own(run: Path) -> None:
     summary = load_run(run).summary()
-    assert "over 4 episodes, each in a scene of its own" in str(summary)
+    assert "over 4 episodes, each in its own scene" in str(summary)
     assert set(summary.kinds) == {"push_buttons", "slide_block"}
     assert all(estimate.n == 2 for found in summary.kinds.values() for estimate in found.values())

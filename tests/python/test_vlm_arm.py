@@ -331,7 +331,7 @@ def test_runs_against_a_server_are_recorded_and_verified(tmp_path: Path) -> None
 def test_a_server_that_is_too_slow_is_infrastructure(tmp_path: Path) -> None:
     with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"slow": 1.0}, slow_seconds=0.5)) as server:
         policy = ArmVLM(server.url, model="mock", cache="off", attempts=1, timeout=0.1)
-        log = evaluate(Manipulation(), wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False)
+        log = evaluate(Manipulation(), wiw.Agent(policy), 1, seed=0, out=tmp_path / "run", progress=False)
         (episode,) = log.episodes
         assert episode["status"] == "error" and episode["kind"] == "vlm/timeout"
 

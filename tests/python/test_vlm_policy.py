@@ -328,7 +328,7 @@ def test_recipes_that_name_no_server_are_replayed_too() -> None:
 def test_a_server_that_is_down_is_infrastructure(tmp_path: Path, two_rooms: str) -> None:
     with MisbehavingVlmServer(MockClient(), misbehaviour=Misbehaviour({"500": 1.0})) as server:
         policy = VLM(server.url, model="mock", cache="off", attempts=1)
-        log = evaluate("imagenav", wiw.Agent(policy), 1, 0, tmp_path / "run", progress=False, scenes=two_rooms)
+        log = evaluate("imagenav", wiw.Agent(policy), 1, seed=0, out=tmp_path / "run", progress=False, scenes=two_rooms)
         (episode,) = log.episodes
         assert episode["status"] == "error" and episode["kind"] == "vlm/status"
 
