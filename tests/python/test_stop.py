@@ -70,7 +70,7 @@ def test_a_run_that_is_stopped_inside_a_model_says_so(tmp_path: Path, sent: int,
     _, shown = process.communicate(timeout=120)
     assert process.returncode == code, shown
     assert "wiw resume" in shown and "terminate called" not in shown and "Traceback" not in shown
-    assert RunStore.begun(tmp_path / "run")
+    assert RunStore.exists(tmp_path / "run")
 
 
 def test_a_run_whose_calls_outlive_the_deadline_is_invalid_and_ends(tmp_path: Path) -> None:

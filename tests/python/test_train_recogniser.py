@@ -125,7 +125,7 @@ def test_looks_are_counted_through(lesson: Any) -> None:
     np.testing.assert_array_equal(second.glimpses.boxes, looks.glimpses.boxes[7:])
     with pytest.raises(ArgumentError, match="none"):
         merge_glimpse_sets([])
-    with pytest.raises(ArgumentError, match="two sets"):
+    with pytest.raises(ArgumentError, match="two glimpse sets"):
         split_in_half(first)
 
 

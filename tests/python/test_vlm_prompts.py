@@ -46,18 +46,18 @@ def test_a_template_that_takes_too_much_or_does_not_end_is_refused(tmp_path: Pat
 def test_a_template_may_be_too_much_for_one_situation_and_not_for_the_next(tmp_path: Path) -> None:
     own_prompt(tmp_path, "{{ 'x' * plan_num }}{% for a in range(plan_num) %}" + LOOP + "{% endfor %}{% endfor %}")
     own = Prompts(tmp_path)
-    assert own.text("imagenav", "planner", **{**SLOTS, "plan_num": 2}) == "xx"
+    assert own.render("imagenav", "planner", **{**SLOTS, "plan_num": 2}) == "xx"
     for plan_num, said in ((2000, "at most 2 s"), (2 << 20, "at most 1048576 characters")):
         with pytest.raises(PromptError, match=said):
-            own.text("imagenav", "planner", **{**SLOTS, "plan_num": plan_num})
+            own.render("imagenav", "planner", **{**SLOTS, "plan_num": plan_num})
     again = pickle.loads(pickle.dumps(own))
-    assert own.text("imagenav", "planner", **SLOTS) == again.text("imagenav", "planner", **SLOTS) == "x"
+    assert own.render("imagenav", "planner", **SLOTS) == again.render("imagenav", "planner", **SLOTS) == "x"
     assert own.digest == again.digest
 
 
 def test_raw_and_comment_blocks_that_end_are_fine(tmp_path: Path) -> None:
     own_prompt(tmp_path, "{# a note #}{% raw %}{{ braces }}{% endraw %} {{ plan_num }}")
-    assert Prompts(tmp_path).text("imagenav", "planner", **SLOTS) == "{{ braces }} 1"
+    assert Prompts(tmp_path).render("imagenav", "planner", **SLOTS) == "{{ braces }} 1"
 
 
 @pytest.mark.parametrize("task", list_tasks())
@@ -68,6 +68,6 @@ def test_shipped_templates_say_the_same_as_a_users(tmp_path: Path, task: str) ->
         (tmp_path / task / file.name).write_text(file.read_text())
     own, shipped = Prompts(tmp_path), Prompts()
     for file in (FOLDER / task).glob("*.j2"):
-        text = own.text(task, file.stem, **slots)
-        assert text == shipped.text(task, file.stem, **slots) and text
+        text = own.render(task, file.stem, **slots)
+        assert text == shipped.render(task, file.stem, **slots) and text
     assert own.digest == shipped.digest
