@@ -31,16 +31,17 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
 from wiw.loop.limits import DEADLINE
+from wiw.loop.model_wrapper import ModelWrapper
 from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, WorldModel, check_rollout, patience
+from wiw.world_models.base import WorldModel, check_rollout, patience
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
 """Seconds before the second and the third try; a server that restarts may be back by then."""
 
 
-class Attempted(WorldModel):
+class Attempted(ModelWrapper):
     """A world model whose answers are held to the contract and to a deadline.
 
     Args:
@@ -52,22 +53,13 @@ class Attempted(WorldModel):
     def __init__(self, model: WorldModel, deadline: float = DEADLINE) -> None:
         if not deadline > 0:
             raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
-        self.model, self.deadline = model, deadline
+        super().__init__(model)
+        self.deadline = deadline
         self._tally: Counter[str] = Counter()
         self._helper: _Helper | None = None
 
     def __reduce__(self) -> Any:
         return Attempted, (self.model, self.deadline)
-
-    @property
-    def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's."""
-        return self.model.accepts
-
-    @property
-    def unwrapped(self) -> WorldModel:
-        """The model behind everything that wraps it."""
-        return self.model.unwrapped
 
     @property
     def spent(self) -> Mapping[str, float]:
@@ -76,15 +68,7 @@ class Attempted(WorldModel):
         `calls` that the model has answered or not, their `rows` and `frames` (padding and frames that other rows answer
         left out), and `retries`, calls that repeat one that gave nothing.
         """
-        return {**self.model.spent, **self._tally}
-
-    def describe(self) -> dict[str, Any]:
-        """Describe the model."""
-        return self.model.describe()
-
-    def fingerprint(self) -> str:
-        """Return the model's."""
-        return self.model.fingerprint()
+        return {**super().spent, **self._tally}
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]

@@ -31,8 +31,9 @@ from numpy.typing import NDArray
 from wiw.errors import ArgumentError
 from wiw.loop.clock import time_apart
 from wiw.loop.limits import BUDGET_GB
+from wiw.loop.model_wrapper import ModelWrapper
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import Accepts, WorldModel
+from wiw.world_models.base import WorldModel
 
 _log = logging.getLogger("wiw.rollouts")
 _HEADER = struct.Struct("<8s6I")
@@ -159,36 +160,19 @@ class RolloutCache:
         return found
 
 
-class Cached(WorldModel):
+class Cached(ModelWrapper):
     """A world model that is asked only for rows that the cache does not hold."""
 
     def __init__(self, model: WorldModel, cache: RolloutCache) -> None:
-        self.model, self.cache = model, cache
+        super().__init__(model)
+        self.cache = cache
         self._cached_rows = 0
         self._identity = f"{model.fingerprint()} {replace(model.accepts, best_batch=1)}".encode()
 
     @property
-    def accepts(self) -> Accepts:  # type: ignore[override]
-        """The model's."""
-        return self.model.accepts
-
-    @property
-    def unwrapped(self) -> WorldModel:
-        """The model behind everything that wraps it."""
-        return self.model.unwrapped
-
-    @property
     def spent(self) -> Mapping[str, float]:
         """Requests to the model, and `cached_rows` that it was not."""
-        return {**self.model.spent, "cached_rows": self._cached_rows}
-
-    def describe(self) -> dict[str, Any]:
-        """Describe the model."""
-        return self.model.describe()
-
-    def fingerprint(self) -> str:
-        """Return the model's."""
-        return self.model.fingerprint()
+        return {**super().spent, "cached_rows": self._cached_rows}
 
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
