@@ -5,7 +5,11 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,63 +66,30 @@ def cpp_edges() -> set[tuple[str, str]]:
     return edges
 
 
-def modules() -> dict[str, Path]:
-    """Every module of the package but the root, which only names what is public."""
-    package = ROOT / "python/wiw"
-    named = {file.relative_to(package).with_suffix(""): file for file in package.rglob("*.py")}
-    return {".".join(p for p in path.parts if p != "__init__"): file for path, file in named.items()}
+def load_structure() -> Any:
+    """Load the script that measures a checkout; it finds imports and circles."""
+    loader = SourceFileLoader("structure", str(ROOT / "scripts/structure"))
+    module = module_from_spec(spec_from_loader("structure", loader))
+    written, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # no cache beside the scripts
+    try:
+        loader.exec_module(module)
+    finally:
+        sys.dont_write_bytecode = written
+    return module
+
+
+STRUCTURE = load_structure()
 
 
 def file_edges() -> dict[str, set[str]]:
     """Imports of each module, wherever they stand in the file: lazy ones and those for type checkers count."""
-    known = modules()
-    edges: dict[str, set[str]] = {}
-    for name, file in known.items():
-        if name:
-            found = {target for node in ast.walk(ast.parse(file.read_text())) for target in targets(node)}
-            edges[name] = {nearest(target, known) for target in found} - {name, ""}
-    return edges
-
-
-def targets(node: ast.AST) -> set[str]:
-    """What of wiw a statement imports, as "room.module" or "room.module.name"."""
-    if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "wiw":
-        module = node.module.removeprefix("wiw").lstrip(".")
-        return {f"{module}.{alias.name}".lstrip(".") for alias in node.names}
-    if isinstance(node, ast.Import):
-        return {alias.name.removeprefix("wiw.") for alias in node.names if alias.name.startswith("wiw.")}
-    return set()
-
-
-def nearest(target: str, known: dict[str, Path]) -> str:
-    """The module itself, or the one that has the name; the compiled core is one module."""
-    if target.split(".", maxsplit=1)[0] == "_core":
-        return "_core"
-    while target and target not in known:
-        target = target.rpartition(".")[0]
-    return target
+    package = ROOT / "python/wiw"
+    return STRUCTURE.imports(package, {file: ast.parse(file.read_text()) for file in package.rglob("*.py")})
 
 
 def python_edges() -> set[tuple[str, str]]:
     pairs = {(a.split(".")[0], b.split(".")[0]) for a, others in file_edges().items() for b in others}
     return {(a, b) for a, b in pairs if a != b}
-
-
-def circles(edges: dict[str, set[str]]) -> list[list[str]]:
-    """Groups of modules that reach each other."""
-    reach = {name: reachable(name, edges) for name in edges}
-    groups = {tuple(sorted(other for other in reach[name] if name in reach.get(other, ()))) for name in edges}
-    return [list(group) for group in sorted(groups) if group]
-
-
-def reachable(start: str, edges: dict[str, set[str]]) -> set[str]:
-    found, waiting = set[str](), [start]
-    while waiting:
-        for other in edges.get(waiting.pop(), ()):
-            if other not in found:
-                found.add(other)
-                waiting.append(other)
-    return found
 
 
 @pytest.mark.parametrize("edge", sorted(cpp_edges()), ids="->".join)
@@ -176,8 +147,8 @@ def test_the_core_knows_no_python() -> None:
 
 
 def test_a_circle_of_files_is_found() -> None:
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [["a", "b", "c"]]
+    assert STRUCTURE.circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [("a", "b", "c")]
 
 
 def test_no_files_import_each_other_in_a_circle() -> None:
-    assert circles(file_edges()) == []
+    assert STRUCTURE.circles(file_edges()) == []
