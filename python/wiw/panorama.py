@@ -187,7 +187,7 @@ def from_cubemap(faces: Image, size: Size, interpolation: Interpolation = "bilin
 
 
 def rotate(pano: Image, yaw_deg: float, interpolation: Interpolation = "bilinear") -> Image:
-    """What is seen after a turn to the left by ``yaw_deg``: 22.5 degrees roll the image by exactly +W/16 columns.
+    """Return the view after a turn to the left by ``yaw_deg``: 22.5 degrees roll the image by exactly +W/16 columns.
 
     Whole columns are copied whatever the type; other yaws blend neighbouring columns (uint32: only ``"nearest"``).
     """

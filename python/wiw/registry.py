@@ -95,7 +95,7 @@ class Registry:
         return self._check_kind(what, self._construct(what, found, options) if _makes(found) else found)
 
     def fitting(self, what: Any, **options: Any) -> Any:
-        """What `make` would call with these options, or the instance that it would return.
+        """Return what `make` would call with these options, or the instance that it would return.
 
         Raises:
             RegistryError: as of `make`, but for what shows only as it is made.
@@ -152,7 +152,7 @@ def _makes(thing: Any) -> bool:
 
 
 def _attribute(path: str) -> Any:
-    """What `path.py:Name` or `package.module:Name` names."""
+    """Return the object that `path.py:Name` or `package.module:Name` names."""
     module_name, _, attribute = path.rpartition(":")
     if not module_name.endswith(".py"):
         return getattr(importlib.import_module(module_name), attribute)

@@ -217,7 +217,7 @@ class Control:
 
 @dataclass(frozen=True)
 class History:
-    """What was observed before each row's rollout begins: N frames, oldest first, of which the last is frame 0.
+    """Observations before each row's rollout begins: N frames, oldest first, of which the last is frame 0.
 
     The frames are those of the decisions so far, as the agent observes once per decision, and so a varying number of
     actions apart. Where a plan begins with turns, frame 0 is the present observation after them, and the present

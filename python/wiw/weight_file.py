@@ -38,7 +38,7 @@ class WeightFile(Generic[N]):
 
     @property
     def cure(self) -> str:
-        """What to do without a file."""
+        """Return advice for a missing file."""
         return f"`wiw train {self.name}` makes some"
 
     def load(self, path: str | Path) -> tuple[N, dict[str, Any]]:
@@ -97,7 +97,7 @@ class WeightFile(Generic[N]):
 
 
 def digest(values: Mapping[str, Tensor]) -> str:
-    """Of names and values."""
+    """Return the digest of names and values."""
     found = blake2b(digest_size=16)
     for name in sorted(values):
         found.update(name.encode() + b"\0" + values[name].cpu().numpy().tobytes())

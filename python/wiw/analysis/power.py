@@ -25,7 +25,7 @@ _DRAWS = 2_000_000
 
 @dataclass(frozen=True)
 class Power:
-    """What `wiw.power` returns; shows itself as a sentence or two."""
+    """The answer of `wiw.power`; shows itself as a sentence or two."""
 
     difference: float
     """Points of success rate between two arms that the run shows."""
@@ -126,7 +126,7 @@ def power(
 
 @dataclass(frozen=True)
 class _Plan:
-    """What does not change while scenes, or the difference, are sought."""
+    """The fixed inputs while the number of scenes, or the difference, is searched for."""
 
     losses: float
     correlation: float

@@ -62,7 +62,7 @@ def _below(text: Any) -> Any:
 
 
 def _row(name: str) -> _Row:
-    """Of a registered model. Those that tell when they are made, such as a server's, have dashes."""
+    """Return the row of a registered model. Those that tell when they are made, such as a server's, have dashes."""
     from wiw.world_models.base import Accepts
     from wiw.world_models.status import lacks
 

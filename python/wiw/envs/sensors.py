@@ -46,7 +46,7 @@ class Sensors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the cameras, the front one first."""
+        """Names of the cameras, the front one first."""
         return tuple(dict.fromkeys(["front", *self.cameras]))
 
     @property

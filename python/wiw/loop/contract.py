@@ -17,7 +17,7 @@ from wiw.world_models.oracle import Oracle
 
 
 class PlanChecker(Protocol):
-    """What is asked of a plan space here."""
+    """The part of a plan space that is needed here."""
 
     def check_plan(self, source: str, actions: Any, longest: int) -> NDArray[Any]:
         """See `wiw.loop.plan_space.PlanSpace.check_plan`."""

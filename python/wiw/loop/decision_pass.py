@@ -26,7 +26,7 @@ from wiw.types import Answer, Decision, Proposal
 
 @dataclass(frozen=True)
 class Components:
-    """What an agent consists of, ready to decide."""
+    """The parts of an agent, looked up and ready to decide."""
 
     policy: Policy
     imaginer: Imaginer

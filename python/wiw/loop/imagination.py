@@ -25,7 +25,7 @@ from wiw.world_models.base import Accepts, WorldModel
 
 @dataclass(frozen=True)
 class ModelInput:
-    """What a world model is shown of one episode; it need not be the episode's own (`wiw.experiments.placebos`)."""
+    """Inputs of a world model for one episode; they need not be the episode's own (`wiw.experiments.placebos`)."""
 
     observation: Any
     """`Observation` or `ArmObservation`."""

@@ -45,7 +45,7 @@ def read_observation(observation: Any) -> Observation | ArmObservation:
 
 @dataclass
 class EpisodeMemory:
-    """Of one live episode."""
+    """Memory of one live episode."""
 
     proposer: Any
     """Memory of the proposing policy; the reviser's too where one policy is both."""

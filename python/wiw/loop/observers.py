@@ -17,7 +17,7 @@ from wiw.types import Decision, Proposal
 
 @dataclass(frozen=True)
 class Futures:
-    """What the reviser is about to score."""
+    """The futures that the reviser is about to score."""
 
     reviser: Policy
     space: PlanSpace

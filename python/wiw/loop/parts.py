@@ -23,7 +23,7 @@ from wiw.types import PRIMITIVES
 
 @dataclass(frozen=True)
 class Parts:
-    """What an agent is made of, before anything is looked up; see `wiw.Agent`."""
+    """The parts of an agent, before anything is looked up; see `wiw.Agent`."""
 
     policy: Any
     model: Any

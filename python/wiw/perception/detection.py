@@ -110,7 +110,7 @@ def check_images(
 
 
 def suppress_duplicates(found: Detections, overlap: float) -> Detections:
-    """Of boxes with one name that overlap by more than `overlap` (IoU), keep the one with the highest score
+    """Keep, of boxes with one name that overlap by more than `overlap` (IoU), the one with the highest score
     (greedily).
     """
     order = np.argsort(-found.scores, kind="stable")

@@ -207,7 +207,7 @@ class Story:
 
     @property
     def target(self) -> str:
-        """What is to be recognised, where the task is that."""
+        """Return the category to be recognised, in tasks of recognition."""
         return str(self.episode.info.get("category", ""))
 
 

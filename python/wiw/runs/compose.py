@@ -27,7 +27,7 @@ from wiw.world_models.base import WorldModel
 
 @dataclass(frozen=True)
 class RunContext:
-    """What an agent is run on: the task, and the episodes of the whole run."""
+    """The task that an agent is run on, and the episodes of the whole run."""
 
     task: Any
     episodes: Sequence[Episode] = ()
@@ -35,7 +35,7 @@ class RunContext:
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is done to an agent to learn about it; see `wiw.experiments`."""
+    """The experiments done to an agent; see `wiw.experiments`."""
 
     placebo: str | None = None
     """"shuffled" or "swapped"."""

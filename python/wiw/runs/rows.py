@@ -53,7 +53,7 @@ class AgainRow:
 
 @dataclass(frozen=True)
 class LostRow:
-    """What a decision of an arm had asked for when it failed."""
+    """Costs of a decision that ended in an error."""
 
     arm: str
     spent: Mapping[str, float]
@@ -61,7 +61,7 @@ class LostRow:
 
 @dataclass(frozen=True)
 class AgentRow:
-    """What an arm's agent said of itself when it was built."""
+    """Description of an arm's agent, from when it was built."""
 
     arm: str
     agent: dict[str, Any]

@@ -46,7 +46,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verification:
-    """What `wiw.verify` returns; prints as one line an episode."""
+    """The answer of `wiw.verify`; prints as one line per episode."""
 
     run: Path
     checks: tuple[Check, ...]

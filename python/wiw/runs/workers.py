@@ -31,7 +31,7 @@ Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
 class Desk(Protocol):
-    """What the workers report to."""
+    """The receiver of the workers' reports."""
 
     def write(self, row: Row) -> None:
         """Write that an agent was built, a decision was taken, or an episode has ended."""
@@ -42,7 +42,7 @@ class Desk(Protocol):
 
 @dataclass(frozen=True)
 class Plan:
-    """What every process must know to run any job."""
+    """Everything a process must know to run any job."""
 
     task: Any
     """Recipe."""

@@ -28,7 +28,7 @@ UNCLEAR = (Error, ValueError, LookupError, TypeError, AttributeError, OverflowEr
 
 @dataclass(frozen=True)
 class Response:
-    """What a request is answered."""
+    """The answer to a request."""
 
     status: int
     body: Mapping[str, Any]

@@ -60,7 +60,7 @@ class Row:
 
 
 class Questions:
-    """What the loop would ask a model in the first moments of some episodes.
+    """The requests that the loop would make of a model in the first moments of some episodes.
 
     Args:
         model: who is asked: about primitives in scenes, or, if it takes poses, about poses at a table.

@@ -35,7 +35,7 @@ ProgressBar = Callable[[Iterable[str], str, int], Iterable[str]]
 
 @dataclass(frozen=True)
 class Job:
-    """What is built from each source."""
+    """The result that is built from each source."""
 
     name: str
     """Description for progress bars."""

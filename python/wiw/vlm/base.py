@@ -57,7 +57,7 @@ class Client(ABC):
 
     @property
     def manner(self) -> str:
-        """What answers depend on beside the model's name and the call; part of the names of cached answers."""
+        """Settings that answers depend on beside the model's name and the call; part of the names of cached answers."""
         return ""
 
     @abstractmethod

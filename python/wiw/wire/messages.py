@@ -42,7 +42,7 @@ class Hello:
 
 @dataclass(frozen=True)
 class Welcome:
-    """What is served."""
+    """The server's description of the model it serves."""
 
     accepts: str
     """JSON of `wiw.Accepts`."""

@@ -221,7 +221,7 @@ class WorldModel(ABC):
 
     @property
     def spent(self) -> Mapping[str, float]:
-        """What the model has used up so far, for the cost ledger (`Decision.spent`)."""
+        """Resources that the model has used up so far, for the cost ledger (`Decision.spent`)."""
         return {} if self.credits is None else {"credits": self.credits}
 
     @classmethod  # noqa: B027 - most models have nothing to say

@@ -30,7 +30,7 @@ MIN_CLEARANCE = 0.45
 
 @dataclass(frozen=True)
 class TargetSighting:
-    """What the real observation shows of the target's position. Angles in radians, left positive."""
+    """The target's position in the real observation. Angles in radians, left positive."""
 
     bearing: float
     distance: float

@@ -18,7 +18,7 @@ Offload = Literal["none", "model", "sequential"]
 
 
 class Loadable(Protocol):
-    """What is read here of a video model (`wiw.world_models.video.model.VideoModel`)."""
+    """The attributes of a video model that are read here (`wiw.world_models.video.model.VideoModel`)."""
 
     pipeline_class: ClassVar[str]
     half_precision: ClassVar[Precision]

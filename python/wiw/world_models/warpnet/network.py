@@ -21,7 +21,7 @@ NEAREST, FARTHEST = 0.05, 20.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """Of the view ahead, in the network's own size."""
+    """Prediction of the view ahead, in the network's own size."""
 
     log_distance: Tensor
     """[B, 1, h, w], of metres along the ray."""
@@ -115,7 +115,7 @@ class Network(nn.Module):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Of panoramas; pixels are as wide as high in degrees."""
+        """Size of panoramas; pixels are as wide as high in degrees."""
         return self.height, 2 * self.height
 
     def forward(self, source: Tensor, ahead: Tensor) -> Prediction:
