@@ -36,8 +36,10 @@ class Row:
 
     @property
     def shape(self) -> tuple[Any, ...]:
-        """Return what the rows of a batch have in common: the number of actions, the shapes of ids and of the history's
-        poses, and the ids' kind."""
+        """Return what the rows of a batch have in common.
+
+        The number of actions, the shapes of ids and of the history's poses, and the ids' kind.
+        """
         ids, past = self.control.ids, self.history
         kinds = () if ids is None else (ids.shape, ids.dtype.str)
         return len(self.control.actions), *kinds, *(() if past is None else past.poses.shape[1:])
