@@ -23,7 +23,7 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 
 import torch
-from test_loop_poses import asked, plan_of
+from test_loop_poses import imagine_plans, plan_of
 
 from wiw.world_models.video.actions import checkpoint
 from wiw.world_models.video.actions.encoder import HIDDEN, ActionEncoder
@@ -231,7 +231,7 @@ def test_poses_steer_a_front_view(made, world_model_options, tmp_path: Path) -> 
     usual = made("svd-action", checkpoint=str(folder), size=None)
     assert usual.accepts.size == (448, 448) == pickle.loads(pickle.dumps(usual)).accepts.size
     assert made("svd-action", checkpoint=str(folder), size=[576, 1024]).accepts.size == (576, 1024)
-    (rollouts,) = asked(model, [plan_of(5, 0.3), plan_of(5, 0.7)]).rollouts
+    (rollouts,) = imagine_plans(model, [plan_of(5, 0.3), plan_of(5, 0.7)]).rollouts
     assert [rollout.frames.shape for rollout in rollouts] == [(5, 48, 48, 3)] * 2
     assert np.abs(rollouts[0].frames.astype(int) - rollouts[1].frames).mean() > 0.02
 

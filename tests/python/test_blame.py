@@ -65,7 +65,7 @@ def change(run: Path, statement: str, *values: Any) -> None:
         assert store.execute(statement, values).rowcount > 0
 
 
-def succeeded(run: Path, arm: str) -> dict[int, bool]:
+def success_by_episode(run: Path, arm: str) -> dict[int, bool]:
     return {row["episode"]: bool(row["metrics"]["success"]) for row in wiw.load_run(run).episodes if row["arm"] == arm}
 
 
@@ -80,7 +80,7 @@ def test_all_three_swaps_are_the_ceiling(blamed: Any) -> None:
 
 
 def test_a_world_model_that_lies_is_to_blame(blamed: Any) -> None:
-    with_truth, line = succeeded(blamed.run, "oracle"), blamed["liar"]
+    with_truth, line = success_by_episode(blamed.run, "oracle"), blamed["liar"]
     assert line.failures and sum(with_truth.values())
     for one in line.episodes:  # the very run of the arm "oracle"
         assert one.success["imagination"] == with_truth[one.episode]
@@ -106,7 +106,7 @@ def test_the_oracle_is_not_told_the_truth_twice(blamed: Any) -> None:
 def test_every_failure_and_only_failures_are_run_again(blamed: Any) -> None:
     rows = again(blamed.run)
     for arm in AGENTS:
-        failed = {episode for episode, good in succeeded(blamed.run, arm).items() if not good}
+        failed = {episode for episode, good in success_by_episode(blamed.run, arm).items() if not good}
         assert {episode for name, episode in rows if name == f"{arm}/all"} == failed
     assert all(row["status"] == "done" for row in rows.values())
 

@@ -158,7 +158,7 @@ def test_a_young_episode_is_padded_with_its_first_frame_and_says_so(task: ImageN
 
 
 def test_a_model_can_tell_a_turning_agent_from_a_standing_one() -> None:
-    def asked(*turned):
+    def question_after(*turned):
         """The agent looks as it does now, wherever it has looked before."""
         model, agent = Watching(), None
         agent = wiw.Agent(Walking(), model, candidates=1, horizon=4, execute=1)
@@ -168,7 +168,7 @@ def test_a_model_can_tell_a_turning_agent_from_a_standing_one() -> None:
             agent.decide(observation, Goal("x"), Key(0, 0, decision))
         return model._calls[-1][0]
 
-    standing, turning = asked(0.0, 0.0), asked(-2 * TURN, -TURN)
+    standing, turning = question_after(0.0, 0.0), question_after(-2 * TURN, -TURN)
     np.testing.assert_array_equal(standing.image, turning.image)
     np.testing.assert_allclose(turning.history.poses[0, :, 2], [-2 * TURN, -TURN, 0], atol=1e-12)
     assert not standing.history.poses.any() and standing.history.count.tolist() == [3]
@@ -456,16 +456,16 @@ def test_the_cache_tells_histories_apart_but_not_batches(tmp_path: Path) -> None
     model = Chunked(frames=0)
     model.fingerprint = lambda: "chunked"
 
-    def asked(history, rows=1):
+    def count_rows(history, rows=1):
         before = len(model._calls)
         seen = replace(observations, image=np.repeat(observations.image, rows, 0), history=history)
         Cached(Attempted(model), RolloutCache(tmp_path)).rollout(seen, controls * rows, np.zeros(rows, np.uint64))
         return sum(len(call[1]) for call in model._calls[before:])
 
-    assert asked(given) == 1 and asked(given) == 0
+    assert count_rows(given) == 1 and count_rows(given) == 0
     for name, other in others.items():
-        assert asked(other) == 1, name
-    assert asked(stack_histories([past, long], 3), rows=2) == 1  # one is known, whatever stands beside it
+        assert count_rows(other) == 1, name
+    assert count_rows(stack_histories([past, long], 3), rows=2) == 1  # one is known, whatever stands beside it
 
 
 def test_gripper_poses_are_absolute_and_their_actions_poses() -> None:

@@ -168,7 +168,7 @@ def imagine(model: Any, proposals: Any, observations: Any) -> Any:
     return space.imagine(model, Request(space, keys, observations, inputs, proposals, origins, frames, Clock()))
 
 
-def asked(model: Any, plans: Any, episodes: int = 1) -> Any:
+def imagine_plans(model: Any, plans: Any, episodes: int = 1) -> Any:
     env = DotEnv(DotTask())
     observations = [env.begin(episode) for episode in DotTask().episodes(episodes)]
     proposals = [[Proposal(np.asarray(plan, float), text="to the left") for plan in plans] for _ in observations]
@@ -181,7 +181,7 @@ def plan_of(count: int, end: float = 1.0) -> Any:
 
 def test_a_plan_is_imagined_at_the_models_length_and_seen_at_its_own_poses() -> None:
     model = Spy()
-    found = asked(model, [plan_of(5), plan_of(50)])
+    found = imagine_plans(model, [plan_of(5), plan_of(50)])
     ((_, controls, _),) = model._calls
     for control in controls:
         assert control.ids.shape == (14, 7) and control.length == 13 and (control.actions == NULL).all()
@@ -196,14 +196,14 @@ def test_a_plan_is_imagined_at_the_models_length_and_seen_at_its_own_poses() -> 
 
 def test_a_model_of_any_length_gets_the_plan_itself() -> None:
     model = Spy(control="action", space="pose7", best_batch=2)
-    asked(model, [plan_of(5), plan_of(3), plan_of(5, 0.7), plan_of(5, 0.2)])
+    imagine_plans(model, [plan_of(5), plan_of(3), plan_of(5, 0.7), plan_of(5, 0.2)])
     assert [[len(c.ids) for c in controls] for _, controls, _ in model._calls] == [[4], [6, 6], [6]]
     np.testing.assert_array_equal(model._calls[1][1][0].ids[1:], plan_of(5))
 
 
 def test_equal_plans_of_an_episode_are_asked_once() -> None:
     model = Spy()
-    found = asked(model, [plan_of(5), plan_of(5), plan_of(5, 0.7)], episodes=2)
+    found = imagine_plans(model, [plan_of(5), plan_of(5), plan_of(5, 0.7)], episodes=2)
     assert [call["rows"] for call in found.costs] == [2, 2]
     np.testing.assert_array_equal(found.rollouts[0][0].frames, found.rollouts[0][1].frames)
     seeds = np.concatenate([seeds for _, _, seeds in model._calls])
@@ -212,7 +212,7 @@ def test_equal_plans_of_an_episode_are_asked_once() -> None:
 
 def test_words_are_the_policys_or_made_of_the_poses() -> None:
     model = Spy(control="text", frames=9)
-    asked(model, [plan_of(5)])
+    imagine_plans(model, [plan_of(5)])
     ((observations, controls, _),) = model._calls
     assert controls[0].text == "to the left" and controls[0].ids is None
     assert observations.image.shape == (1, 32, 32, 3)

@@ -39,7 +39,7 @@ def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
     results = []
     for index in range(4):
         env.reset(options={"episode": index})
-        assert not env.table.succeeded()
+        assert not env.table.is_success()
         results.append(solved(env, discrete))
     assert sum(result["success"] for result in results) >= 3
     assert all(result["poses"] <= 15 for result in results)

@@ -192,7 +192,7 @@ def test_a_guide_knows_what_plans_are_worth() -> None:
     before = bench.pose
     assert len(plan) == 5 and guide.worth(plan) > guide.worth(still) > -20
     np.testing.assert_array_equal(bench.pose, before)
-    while not env.table.succeeded():
+    while not env.table.is_success():
         env.run(env.guide().plan(5))
     assert env.guide().worth(bench.pose[None]) == 0.0
 

@@ -70,7 +70,7 @@ def plan(*actions: int, shared: int = 0) -> Control:
     return Control(ids, trajectory, viewpoints, length=len(ids), shared=shared)
 
 
-def asked(model: Served, observations: Conditioning, *plans: Control, seed: int = 5) -> np.ndarray:
+def imagine_plans(model: Served, observations: Conditioning, *plans: Control, seed: int = 5) -> np.ndarray:
     seeds = np.arange(seed, seed + len(plans), dtype=np.uint64)
     with patience(30):
         return model.rollout(observations, plans, seeds)
@@ -78,14 +78,14 @@ def asked(model: Served, observations: Conditioning, *plans: Control, seed: int 
 
 def test_turns_roll_the_observation_and_standing_still_keeps_it(se3ds: Served) -> None:
     observations = seen(semantic=False)
-    frames = asked(se3ds, observations, plan(TURN_LEFT, STOP, TURN_LEFT))[0]
+    frames = imagine_plans(se3ds, observations, plan(TURN_LEFT, STOP, TURN_LEFT))[0]
     image = observations.image[0]
     for frame, columns in zip(frames, (0, SIDE, SIDE, 2 * SIDE), strict=True):
         np.testing.assert_array_equal(frame, np.roll(image, columns, axis=1))
 
 
 def test_a_turn_after_a_step_rolls_what_was_imagined(pathdreamer: Served) -> None:
-    frames = asked(pathdreamer, seen(), plan(FORWARD, TURN_LEFT, TURN_LEFT))[0]
+    frames = imagine_plans(pathdreamer, seen(), plan(FORWARD, TURN_LEFT, TURN_LEFT))[0]
     assert np.abs(frames[1].astype(int) - frames[0]).mean() > 1
     np.testing.assert_array_equal(frames[2], np.roll(frames[1], SIDE, axis=1))
     np.testing.assert_array_equal(frames[3], np.roll(frames[1], 2 * SIDE, axis=1))
@@ -104,36 +104,36 @@ def test_frames_are_projections_from_the_viewpoints(se3ds: Served) -> None:
     image[0, 240:336, 464:560] = (200, 20, 20)  # ahead
     image[0, 240:336, 720:816] = (20, 200, 20)  # to the right
     room = Conditioning(image, depth=np.full((1, *SIZE), 1.0, np.float32))
-    ahead = asked(se3ds, room, plan(FORWARD, FORWARD))[0]
-    right = asked(se3ds, room, plan(*[TURN_RIGHT] * 4, FORWARD, FORWARD))[0]
+    ahead = imagine_plans(se3ds, room, plan(FORWARD, FORWARD))[0]
+    right = imagine_plans(se3ds, room, plan(*[TURN_RIGHT] * 4, FORWARD, FORWARD))[0]
     assert 90 < extent(ahead[0], 0) < extent(ahead[2], 0) and extent(ahead[2], 1) == 0
     assert 90 < extent(right[4], 1) < extent(right[6], 1) and extent(right[6], 0) == 0
     assert extent(ahead[2], 0) == pytest.approx(96 / 0.6, abs=36)  # two pixels of the networks
     far = Conditioning(image, depth=np.full((1, *SIZE), 19.0, np.float32))
-    assert extent(asked(se3ds, far, plan(FORWARD, FORWARD))[0, 2], 0) < extent(ahead[2], 0)
+    assert extent(imagine_plans(se3ds, far, plan(FORWARD, FORWARD))[0, 2], 0) < extent(ahead[2], 0)
 
 
 def test_semantics_and_depth_reach_the_networks(pathdreamer: Served) -> None:
     """Holes are painted by category and depth; at the masked top there is nothing else."""
     for category in (3, 40):
-        top = asked(pathdreamer, seen(category=category), plan(FORWARD))[0, 1, 20:60, :, 0].astype(int)
+        top = imagine_plans(pathdreamer, seen(category=category), plan(FORWARD))[0, 1, 20:60, :, 0].astype(int)
         assert (np.abs(top - 255 * category / 41) < 8).mean() > 0.3
     for metres in (2.0, 6.0):
-        top = asked(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1, 20:60, :, 1].astype(int)
+        top = imagine_plans(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1, 20:60, :, 1].astype(int)
         assert (np.abs(top - 255 * metres / 10) < 15).mean() > 0.3
 
 
 def test_what_is_beyond_the_scale_or_nothing_is_a_hole(pathdreamer: Served, se3ds: Served) -> None:
     for metres in (0.0, 10.0, 30.0):
-        frame = asked(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1]
+        frame = imagine_plans(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1]
         assert np.abs(frame[..., 0].astype(int) - 255 / 41).max() < 3  # all walls, as the structure fills them
-    frame = asked(se3ds, seen(metres=12.0, semantic=False), plan(FORWARD))[0, 1]
+    frame = imagine_plans(se3ds, seen(metres=12.0, semantic=False), plan(FORWARD))[0, 1]
     assert np.ptp(frame[100:-100]) > 20  # 20 m is the other one's scale
 
 
 def test_predictions_are_remembered(se3ds: Served) -> None:
     """Holes of one frame are known in the next: the grey that was imagined stays where it is."""
-    frames = asked(se3ds, seen(metres=30.0, semantic=False), plan(FORWARD, FORWARD))[0]
+    frames = imagine_plans(se3ds, seen(metres=30.0, semantic=False), plan(FORWARD, FORWARD))[0]
     assert np.abs(frames[1:].astype(int) - 127).max() <= 1
 
 
@@ -145,18 +145,18 @@ def test_rows_do_not_meet_and_equal_questions_have_equal_answers(pathdreamer: Se
         semantic=np.concatenate([one.semantic, two.semantic]),
     )
     plans = plan(FORWARD, FORWARD), plan(FORWARD, TURN_LEFT)
-    frames = asked(pathdreamer, both, *plans)
-    np.testing.assert_array_equal(asked(pathdreamer, two, plans[1], seed=9)[0], frames[1])
+    frames = imagine_plans(pathdreamer, both, *plans)
+    np.testing.assert_array_equal(imagine_plans(pathdreamer, two, plans[1], seed=9)[0], frames[1])
     with fake_panoramic.serving(official, "pathdreamer") as address:
         other = wiw.world_model("pathdreamer", address=address)
-        np.testing.assert_array_equal(asked(other, one, plans[0])[0], frames[0])
+        np.testing.assert_array_equal(imagine_plans(other, one, plans[0])[0], frames[0])
         assert other.fingerprint() == pathdreamer.fingerprint() and other.describe() == pathdreamer.describe()
         other.close()
 
 
 def test_shared_frames_are_computed_but_do_not_travel(pathdreamer: Served) -> None:
-    whole = asked(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT))[0]
-    tail = asked(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT, shared=1))[0]
+    whole = imagine_plans(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT))[0]
+    tail = imagine_plans(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT, shared=1))[0]
     np.testing.assert_array_equal(tail[2:], whole[2:])
 
 
@@ -164,23 +164,23 @@ def test_noise_is_drawn_from_the_seed(official: Path) -> None:
     with fake_panoramic.serving(official, "pathdreamer", "--noise") as address:
         model = wiw.world_model("pathdreamer", address=address)
         room = seen(metres=30.0)
-        first, other = (asked(model, room, plan(FORWARD), seed=seed)[0, 1] for seed in (1, 2))
+        first, other = (imagine_plans(model, room, plan(FORWARD), seed=seed)[0, 1] for seed in (1, 2))
         assert (first != other).any() and not model.accepts.causal
-        np.testing.assert_array_equal(asked(model, room, plan(FORWARD, TURN_LEFT), seed=1)[0, 1], first)
+        np.testing.assert_array_equal(imagine_plans(model, room, plan(FORWARD, TURN_LEFT), seed=1)[0, 1], first)
         model.close()
 
 
 def test_what_a_network_raises_is_told_and_others_go_on(se3ds: Served) -> None:
     white = Conditioning(np.full((1, *SIZE, 3), 255, np.uint8), depth=np.ones((1, *SIZE), np.float32))
     with pytest.raises(RemoteError, match="out of memory") as caught:
-        asked(se3ds, white, plan(FORWARD))
+        imagine_plans(se3ds, white, plan(FORWARD))
     assert caught.value.kind == "raised"
-    asked(se3ds, seen(semantic=False), plan(FORWARD))
+    imagine_plans(se3ds, seen(semantic=False), plan(FORWARD))
 
 
 def test_unknown_categories_are_refused(pathdreamer: Served) -> None:
     with pytest.raises(RemoteError, match="categories below 42") as caught:
-        asked(pathdreamer, seen(category=42), plan(FORWARD))
+        imagine_plans(pathdreamer, seen(category=42), plan(FORWARD))
     assert caught.value.kind == "row"
 
 
@@ -286,11 +286,11 @@ def test_killed_in_mid_run_and_started_again_it_answers(official: Path) -> None:
     assert first.stdout is not None
     address = first.stdout.readline().split()[-1]
     model = wiw.world_model("se3ds", address=address)
-    expected = asked(model, seen(semantic=False), plan(FORWARD, FORWARD))
+    expected = imagine_plans(model, seen(semantic=False), plan(FORWARD, FORWARD))
     first.send_signal(signal.SIGKILL)
     first.wait()
     with fake_panoramic.serving(official, "se3ds", port=int(address.rpartition(":")[2])):
-        again = asked(model, seen(semantic=False), plan(FORWARD, FORWARD))
+        again = imagine_plans(model, seen(semantic=False), plan(FORWARD, FORWARD))
     np.testing.assert_array_equal(again, expected)
     model.close()
 

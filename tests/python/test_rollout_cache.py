@@ -61,7 +61,7 @@ def question(*plans, image=5, seeds=None, shared=0):
     )
 
 
-def asked(ask, *given):
+def imagine_rows(ask, *given):
     before = Counting.rows
     frames = ask.rollout(*given)
     return frames, Counting.rows - before
@@ -80,13 +80,13 @@ FF, FL = [FORWARD, FORWARD], [FORWARD, TURN_LEFT]
 
 def test_a_question_is_put_once_also_by_another_process_and_in_other_company(tmp_path) -> None:
     given = question(FF, FL)
-    fresh, rows = asked(make(tmp_path), *given)
+    fresh, rows = imagine_rows(make(tmp_path), *given)
     assert rows == 2
-    again, rows = asked(make(tmp_path), *given)
+    again, rows = imagine_rows(make(tmp_path), *given)
     assert rows == 0
     for mine, theirs in zip(own(fresh, given[1]), own(again, given[1]), strict=True):
         np.testing.assert_array_equal(mine, theirs)
-    more, rows = asked(make(tmp_path), *question(FL, FF, [TURN_LEFT, FORWARD], seeds=[1, 0, 9]))
+    more, rows = imagine_rows(make(tmp_path), *question(FL, FF, [TURN_LEFT, FORWARD], seeds=[1, 0, 9]))
     assert rows == 1
     np.testing.assert_array_equal(more[0, 1:], fresh[1, 1:])
     np.testing.assert_array_equal(more[2, 1:], Counting().rollout(*question([TURN_LEFT, FORWARD], seeds=[9]))[0, 1:])
@@ -106,58 +106,58 @@ def test_a_question_is_put_once_also_by_another_process_and_in_other_company(tmp
     ids=["plan", "image", "seed", "depth", "text", "ids", "trajectory"],
 )
 def test_another_question_is_another_entry(tmp_path, other) -> None:
-    asked(make(tmp_path), *question(FF))
-    assert asked(make(tmp_path), *question(FF))[1] == 0
-    assert asked(make(tmp_path), *other)[1] == 1
+    imagine_rows(make(tmp_path), *question(FF))
+    assert imagine_rows(make(tmp_path), *question(FF))[1] == 0
+    assert imagine_rows(make(tmp_path), *other)[1] == 1
 
 
 def test_another_model_is_another_entry(tmp_path) -> None:
     class Other(Counting):
         pass
 
-    asked(make(tmp_path), *question(FF))
+    imagine_rows(make(tmp_path), *question(FF))
     for model in (Counting(2.0), Other()):
-        frames, rows = asked(make(tmp_path, model), *question(FF))
+        frames, rows = imagine_rows(make(tmp_path, model), *question(FF))
         assert rows == 1
         np.testing.assert_array_equal(frames[:, 1:], model.rollout(*question(FF))[:, 1:])
 
 
 def test_an_entry_serves_rows_that_need_less_of_it(tmp_path) -> None:
     short = question(FF, FF, seeds=[0, 0], shared=1)
-    whole, _ = asked(make(tmp_path), *question(FF))
-    frames, rows = asked(make(tmp_path), *short)
+    whole, _ = imagine_rows(make(tmp_path), *question(FF))
+    frames, rows = imagine_rows(make(tmp_path), *short)
     assert rows == 0
     np.testing.assert_array_equal(frames[1, 2], whole[0, 2])
-    asked(make(tmp_path / "b"), *question([TURN_LEFT], FF, seeds=[4, 0], shared=1))
-    assert asked(make(tmp_path / "b"), *question(FF))[1] == 1  # its first frame was another row's
+    imagine_rows(make(tmp_path / "b"), *question([TURN_LEFT], FF, seeds=[4, 0], shared=1))
+    assert imagine_rows(make(tmp_path / "b"), *question(FF))[1] == 1  # its first frame was another row's
 
 
 @pytest.mark.parametrize("harm", ["truncate", "frames", "header", "longer", "empty"])
 def test_a_damaged_entry_is_dropped_named_and_imagined_anew(tmp_path, caplog, harm) -> None:
-    fresh, _ = asked(make(tmp_path), *question(FF))
+    fresh, _ = imagine_rows(make(tmp_path), *question(FF))
     (path,) = tmp_path.rglob("*.frames")
     data = bytearray(path.read_bytes())
     if harm in ("frames", "header"):
         data[-5 if harm == "frames" else 9] ^= 1
     path.write_bytes({"truncate": data[:-7], "longer": data + b"x", "empty": b""}.get(harm, data))
     with caplog.at_level(logging.WARNING, "wiw.rollouts"):
-        again, rows = asked(make(tmp_path), *question(FF))
+        again, rows = imagine_rows(make(tmp_path), *question(FF))
     assert rows == 1 and path.name in caplog.text
     np.testing.assert_array_equal(fresh[:, 1:], again[:, 1:])
-    assert asked(make(tmp_path), *question(FF))[1] == 0
+    assert imagine_rows(make(tmp_path), *question(FF))[1] == 0
 
 
 def test_the_least_recently_used_goes_when_the_budget_is_spent(tmp_path) -> None:
     size = 32 + 2 * H * W * 3
     ask = make(tmp_path, budget_gb=10 * size / 2**30)
     for image in range(10):
-        asked(ask, *question(FF, image=image))
-    assert asked(ask, *question(FF, image=0))[1] == 0  # used again: no longer the oldest
+        imagine_rows(ask, *question(FF, image=image))
+    assert imagine_rows(ask, *question(FF, image=0))[1] == 0  # used again: no longer the oldest
     for image in range(10, 13):
-        asked(ask, *question(FF, image=image))
+        imagine_rows(ask, *question(FF, image=image))
     assert sum(path.stat().st_size for path in tmp_path.rglob("*.frames")) <= 10 * size
-    assert asked(ask, *question(FF, image=0))[1] == 0 and asked(ask, *question(FF, image=12))[1] == 0
-    assert asked(ask, *question(FF, image=1))[1] == 1
+    assert imagine_rows(ask, *question(FF, image=0))[1] == 0 and imagine_rows(ask, *question(FF, image=12))[1] == 0
+    assert imagine_rows(ask, *question(FF, image=1))[1] == 1
     with pytest.raises(ArgumentError, match="budget"):
         RolloutCache(tmp_path, 0)
 
@@ -166,7 +166,7 @@ def test_where_nothing_can_be_written_the_run_goes_on_and_says_so_once(tmp_path,
     (tmp_path / "file").write_text("")
     ask = make(tmp_path / "file" / "cache")
     with caplog.at_level(logging.WARNING, "wiw.rollouts"):
-        assert asked(ask, *question(FF))[1] == 1 and asked(ask, *question(FF, image=9))[1] == 1
+        assert imagine_rows(ask, *question(FF))[1] == 1 and imagine_rows(ask, *question(FF, image=9))[1] == 1
     assert caplog.text.count("not kept any more") == 1
 
 

@@ -56,14 +56,14 @@ class ArmSummary:
     """Over the scored episodes, by metric: "success" and "spl" in percent, "actions" in primitives."""
 
     @property
-    def asked(self) -> int:
+    def total(self) -> int:
         """Episodes of the run, scored or not."""
         return self.done + self.errors + self.pending
 
     @property
-    def judged(self) -> str:
+    def scored_of_total(self) -> str:
         """E.g. "20", or "18/20" where only 18 of 20 episodes are scored."""
-        return str(self.done) if self.done == self.asked else f"{self.done}/{self.asked}"
+        return str(self.done) if self.done == self.total else f"{self.done}/{self.total}"
 
 
 @dataclass(frozen=True)
@@ -125,10 +125,10 @@ class Summary:
     def invalid(self) -> tuple[str, ...]:
         """Why the run must not be reported, a sentence per arm; empty for a valid run."""
         return tuple(
-            f"{line.errors} of {line.asked} episodes of {line.name} ended with an infrastructure error "
-            f"({100 * line.errors / line.asked:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
+            f"{line.errors} of {line.total} episodes of {line.name} ended with an infrastructure error "
+            f"({100 * line.errors / line.total:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
             for line in self.arms
-            if line.errors > MAX_ERROR_SHARE * line.asked
+            if line.errors > MAX_ERROR_SHARE * line.total
         )
 
     def __getitem__(self, arm: str) -> ArmSummary:
@@ -191,7 +191,7 @@ def arm_table(run: Run) -> Records:
     lines = []
     for arm in summary.arms:
         line: dict[str, Any] = {"arm": arm.name, "role": arm.role}
-        line |= {"n": arm.done, "asked": arm.asked, "errors": arm.errors}
+        line |= {"n": arm.done, "asked": arm.total, "errors": arm.errors}
         for metric, estimate in arm.estimates.items():
             line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
         if found := utilities.get(arm.name):
@@ -301,7 +301,7 @@ def notes(summary: Summary) -> list[str]:
             0,
             f"INVALID RUN, do not report: {' '.join(summary.invalid)} Fix the cause, then `wiw resume --retry-errors`.",
         )
-    found += [_describe_missing(line) for line in summary.arms if line.done < line.asked]
+    found += [_describe_missing(line) for line in summary.arms if line.done < line.total]
     found += [*_explain_intervals(summary), *_explain_differences(summary), *_explain_utility(summary)]
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
     found += summary.remarks()
@@ -320,7 +320,7 @@ def notes(summary: Summary) -> list[str]:
 
 def _describe_missing(line: ArmSummary) -> str:
     """Return the range of the rate over all episodes: every missing one a failure, or every one a success."""
-    text = f"{line.name}: {line.done} of {line.asked} episodes are scored"
+    text = f"{line.name}: {line.done} of {line.total} episodes are scored"
     if line.errors:
         count = "1 infrastructure error is" if line.errors == 1 else f"{line.errors} infrastructure errors are"
         text += f"; {count} excluded from scores"
@@ -328,8 +328,8 @@ def _describe_missing(line: ArmSummary) -> str:
     if "success" not in line.estimates:
         return f"{text}."
     won = line.estimates["success"].value * line.done
-    least, most = won / line.asked, (won + 100 * (line.asked - line.done)) / line.asked
-    return f"{text}. Over all {line.asked}, SR would be between {least:.1f} and {most:.1f} %."
+    least, most = won / line.total, (won + 100 * (line.total - line.done)) / line.total
+    return f"{text}. Over all {line.total}, SR would be between {least:.1f} and {most:.1f} %."
 
 
 def _explain_intervals(summary: Summary) -> list[str]:

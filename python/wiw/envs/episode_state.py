@@ -115,7 +115,7 @@ class EpisodeState:
         return len(self.positions) - 1
 
     @property
-    def travelled(self) -> float:
+    def path_length(self) -> float:
         """Metres walked, measured horizontally as shortest paths are."""
         steps = np.diff(self.positions, axis=0).reshape(-1, 3)
         return float(np.hypot(steps[:, 0], steps[:, 2]).sum())

@@ -135,13 +135,13 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
             executed.append(pose)
             path.append(table.bench.pose[:3])
             refused += [] if move.reason == "free" else [move.reason]
-            if table.succeeded():
+            if table.is_success():
                 break
         self._decisions += 1
         self._taken += len(executed)
         self._refused += refused
         self._key = self._key.at(self._key.decision + 1)
-        done = table.succeeded()
+        done = table.is_success()
         over = not done and self._taken >= self.task.actions
         taken = np.array(executed).reshape(-1, 7)
         return Segment(self._observe(), taken, np.stack(path), done, over, self._key, tuple(refused))
@@ -182,7 +182,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         poses gone to, and ways refused.
         """
         return {
-            "success": float(self.table.succeeded()),
+            "success": float(self.table.is_success()),
             "actions": float(self._decisions),
             "poses": float(self._taken),
             "refused": float(len(self._refused)),

@@ -33,7 +33,7 @@ from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html
 from wiw.runs.run import Run
 
-COUNTS = (("n", "judged", ""), ("errors", "errors", "red"), ("to run", "pending", ""))
+COUNTS = (("n", "scored_of_total", ""), ("errors", "errors", "red"), ("to run", "pending", ""))
 """Column, attribute of `ArmSummary`, style; all but the first are left out where they are zero."""
 NARROW = 3
 """Arms that fit beside each other with their intervals on one line."""

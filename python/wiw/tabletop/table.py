@@ -35,6 +35,6 @@ class Table:
         self.objects = setup.objects
         """Names of what agents are told the place of."""
 
-    def succeeded(self) -> bool:
+    def is_success(self) -> bool:
         """Return whether what is asked for is done."""
         return self.kind.is_success(self.bench, self.setup)

@@ -94,11 +94,11 @@ class ImageNav(NavigationTask):
         by_actions = self.rules.spl == "actions"
         geodesic, ideal = _find_shortest(state)
         shortest = float(ideal) if by_actions else geodesic
-        walked = float(state.actions) if by_actions else state.travelled
+        walked = float(state.actions) if by_actions else state.path_length
         return {
             "success": float(state.success),
             "actions": float(state.actions),
-            "travelled": state.travelled,
+            "travelled": state.path_length,
             "shortest": geodesic,
             "spl": float(path_efficiency([state.success], [shortest], [walked])[0]),
             "distance_to_goal": state.distance_to_goal(),
