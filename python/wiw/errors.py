@@ -13,6 +13,7 @@ __all__ = [
     "Error",
     "FileError",
     "InfrastructureError",
+    "JudgeError",
     "NavigationError",
     "PromptError",
     "RegistryError",
@@ -116,6 +117,17 @@ class VlmError(InfrastructureError):
     """
 
     def __init__(self, message: str = "", kind: str = "unreachable") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class JudgeError(InfrastructureError):
+    """A judge gave no usable mark, however often it was asked.
+
+    `kind` is "unparsable" (a reply that is no mark from 1 to 5), or the kind of the `VlmError` that the call ended in.
+    """
+
+    def __init__(self, message: str = "", kind: str = "unparsable") -> None:
         super().__init__(message)
         self.kind = kind
 

@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import Any
 
 NAMESPACE = "wiw"
-TASKS = {"ImageNav-v0": "imagenav", "AR-v0": "ar", "Manipulation-v0": "manipulation"}
+TASKS = {"ImageNav-v0": "imagenav", "AR-v0": "ar", "AEQA-v0": "aeqa", "Manipulation-v0": "manipulation"}
 """Names of tasks by gymnasium's names."""
 _REGISTRY = "gymnasium.envs"
 

@@ -252,6 +252,7 @@ TASKS = Registry(
     {
         "imagenav": "wiw.tasks.imagenav:ImageNav",
         "ar": "wiw.tasks.ar:AR",
+        "aeqa": "wiw.tasks.aeqa:AEQA",
         "manipulation": "wiw.tasks.manipulation:Manipulation",
     },
     "wiw.tasks.base:Task",
@@ -290,7 +291,11 @@ METRICS = Registry(
     "wiw.metrics",
     {
         "success": "wiw.metrics.metric:SUCCESS",
+        "answer_score": "wiw.metrics.metric:ANSWER_SCORE",
         "spl": "wiw.metrics.metric:SPL",
+        "answered": "wiw.metrics.metric:ANSWERED",
+        "grounded": "wiw.metrics.metric:GROUNDED",
+        "path_length": "wiw.metrics.metric:PATH_LENGTH",
         "mean_trajectory": "wiw.metrics.metric:MEAN_TRAJECTORY",
         "refused": "wiw.metrics.metric:REFUSED",
     },

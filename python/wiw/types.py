@@ -80,6 +80,23 @@ class Answer:
 
 
 @dataclass(frozen=True)
+class TextAnswer:
+    """What an agent believes at a decision, in words, where the goal is a question."""
+
+    text: str = ""
+    """Empty while the agent believes nothing."""
+    confidence: float = 0.0
+    """From 0 to 1."""
+    final: bool = False
+    """Whether the agent gives this as its answer; the task's rules say when that ends the episode."""
+
+    @property
+    def label(self) -> str:
+        """The text, by the name that `Answer` has for it."""
+        return self.text
+
+
+@dataclass(frozen=True)
 class Observation:
     """What the agent perceives: images, odometry since the episode's start, and depth where the run grants it.
 
@@ -152,6 +169,13 @@ class Goal:
     text: str | None = None
     choices: tuple[str, ...] = ()
     """What an answer is chosen from, where the task asks for one."""
+    question: bool = False
+    """Whether `text` is a question that is answered in words (`TextAnswer`)."""
+
+    @property
+    def expects_answer(self) -> bool:
+        """Whether the agent says at every decision what it believes."""
+        return self.question or bool(self.choices)
 
 
 @dataclass(frozen=True)
@@ -368,8 +392,8 @@ class Decision:
     """What this decision asked for, a function of the decision alone: consultations of the world model (0 or 1, one a
     level of the beam search), and the rows and frames of its rollouts."""
     note: str = ""
-    answer: Answer | None = None
-    """What the agent believes now, where the goal has choices."""
+    answer: Answer | TextAnswer | None = None
+    """What the agent believes now, where the goal has choices or is a question."""
     fidelity: Fidelity | None = None
     """How true imagination was, where the run measures it."""
     spent: Mapping[str, float] = field(default_factory=dict)
@@ -450,10 +474,12 @@ class EpisodeResult:
     metrics: Mapping[str, float] = field(default_factory=dict)
     """ImageNav: success (0 or 1), actions, decisions, travelled, shortest, spl (0..1), distance_to_goal.
     AR: success, actions, decisions, confidence, visible_start, visible_end (0..1), category, predicted (numbers of
-    choices)."""
+    choices). A-EQA: see `wiw.tasks.aeqa.AEQA.measure`."""
     seconds: float = 0.0
     error: str = ""
     """Traceback."""
     kind: str = ""
-    """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`, or
-    "vlm/" and a `VlmError.kind`."""
+    """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`,
+    "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
+    details: Mapping[str, Any] = field(default_factory=dict)
+    """What the task says of the episode besides numbers, JSON-able. A-EQA: "answer" and its "judgement"."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.types import Answer, Episode, Goal, Key, Truth
+from wiw.types import Answer, Episode, Goal, Key, TextAnswer, Truth
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Env(ABC):
         """Start an episode and return the first observation."""
 
     @abstractmethod
-    def run(self, plan: Any, answer: Answer | None = None) -> Segment:
+    def run(self, plan: Any, answer: Answer | TextAnswer | None = None) -> Segment:
         """Carry out the actions of one decision, as far as the episode goes on, and observe once, at the end.
 
-        `answer` is what the agent believes now; the loop gives it only where the goal has choices.
+        `answer` is what the agent believes now; the loop gives it only where the goal expects one.
         """
 
     @property
@@ -86,6 +86,10 @@ class Env(ABC):
     @abstractmethod
     def result(self) -> Mapping[str, float]:
         """Return the metrics of the running episode, "success" (0 or 1) among them."""
+
+    def details(self) -> Mapping[str, Any]:
+        """Return what is recorded of the running episode besides its metrics, JSON-able."""
+        return {}
 
     def fork(self) -> Any:
         """Return a copy of the simulator as it stands, which the world model `oracle` runs ahead."""

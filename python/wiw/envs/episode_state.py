@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw._core import env as _env
-from wiw.action import STOP
+from wiw.action import STOP, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.worlds import World, world
 from wiw.envs.pointing import IDS, Pointing
 from wiw.errors import ArgumentError
-from wiw.types import Answer, Episode, Goal, Observation, Truth
+from wiw.types import Answer, Episode, Goal, Observation, TextAnswer, Truth
 
 
 class NavigationSpec(ABC):
@@ -26,6 +26,10 @@ class NavigationSpec(ABC):
     backend: Literal["auto", "cpu", "gpu"]
     choices: tuple[str, ...] = ()
     """Labels that answers are chosen from, where the task asks for any."""
+    free_turns: bool = False
+    """Whether the turn at the start of a segment does not count."""
+    limit: int | None = None
+    """Most primitives of an episode, however they are divided over decisions; None where decisions are counted."""
 
     @property
     @abstractmethod
@@ -76,6 +80,14 @@ class NavigationSpec(ABC):
         """Return whether the answers given so far end the episode."""
         return False
 
+    def waits(self, state: EpisodeState) -> bool:
+        """Return whether the agent stays where it is after its last answer, to be asked again there."""
+        return False
+
+    def describe_end(self, state: EpisodeState) -> dict[str, Any]:
+        """Return what is recorded of an episode besides its metrics, JSON-able."""
+        return {}
+
     def find_destination(self, state: EpisodeState) -> NDArray[np.float64]:
         """Return where an agent that knew the scene would go."""
         return state.goal_position
@@ -106,13 +118,19 @@ class EpisodeState:
     success: bool = False
     ended: bool = False
     """By success, by stopping, by an answer that was sure enough, or for want of a target."""
-    answers: list[Answer] = field(default_factory=list)
+    answers: list[Answer | TextAnswer] = field(default_factory=list)
     """The agent's beliefs, decision by decision."""
+    observed: list[int] = field(default_factory=lambda: [0])
+    """Indices of `positions` from which the agent has observed."""
+    uncounted: int = 0
+    """Primitives that the task does not count."""
+    notes: dict[str, Any] = field(default_factory=dict)
+    """What the task keeps of the episode while it measures it."""
 
     @property
     def actions(self) -> int:
-        """Primitives carried out, refused moves and stop included."""
-        return len(self.positions) - 1
+        """Primitives carried out, refused moves and stop included, but for those that the task does not count."""
+        return len(self.positions) - 1 - self.uncounted
 
     @property
     def path_length(self) -> float:
@@ -142,15 +160,16 @@ class EpisodeState:
         self.success = task.is_success(self)
         self.ended = self.ended or self.success
 
-    def record_answer(self, task: NavigationSpec, answer: Answer, final: bool = False) -> bool:
-        """Record what the agent believes; return whether it is the last answer, after which nothing is carried out.
+    def record_answer(self, task: NavigationSpec, answer: Answer | TextAnswer, final: bool = False) -> bool:
+        """Record what the agent believes; return whether nothing is carried out after it.
 
-        It is when the task says that it is sure enough, with the last decision, and when the agent calls it `final`.
+        Nothing is after the last answer: when the task says that it is sure enough, with the last decision, and when
+        the agent ends the episode with it (`final`). Nothing is either where the task asks again on the same view.
         """
         self.answers.append(answer)
         self.ended = final or task.is_sure(self)
         self.success = task.is_success(self)
-        return self.ended or self.is_out_of_budget(task)
+        return self.ended or self.is_out_of_budget(task) or task.waits(self)
 
     def record_observation(self, task: NavigationSpec, observation: Observation) -> None:
         """End the episode where the task says so once its target is out of sight."""
@@ -158,9 +177,24 @@ class EpisodeState:
             self.ended = True
             self.success = task.is_success(self)
 
+    def limit_plan(self, task: NavigationSpec, plan: Any) -> Any:
+        """Return as much of a plan as may still be carried out, where the task limits primitives."""
+        if task.limit is None:
+            return plan
+        free, left = count_leading_turns(plan) if task.free_turns else 0, max(0, task.limit - self.actions)
+        self.uncounted += free
+        return plan[: free + left]
+
     def is_out_of_budget(self, task: NavigationSpec) -> bool:
-        """Return whether the decisions are used up, or the primitives where they are given one by one."""
+        """Return whether the decisions are used up, or the primitives where these are limited or given one by one."""
+        if task.limit is not None:  # an agent that only turns for nothing, or only waits, must come to an end too
+            return self.actions >= task.limit or self.decisions >= 2 * task.limit
         return self.decisions >= task.decisions if self.decisions else self.actions >= task.budget
+
+
+def count_leading_turns(plan: Any) -> int:
+    """Return how many turns a plan begins with."""
+    return next((i for i, action in enumerate(plan) if action not in (TURN_LEFT, TURN_RIGHT)), len(plan))
 
 
 def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:

@@ -25,7 +25,7 @@ from wiw.envs.spaces import FIRST_ACTION, LAST_PRIMITIVE, action_space, answer_o
 from wiw.errors import ArgumentError
 from wiw.perception.semantics import TrueSemantics
 from wiw.perception.simulator import read_categories
-from wiw.types import Answer, Episode, Goal, Key, Observation, Truth
+from wiw.types import Answer, Episode, Goal, Key, Observation, TextAnswer, Truth
 
 
 class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
@@ -110,19 +110,32 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         self._path = None
         return self._observe()
 
-    def run(self, plan: Sequence[int] | NDArray[np.int8], answer: Answer | None = None) -> Segment:
+    def run(self, plan: Sequence[int] | NDArray[np.int8], answer: Answer | TextAnswer | None = None) -> Segment:
         """Carry out one decision's primitives, as far as the episode goes on; observe once, at the end.
 
-        Where the goal has choices, `answer` comes first, and nothing is carried out after the last one.
+        Where the goal expects an answer, `answer` comes first, and nothing is carried out after the last one.
 
         Raises:
-            ArgumentError: the goal has choices and no answer is given.
+            ArgumentError: the goal expects an answer and none is given.
         """
         self.state.decisions += 1
-        if answer is None and self.task.choices:
-            raise ArgumentError("run: the goal has choices; give the decision's answer too, run(plan, answer)")
-        over = answer is not None and self.state.record_answer(self.task, answer)
-        return self._carry_out([] if over else plan)
+        if answer is None and self.goal.expects_answer:
+            raise ArgumentError("run: the goal expects an answer; give the decision's too, run(plan, answer)")
+        stays = answer is not None and self.state.record_answer(self.task, answer)
+        return self._carry_out([] if stays else self.state.limit_plan(self.task, plan))
+
+    def answer(self, text: str) -> dict[str, float]:
+        """End the episode with an answer in words, for those who step it themselves; return its metrics.
+
+        Raises:
+            ArgumentError: the goal is no question, or the text is empty.
+        """
+        if not self.goal.question or not text.strip():
+            raise ArgumentError(
+                f"answer: expected a text in reply to a question, got {text!r} in task {self.task.name}"
+            )
+        self.state.record_answer(self.task, TextAnswer(text, 1.0, final=True), final=True)
+        return self.result()
 
     def _carry_out(self, actions: Sequence[int] | NDArray[np.int8]) -> Segment:
         state, executed = self.state, []
@@ -134,6 +147,7 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
             if state.ended:
                 break
         path = np.stack(state.positions[first:])
+        state.observed.append(len(state.positions) - 1)
         self._key = self._key.at(self._key.decision + 1)
         observation = self._observe()
         state.record_observation(self.task, observation)
@@ -191,6 +205,10 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
     def result(self) -> dict[str, float]:
         """Return the task's metrics of the running episode."""
         return self.task.measure(self.state)
+
+    def details(self) -> dict[str, Any]:
+        """See `Env.details`."""
+        return self.task.describe_end(self.state)
 
     # ------------------------------------------------------------------------------------------------------------------
 

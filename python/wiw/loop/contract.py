@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
 from wiw.policies.base import Policy, Situation
-from wiw.types import Answer, Goal, Proposal
+from wiw.types import Answer, Goal, Proposal, TextAnswer
 from wiw.world_models.base import WorldModel
 from wiw.world_models.oracle import Oracle
 
@@ -116,30 +116,45 @@ def check_answerer(policy: Policy, goal: Goal) -> None:
     Raises:
         ContractError: it has not written `answer`.
     """
-    if goal.choices and type(policy.unwrapped).answer is Policy.answer:
+    if goal.expects_answer and type(policy.unwrapped).answer is Policy.answer:
+        what = f"one of {len(goal.choices)} choices" if goal.choices else "one in words"
         raise ContractError(
-            f"{type(policy.unwrapped).__name__} gives no answer, but task '{goal.task}' asks for one of "
-            f"{len(goal.choices)} choices at every decision; write its `answer`, or give the agent a policy that "
-            "answers (reviser=)"
+            f"{type(policy.unwrapped).__name__} gives no answer, but task '{goal.task}' asks for {what} at every "
+            "decision; write its `answer`, or give the agent a policy that answers (reviser=)"
         )
 
 
-def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation]) -> list[Answer | None]:
-    """Return a distribution over the goal's choices for each episode whose goal has some, None for the others.
+def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation]) -> list[Answer | TextAnswer | None]:
+    """Return an answer for each episode whose goal expects one, None for the others.
+
+    That is a distribution over the goal's choices, or a text where the goal is a question.
 
     Raises:
-        ContractError: other choices, or numbers that are no distribution.
+        ContractError: another kind of answer, other choices, or numbers that are no probabilities.
     """
     name = f"{type(policy.unwrapped).__name__}.answer"
     if not isinstance(answers, Sequence) or len(answers) != len(situations):
         raise ContractError(f"{name}: expected one answer for each of {len(situations)} episodes, got {answers!r}")
     for answer, situation in zip(answers, situations, strict=True):
-        choices = situation.goal.choices
-        if answer is None and not choices:
-            continue
-        if not isinstance(answer, Answer) or answer.choices != choices:
-            raise ContractError(f"{name}: expected an Answer over {list(choices)}, got {answer!r}")
-        p = np.asarray(answer.probabilities, np.float64)
-        if p.shape != (len(choices),) or not (p >= 0).all() or abs(p.sum() - 1) > 1e-3:
-            raise ContractError(f"{name}: expected {len(choices)} probabilities that sum to 1, got {p.tolist()}")
+        if situation.goal.question:
+            _check_text_answer(name, answer)
+        elif situation.goal.choices or answer is not None:
+            _check_choice(name, answer, situation.goal.choices)
     return list(answers)
+
+
+def _check_choice(name: str, answer: Any, choices: tuple[str, ...]) -> None:
+    if not isinstance(answer, Answer) or answer.choices != choices:
+        raise ContractError(f"{name}: expected an Answer over {list(choices)}, got {answer!r}")
+    p = np.asarray(answer.probabilities, np.float64)
+    if p.shape != (len(choices),) or not (p >= 0).all() or abs(p.sum() - 1) > 1e-3:
+        raise ContractError(f"{name}: expected {len(choices)} probabilities that sum to 1, got {p.tolist()}")
+
+
+def _check_text_answer(name: str, answer: Any) -> None:
+    if not isinstance(answer, TextAnswer) or not isinstance(answer.text, str):
+        raise ContractError(f"{name}: expected a TextAnswer, for the goal is a question, got {answer!r}")
+    if not 0 <= answer.confidence <= 1:
+        raise ContractError(f"{name}: expected a confidence from 0 to 1, got {answer.confidence!r}")
+    if answer.final and not answer.text.strip():
+        raise ContractError(f"{name}: expected a text in a final answer, got {answer!r}")

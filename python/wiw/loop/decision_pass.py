@@ -21,7 +21,7 @@ from wiw.loop.plan_space import PlanSpace
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.loop.search import Search
 from wiw.policies.base import Policy
-from wiw.types import Answer, Decision, Proposal
+from wiw.types import Answer, Decision, Proposal, TextAnswer
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class DecisionPass:
         search: Search,
         futures: Imagination,
         scores: NDArray[np.float64],
-        answer: Answer | None,
+        answer: Answer | TextAnswer | None,
         shared: Mapping[str, Any],
     ) -> Decision:
         """Return one episode's decision with all evidence."""

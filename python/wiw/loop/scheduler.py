@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, ContractError, RolloutError, VlmError, asks_to_stop
+from wiw.errors import ArgumentError, ContractError, JudgeError, RolloutError, VlmError, asks_to_stop
 from wiw.loop.agent import Agent
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
@@ -151,7 +151,8 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
                 raise
             trial.done = True
             sink.record_lost({**decision.spent, "seconds": sum(decision.seconds.values())})
-            sink.episode(_build_error_result(trial.index, trial.episode, trial.begin, "environment", error))
+            kind = f"judge/{error.kind}" if isinstance(error, JudgeError) else "environment"
+            sink.episode(_build_error_result(trial.index, trial.episode, trial.begin, kind, error))
             continue
         sink.decision(record)
         if result is not None:
@@ -167,8 +168,9 @@ def _kind(error: BaseException) -> str:
 
 def _build_result(trial: Trial) -> EpisodeResult:
     metrics = {**trial.env.result(), "decisions": float(trial.decisions)}
-    seconds = time.perf_counter() - trial.begin
-    return EpisodeResult(trial.index, trial.episode.episode_id, trial.episode.scene, "done", metrics, seconds)
+    details, seconds = dict(trial.env.details()), time.perf_counter() - trial.begin
+    episode = trial.episode
+    return EpisodeResult(trial.index, episode.episode_id, episode.scene, "done", metrics, seconds, details=details)
 
 
 def _build_error_result(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:

@@ -70,6 +70,22 @@ class Metric:
 
 SUCCESS = Metric("success", "SR", "rate", True, about="Success rate: percent of episodes that succeeded.")
 SPL = Metric("spl", "SPL", "rate", True, about="Success weighted by path length, in percent.")
+ANSWER_SCORE = Metric(
+    "answer_score", "Score", "rate", True, about="Mean mark of the answers, 1 to 5 mapped to 0 to 100."
+)
+ANSWERED = Metric("answered", "Answered", "rate", True, about="Percent of questions that were answered in time.")
+GROUNDED = Metric(
+    "grounded", "Grounded", "rate", True, about="Percent of episodes in which what is asked about was in sight."
+)
+PATH_LENGTH = Metric(
+    "path_length",
+    "Metres",
+    "length",
+    False,
+    about="Mean length of the path in metres. Mean Traj of A-EQA in the paper.",
+    least=0.0,
+    paper_name="Mean Traj",
+)
 MEAN_TRAJECTORY = Metric(
     "actions",
     "Actions",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ContractError
-from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout
+from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 
 
 @dataclass(frozen=True)
@@ -150,9 +150,9 @@ class Policy(ABC):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | None]:
-        """Return what each episode's agent believes, where its goal has choices; `rollouts` are None without a world
-        model.
+    ) -> list[Answer | TextAnswer | None]:
+        """Return what each episode's agent believes: an `Answer` where its goal has choices, a `TextAnswer` where it is
+        a question; `rollouts` are None without a world model.
 
         Called on the revising policy once per decision, with what is seen and what was imagined. Default: no answer.
         """

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 
 
 class PolicyWrapper(Policy):
@@ -75,7 +75,7 @@ class PolicyWrapper(Policy):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | None]:
+    ) -> list[Answer | TextAnswer | None]:
         """See `Policy.answer`."""
         return self.inner.answer(situations, proposals, rollouts)
 

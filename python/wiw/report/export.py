@@ -54,7 +54,10 @@ def tables(run: Run) -> dict[str, Table]:
     return {
         "arms": [dict(line) for line in arm_table(run)],
         "episodes": _episodes(run),
-        "outcomes": [_without({**row, **row["metrics"]}, "metrics") for row in run.store.outcomes()],
+        "outcomes": [
+            _without({**row, **row["metrics"], "details": to_json(row["details"])}, "metrics")
+            for row in run.store.outcomes()
+        ],
         "decisions": [_decision(row) for row in decisions],
         "candidates": [candidate for row in decisions for candidate in _candidates(row)],
     }

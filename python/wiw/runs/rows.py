@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, StoreError
-from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fidelity, Truth
+from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fidelity, TextAnswer, Truth
 
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
@@ -123,7 +123,9 @@ def decision_row(arm: str, record: DecisionRecord, with_images: bool) -> Decisio
     return DecisionRow(arm, int(record.episode), int(record.index), values, images)
 
 
-def _answer(answer: Answer) -> dict[str, Any]:
+def _answer(answer: Answer | TextAnswer) -> dict[str, Any]:
+    if isinstance(answer, TextAnswer):
+        return {"label": answer.text, "confidence": answer.confidence, "final": answer.final}
     return {
         "label": answer.label,
         "confidence": answer.confidence,

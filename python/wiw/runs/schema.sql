@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 8 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 9 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -24,7 +24,8 @@ CREATE TABLE outcome (              -- how an episode ended in an arm; absent wh
     metrics TEXT NOT NULL,          -- JSON: name to number
     seconds REAL NOT NULL,
     error TEXT NOT NULL,            -- traceback; empty where nothing broke
-    kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind> | vlm/<kind>; else empty
+    kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind> | vlm/<kind> | judge/<kind>; else empty
+    details TEXT NOT NULL,          -- JSON: what the task says of it besides numbers, such as the answer and its judgement
     PRIMARY KEY (arm, episode)
 ) WITHOUT ROWID;
 
@@ -39,7 +40,8 @@ CREATE TABLE decision (
     scores TEXT,                    -- JSON: one a proposal
     proposals TEXT NOT NULL,        -- JSON: [{actions, prior, note[, text]}]
     real_frames TEXT,               -- JSON: for each proposal and frame, whether it is the real view turned
-    answer TEXT,                    -- JSON: {label, confidence, probabilities}; NULL where the task asks for none
+    answer TEXT,                    -- JSON: {label, confidence, probabilities}, or {label, confidence, final} in words:
+                                    -- NULL where the task asks for none
     fidelity TEXT,                  -- JSON: {scores, rank, regret, best, psnr, ssim[, lpips]}; NULL: not measured
     exchanges TEXT NOT NULL,        -- JSON: [{purpose, model, said, result, problem, instead}]: a language model's part
     note TEXT NOT NULL,

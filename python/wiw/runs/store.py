@@ -26,7 +26,7 @@ from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 DECISION_JSON = (
     "actions",
     "executed",
@@ -43,6 +43,8 @@ DECISION_JSON = (
     "spent",
 )
 """Columns of table `decision` that hold JSON."""
+OUTCOME_JSON = ("metrics", "details")
+"""Columns of table `outcome` that hold JSON."""
 APPLICATION_ID = 0x77697721
 """Marks the file as a run store (SQLite's application_id)."""
 FILE_NAME = "run.sqlite"
@@ -243,7 +245,8 @@ class RunStore:
         rows = self._convert_types("outcome", rows)
         named = [row if row["task"] else {name: row[name] for name in row if name != "task"} for row in rows]
         return [
-            {**row, "metrics": parse_column("metrics", row["metrics"], self._place("outcome", row))} for row in named
+            {**row, **{name: parse_column(name, row[name], self._place("outcome", row)) for name in OUTCOME_JSON}}
+            for row in named
         ]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
@@ -340,6 +343,7 @@ class RunStore:
                         "seconds": result.seconds,
                         "error": result.error,
                         "kind": result.kind,
+                        "details": to_json(dict(result.details)),
                     },
                 )
                 shortest = result.metrics.get("shortest", math.nan)

@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active Embodied Question Answering: explore until a question can be answered in words (paper, appendix "A-EQA")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets.questions import EpisodeRules, Question, blind_answer, generate, load
+from wiw.datasets.visibility import COARSE, measure_sizes
+from wiw.datasets.worlds import World
+from wiw.envs.episode_state import EpisodeState
+from wiw.errors import ArgumentError
+from wiw.judging import Judge, Judgement, Reference, make_judge
+from wiw.metrics import path_efficiency
+from wiw.tasks.navigation import NavigationTask
+from wiw.types import Episode, Goal, TextAnswer, Wording
+
+CUTS = (30, 60, 120, 250)
+"""Primitives after which the anytime curve looks at what has been answered."""
+HALF_TURN = 8
+"""Most primitives of a turn: 22.5 degrees each, the shorter way round."""
+SEEN = 0.008
+"""Steradians of a thing in view that count as having seen it: .3 % of a view with 105 degrees across."""
+
+
+@dataclass(frozen=True)
+class AEQARules:
+    """Budget, end and metric variants; their values are in the presets (`wiw/configs`)."""
+
+    actions: int
+    """Primitives that an episode may take."""
+    candidates: int
+    """M, plans imagined per decision."""
+    horizon: int
+    """L, actions per plan, where the turn that a plan begins with counts as one, whatever its angle."""
+    execute: int
+    """Most primitives carried out before the next decision."""
+    confirm: Literal["next_view", "same_view", "none"]
+    """When a final answer ends the episode: given again after the next segment, given again at once on the same view
+    (nothing is carried out in between), or the first time."""
+    unanswered: Literal["blind", "blind_with_path", "lowest"]
+    """Mark of an episode without a final answer: that of the answer by the text alone, with an SPL of 0 or with the
+    path's, or 1."""
+    shortest: Literal["viewpoint", "file"]
+    """L*: the shortest path to a place from where the answer is seen, or the length that the episode file gives."""
+    turns: Literal["counted", "first_free"]
+    """Whether the turn at the start of a segment counts as primitives."""
+    motion: Literal["refuse", "slide"]
+
+    def __post_init__(self) -> None:
+        if min(self.actions, self.candidates, self.horizon, self.execute) < 1:
+            raise ArgumentError(f"aeqa: actions, candidates, horizon and execute must be positive, got {self}")
+
+
+class AEQA(NavigationTask):
+    """Answer a question about a home, exploring it as far as needed.
+
+    What is asked, when an episode ends, and what is measured. `NavigationTask` documents the rest of the arguments.
+
+    Args:
+        judge: who marks answers, see `wiw.judging.make_judge`: "auto" marks typed questions by rules and all others by
+            an approximate score, "llm:URL" asks a language model for those.
+    """
+
+    name = "aeqa"
+    metrics = ("answer_score", "spl", "path_length")
+    rules_class = AEQARules
+    generator_class = EpisodeRules
+    wording = Wording(
+        succeeded="answered correctly",
+        won="correct",
+        lost="not correct",
+        goal="nearest viewpoint",
+        way="to the nearest viewpoint",
+        asked="The question",
+    )
+
+    def __init__(self, *args: Any, judge: str | Judge = "auto", **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.judge = make_judge(judge)
+
+    # -- what it says of itself ----------------------------------------------------------------------------------------
+
+    @property
+    def limit(self) -> int:  # type: ignore[override]
+        """Most primitives of an episode."""
+        return int(self.rules.actions)
+
+    @property
+    def budget(self) -> int:
+        """Most primitives of an episode."""
+        return self.limit
+
+    @property
+    def decisions(self) -> int:
+        """Decisions that an episode takes if each carries out as much as it may: what progress bars expect."""
+        return -(-self.limit // int(self.rules.execute))
+
+    @property
+    def free_turns(self) -> bool:
+        """Whether the turn at the start of a segment does not count."""
+        return bool(self.rules.turns == "first_free")
+
+    @property
+    def defaults(self) -> dict[str, Any]:
+        """Options for `wiw.Agent` that the task prescribes."""
+        horizon = self.rules.horizon - 1 + HALF_TURN
+        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": self.rules.execute}
+
+    def describe(self) -> dict[str, Any]:
+        """Return the JSON-able identity: what must be equal for two runs to be comparable."""
+        return {**super().describe(), "judge": self.judge.describe()}
+
+    # -- episodes ------------------------------------------------------------------------------------------------------
+
+    def load_episodes(self) -> list[Episode]:
+        """Return the file's episodes: wiw's own, or OpenEQA's."""
+        assert self.episode_file is not None
+        return [_name_kind(episode) for episode in load(self.episode_file, self.scene_folder)]
+
+    def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
+        """Return questions about one scene, each with a start from where its answer is not seen."""
+        made = generate(place, self.per_scene, self.seed, self.generator, first=first, before=before)
+        return [_name_kind(episode) for episode in made]
+
+    def make_goal(self, place: World, episode: Episode) -> Goal:
+        """Return the question's text, and nothing else of it."""
+        return Goal(self.name, text=read_question(episode).text, question=True)
+
+    def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
+        """Return the viewpoint that is nearest to the start; the start itself where none is known."""
+        known = episode.goal_position if np.isfinite(episode.goal_position).all() else episode.start_position
+        return place.ground.put_down(known).astype(np.float64)
+
+    # -- when it ends --------------------------------------------------------------------------------------------------
+
+    def is_sure(self, state: EpisodeState) -> bool:
+        """Return whether the last answer is final, and confirmed as the rules ask."""
+        needed = 1 if self.rules.confirm == "none" else 2
+        latest = state.answers[-needed:]
+        return len(latest) == needed and all(isinstance(own, TextAnswer) and own.final for own in latest)
+
+    def waits(self, state: EpisodeState) -> bool:
+        """Return whether a final answer is to be confirmed on the same view."""
+        latest = state.answers[-1]
+        return bool(self.rules.confirm == "same_view" and isinstance(latest, TextAnswer) and latest.final)
+
+    def is_success(self, state: EpisodeState) -> bool:
+        """Return whether the episode has ended with an answer of the highest mark."""
+        return bool(self.final_answer(state)) and self._judge_final(state).mark == 5
+
+    def final_answer(self, state: EpisodeState) -> str:
+        """Return the answer that the episode has ended with; empty without one.
+
+        A final answer that the budget leaves no time to confirm counts too.
+        """
+        last = state.answers[-1] if state.answers else None
+        over = state.ended or state.is_out_of_budget(self)
+        return last.text if over and isinstance(last, TextAnswer) and last.final else ""
+
+    # -- metrics -------------------------------------------------------------------------------------------------------
+
+    def measure(self, state: EpisodeState) -> dict[str, float]:
+        """Return the metrics of one finished episode.
+
+        `mark` 1 to 5; `answer_score` (mark - 1) / 4; `success` 0 or 1, 1 for the highest mark; `spl`, the episode's
+        contribution; `path_length` in metres and `shortest`, L*; `primitives`; `answered` 0 or 1; `score_at_30` and so
+        on, the score if the episode had been cut there; `grounded` 0 or 1, whether what the question is about was in
+        sight before the answer, where that is known.
+
+        Raises:
+            JudgeError: the judge gave no mark.
+        """
+        answer, blind = self.final_answer(state), self._judge_blind(state)
+        judged = self._judge_final(state) if answer else self._judge_unanswered(blind)
+        score = _score(judged.mark)
+        counts = bool(answer) or self.rules.unanswered == "blind_with_path"
+        shortest = self._shortest(state)
+        cuts = {f"score_at_{cut}": score if answer and state.actions <= cut else _score(blind.mark) for cut in CUTS}
+        return {
+            "success": float(bool(answer) and judged.mark == 5),
+            "mark": float(judged.mark),
+            "answer_score": score,
+            "spl": float(path_efficiency([score if counts else 0.0], [shortest], [state.path_length])[0]),
+            "path_length": state.path_length,
+            "shortest": shortest,
+            "primitives": float(state.actions),
+            "answered": float(bool(answer)),
+            **cuts,
+            **self._measure_grounding(state),
+        }
+
+    def describe_end(self, state: EpisodeState) -> dict[str, Any]:
+        """Return the answer, what was expected, and who judged it how."""
+        answer, question = self.final_answer(state), read_question(state.episode)
+        judged = self._judge_final(state) if answer else self._judge_unanswered(self._judge_blind(state))
+        return {"answer": answer, "expected": question.answer, "judgement": judged.to_json()}
+
+    def _judge_final(self, state: EpisodeState) -> Judgement:
+        return self._judge(state, self.final_answer(state))
+
+    def _judge_blind(self, state: EpisodeState) -> Judgement:
+        return self._judge(state, blind_answer(read_question(state.episode).text))
+
+    def _judge_unanswered(self, blind: Judgement) -> Judgement:
+        return replace(blind, mark=1) if self.rules.unanswered == "lowest" else blind
+
+    def _judge(self, state: EpisodeState, answer: str) -> Judgement:
+        """Return the judgement of an answer, each one asked for once per episode."""
+        known: dict[str, Judgement] = state.notes.setdefault("judgements", {})
+        if answer not in known:
+            question = read_question(state.episode)
+            reference = Reference(question.text, question.answer, question.extra_answers, question.answer_type)
+            known[answer] = self.judge.judge([reference], [answer])[0]
+        return known[answer]
+
+    def _shortest(self, state: EpisodeState) -> float:
+        length = state.episode.geodesic
+        if self.rules.shortest == "file":
+            length = float(state.episode.info.get("file_length", length))
+        return length if np.isfinite(length) else 0.0
+
+    def _measure_grounding(self, state: EpisodeState) -> dict[str, float]:
+        targets = list(read_question(state.episode).target)
+        if not targets:
+            return {}
+        places = np.unique(np.stack([state.positions[i] for i in state.observed]), axis=0)
+        sizes = measure_sizes(state.world, places, COARSE)[:, targets]
+        return {"grounded": float((sizes.max(axis=0) >= SEEN).all())}
+
+
+def read_question(episode: Episode) -> Question:
+    """Return the question of an episode, with all that the agent is not told."""
+    return Question.from_info(episode.info["question"])
+
+
+def _name_kind(episode: Episode) -> Episode:
+    """Let the question's category be the episode's kind, which tables are split by."""
+    return replace(episode, info={**episode.info, "task": read_question(episode).category})
+
+
+def _score(mark: float) -> float:
+    """Return a mark from 1 to 5 as a share (paper, "Answering Score")."""
+    return (mark - 1) / 4
