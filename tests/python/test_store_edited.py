@@ -36,7 +36,7 @@ ODD = (
 TEXTS = {
     "run": ("config", "info"),
     "episode": ("info", "episode_id", "scene"),
-    "outcome": ("metrics",),
+    "outcome": ("metrics", "details"),
     "decision": (*DECISION_JSON, "note"),
 }
 

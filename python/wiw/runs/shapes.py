@@ -50,11 +50,15 @@ COLUMNS: Mapping[str, Any] = {
     "info": INFO,
     "episode.info": {},
     "metrics": NUMBERS,
+    "details": {},
     "world_to_pixel": [[NUMBER]],
     "actions": ACTIONS,
     "executed": ACTIONS,
     "scores": [NUMBER],
-    "answer": {"label": TEXT, "confidence": NUMBER, "probabilities": NUMBERS},
+    "answer": Either(
+        {"label": TEXT, "confidence": NUMBER, "probabilities": NUMBERS},
+        {"label": TEXT, "confidence": NUMBER, "final": FLAG},
+    ),
     "fidelity": {
         "scores": [NUMBER],
         "rank": NUMBER,
