@@ -9,13 +9,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.questions import EpisodeRules, Question, blind_answer, generate, load
+from wiw.datasets.questions import EpisodeRules, Question, blind_answer, load, make_episodes
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError
 from wiw.judging import Judge, Judgement, Reference, make_judge
 from wiw.metrics import path_efficiency
+from wiw.scenes import possible_edits, resolve
 from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, TextAnswer, Wording
 
@@ -122,9 +123,11 @@ class AEQA(NavigationTask):
         assert self.episode_file is not None
         return [_name_kind(episode) for episode in load(self.episode_file, self.scene_folder)]
 
-    def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
-        """Return questions about one scene, each with a start from where its answer is not seen."""
-        made = generate(place, self.per_scene, self.seed, self.generator, first=first, before=before)
+    def generate_first(self, count: int) -> list[Episode]:
+        """Return questions, each asked in two scenes at least with different answers, from where none is seen."""
+        scenes = resolve(self.scenes)
+        options = {"per_scene": self.per_scene, "backend": self.backend, "possible_edits": possible_edits}
+        made = make_episodes(scenes, count, self.seed, self.generator, **options)
         return [_name_kind(episode) for episode in made]
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
@@ -198,7 +201,7 @@ class AEQA(NavigationTask):
         """Return the answer, what was expected, and who judged it how."""
         answer, question = self.final_answer(state), read_question(state.episode)
         judged = self._judge_final(state) if answer else self._judge_unanswered(self._judge_blind(state))
-        return {"answer": answer, "expected": question.answer, "judgement": judged.to_json()}
+        return {"answer": answer, "expected": question.answer, "judgement": judged.to_info()}
 
     def _judge_final(self, state: EpisodeState) -> Judgement:
         return self._judge(state, self.final_answer(state))

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -75,9 +74,9 @@ class NavigationTask(NavigationSpec, Task):
         assert self.episode_file is not None
         return episode_file.load(self.episode_file, self.scene_folder)
 
-    @abstractmethod
     def generate_episodes(self, place: World, first: int, before: list[Episode]) -> list[Episode]:
         """Return `per_scene` generated episodes of a scene, from its number `first` on, after those `before`."""
+        raise NotImplementedError(f"{type(self).__name__}: write generate_episodes, or generate_first for all scenes")
 
     # ------------------------------------------------------------------------------------------------------------------
 
@@ -161,19 +160,30 @@ class NavigationTask(NavigationSpec, Task):
         """
         if self.episode_file:
             return self._first_of_file(count)
+        if len(self._episodes) < count:
+            self._episodes = self.generate_first(count)
+        return self._episodes[:count]
+
+    def generate_first(self, count: int) -> list[Episode]:
+        """Return the first `count` generated episodes: scene by scene, `per_scene` each, all of a single scene.
+
+        Raises:
+            ArgumentError: the scenes give fewer.
+        """
         scenes = resolve(self.scenes)
         whole_scene = len(scenes) == 1
-        while len(self._episodes) < count:
-            done = len(self._episodes) // self.per_scene
+        made = list(self._episodes)
+        while len(made) < count:
+            done = len(made) // self.per_scene
             if not whole_scene and done >= len(scenes):
-                break
-            self._add(scenes[0] if whole_scene else scenes[done], done if whole_scene else 0)
-        if len(self._episodes) < count:
-            raise ArgumentError(
-                f"{self.name}: asked for {count} episodes, but there are {len(self._episodes)}; "
-                "name more scenes (apartments:val:N) or raise per_scene"
-            )
-        return self._episodes[:count]
+                raise ArgumentError(
+                    f"{self.name}: asked for {count} episodes, but there are {len(made)}; "
+                    "name more scenes (apartments:val:N) or raise per_scene"
+                )
+            place = world(scenes[0] if whole_scene else scenes[done], self.backend)
+            block = self.generate_episodes(place, self.per_scene * done if whole_scene else 0, made)
+            made += [replace(episode, episode_id=f"{len(made) + i:04d}") for i, episode in enumerate(block)]
+        return made
 
     def _first_of_file(self, count: int) -> list[Episode]:
         found = self._read_file()
@@ -218,9 +228,3 @@ class NavigationTask(NavigationSpec, Task):
     def open_world(self, episode: Episode) -> World:
         """Return the scene of an episode with renderer and navigation mesh."""
         return world(episode.scene, self.backend)
-
-    def _add(self, scene: str, block: int) -> None:
-        """Add one block of episodes in one scene, numbered on from those before it."""
-        made = self.generate_episodes(world(scene, self.backend), self.per_scene * block, self._episodes)
-        first = len(self._episodes)
-        self._episodes += [replace(episode, episode_id=f"{first + i:04d}") for i, episode in enumerate(made)]

@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Question answering without a language model: a map of objects, an answer from it, and exploring where it pays.
+
+Real views make the map, and the map alone answers. Imagined views rank plans and never answer, as the paper's prompt
+asks ("A-EQA High-Level Planner Additional Prompt").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.action import TURN_LEFT
+from wiw.datasets.questions import ParsedQuestion, parse
+from wiw.errors import ArgumentError
+from wiw.mapping.object_map import ObjectMap
+from wiw.mapping.occupancy import OccupancyGrid
+from wiw.mapping.views import HFOV_DEG, VIEW_YAWS_DEG, Views, cut_views, unproject
+from wiw.panorama import to_perspective
+from wiw.perception.colors import name_color
+from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
+from wiw.policies.base import FrameSpec, Policy, Situation
+from wiw.policies.explorer.answering import Belief, answer, list_wanted
+from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
+from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
+from wiw.registry import LABELLERS
+from wiw.types import Answer, Goal, Key, Proposal, Rollout, TextAnswer
+
+VIEW_SIZE = (192, 224)
+"""(H, W) of the views that are labelled."""
+SURFACES = ("floor", "wall")
+SURFACE_STRIDE = 24
+"""Pixels between the looks at floors and walls, along rows and columns."""
+LOOK_ACTIONS = 3
+"""Most primitives of a plan that only takes a second look."""
+CLEAR_SHARE = 0.01
+"""Share of a view that a wanted thing must fill in an imagined view to count in full."""
+
+
+@dataclass
+class Memory:
+    """The memory of one episode."""
+
+    question: ParsedQuestion | None
+    """None where the text is none of the generator's language: then only the blind answer is left."""
+    objects: ObjectMap
+    grid: OccupancyGrid = field(default_factory=OccupancyGrid)
+    surfaces: list[Surface] = field(default_factory=list)
+    belief: Belief = Belief("", 0.0)
+    home: Any = None
+    expected: NDArray[np.float64] | None = None
+    """Where the last segment should have ended: a step that was refused shows in the odometry."""
+
+
+class Explorer(Policy):
+    """Explores a home until its map answers the question.
+
+    Args:
+        perception: who labels views: "learned", or a `wiw.perception.scene_labels.Labeller`.
+        sure: confidence from which on an answer is final.
+        imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
+        path: worth of a metre that need not be walked, in square metres of new floor.
+        affinity: worth of a room that is likely to have what is asked about.
+        budget: primitives of an episode; with its last segment the agent answers, however sure it is.
+
+    Raises:
+        BackendError: torch is not installed.
+        FileError: the weights cannot be read.
+    """
+
+    needs = ("depth",)
+    frames = FrameSpec("panorama", (288, 512))
+
+    def __init__(
+        self,
+        perception: Any = "learned",
+        sure: float = 0.5,
+        imagination: float = 8.0,
+        path: float = 0.6,
+        affinity: float = 4.0,
+        budget: int = 250,
+    ) -> None:
+        self.labeller: Labeller = LABELLERS.make(perception)
+        self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
+        self.knowledge = load_knowledge()
+
+    @classmethod
+    def require(cls, task: Mapping[str, Any]) -> None:
+        """Require a task that asks questions.
+
+        Raises:
+            ArgumentError: it does not.
+        """
+        if task.get("judge") is None:
+            raise ArgumentError(
+                f"policy explorer answers questions about a home, and task '{task.get('task', 'of this run')}' asks "
+                "none; use it with task aeqa (`wiw run aeqa`)"
+            )
+
+    def describe(self) -> dict[str, Any]:
+        """Return a JSON-able identity, with that of the perception."""
+        return {
+            "policy": type(self).__name__,
+            "perception": self.labeller.describe(),
+            "sure": self.sure,
+            "imagination": self.imagination,
+            "path": self.path,
+            "affinity": self.affinity,
+            "budget": self.budget,
+        }
+
+    def begin(self, goal: Goal, key: Key) -> Memory:
+        """Return an empty map."""
+        return Memory(parse(goal.text or ""), ObjectMap(self.labeller.categories, STATES))
+
+    # -- real views ----------------------------------------------------------------------------------------------------
+
+    def observe(self, situations: Sequence[Situation]) -> None:
+        """Add the real views to the maps, labelled in one batch, and ask them the questions."""
+        cut = [cut_views(own.panorama, own.depth, own.odometry, VIEW_SIZE) for own in (s.observation for s in situations)]
+        labels = self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
+        for i, (situation, views) in enumerate(zip(situations, cut, strict=True)):
+            self._add_views(situation, views, _take(labels, 4 * i, 4))
+
+    def _add_views(self, situation: Situation, views: Views, labels: SceneLabels) -> None:
+        memory, observation = situation.memory, situation.observation
+        if memory.expected is not None and np.hypot(*(memory.expected - observation.odometry)[:2]) > 0.05:
+            memory.grid.mark_blocked(observation.odometry, 0.2)
+        memory.grid.add(observation.depth, observation.odometry)
+        memory.objects.add(views, labels, name_color)
+        memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
+        memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
+        memory.belief = answer(memory.question, situation.goal.text, memory.home, memory.grid)
+
+    # -- plans ---------------------------------------------------------------------------------------------------------
+
+    def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
+        """Return routes to different places worth going to, the best first; a short second look where an answer stands."""
+        return [self._plan(situation, candidates, horizon) for situation in situations]
+
+    def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
+        memory, pose = situation.memory, situation.observation.odometry
+        final = self._is_final(situation)
+        found = choose_destinations(
+            memory.grid, pose, memory.belief.places, self._rate, memory, most=1 if final else 2 * candidates
+        )
+        plans: dict[bytes, Proposal] = {}
+        for place in found:
+            actions = plan_route(memory.grid, pose, place, LOOK_ACTIONS if final else horizon)
+            if len(actions):
+                plans.setdefault(actions.tobytes(), Proposal(actions, prior=place.worth, note=place.note))
+            if len(plans) == candidates:
+                break
+        if not plans:  # nowhere to go: another look from here, a quarter turned
+            plans[b""] = Proposal(np.full(1 if final else 4, TURN_LEFT, np.int8), note="look around")
+        return sorted(plans.values(), key=lambda plan: -plan.prior)
+
+    def _rate(self, memory: Memory, place: Destination, metres: float) -> float:
+        """Return what going to a place is worth: new floor, what is likely to be there, less the way."""
+        wanted = list_wanted(memory.question)
+        room = memory.home.room_names.get(memory.grid.find_room(place.position[None]), "")
+        kind = room.rpartition(" ")[0]
+        named = memory.question.slots.get("room") if memory.question is not None else None
+        likely = self.knowledge.measure_affinity(kind, wanted) if kind else 0.3
+        likely = max(likely, float(kind == named)) if named else likely
+        return place.gain + place.interest + self.affinity * likely - self.path * metres
+
+    # -- imagined views ------------------------------------------------------------------------------------------------
+
+    def score(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout]],
+    ) -> list[NDArray[np.float64]]:
+        """Return the worth of each plan's destination, and of what is asked about in the views at its imagined end."""
+        ends = [_cut_end(rollout) for futures in rollouts for rollout in futures]
+        labels = iter(self._label_views(ends))
+        scores = []
+        for situation, plans in zip(situations, proposals, strict=True):
+            wanted = list_wanted(situation.memory.question)
+            shown = [self._measure_evidence(next(labels), wanted) for _ in plans]
+            prior = np.array([plan.prior for plan in plans], np.float64)
+            scores.append(prior + self.imagination * np.array(shown))
+        return scores
+
+    def _label_views(self, ends: Sequence[tuple[NDArray[np.uint8], float]]) -> list[SceneLabels]:
+        """Return the labels of views [V, H, W, 3] of each end; those of one angle are labelled in one batch."""
+        found: dict[int, SceneLabels] = {}
+        for hfov in sorted({hfov for _, hfov in ends}):
+            own = [i for i, (_, other) in enumerate(ends) if other == hfov]
+            labels = self.labeller.label(np.concatenate([ends[i][0] for i in own]), hfov)
+            first = 0
+            for i in own:
+                found[i] = _take(labels, first, len(ends[i][0]))
+                first += len(ends[i][0])
+        return [found[i] for i in range(len(ends))]
+
+    def _measure_evidence(self, labels: SceneLabels, wanted: Sequence[str]) -> float:
+        """Return how surely something wanted is in sight, 0 to 1; what is asked about counts more than its anchors."""
+        evidence = 0.0
+        for rank, name in enumerate(wanted):
+            if name not in self.labeller.categories:
+                continue
+            mask = labels.category == self.labeller.categories.index(name)
+            share = float((labels.confidence * mask).sum(axis=(1, 2)).max()) / mask[0].size
+            evidence = max(evidence, min(1.0, share / CLEAR_SHARE) * (1.0 if rank == 0 else 0.6))
+        return evidence
+
+    # -- answers -------------------------------------------------------------------------------------------------------
+
+    def answer(
+        self,
+        situations: Sequence[Situation],
+        proposals: Sequence[Sequence[Proposal]],
+        rollouts: Sequence[Sequence[Rollout] | None],
+    ) -> list[Answer | TextAnswer | None]:
+        """Answer from the map of real views."""
+        return [
+            TextAnswer(own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self._is_final(situation))
+            for situation, own in ((situation, situation.memory) for situation in situations)
+        ]
+
+    def _is_final(self, situation: Situation) -> bool:
+        """Return whether the present belief is given as the answer: it is sure enough, or time is nearly up."""
+        left = self.budget - len(situation.executed)
+        return bool(situation.memory.belief.confidence >= self.sure or left <= 2 * LOOK_ACTIONS)
+
+    def revise(
+        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
+    ) -> tuple[NDArray[Any], int | None]:
+        """Take the best plan, and remember where it leads."""
+        actions, chosen = super().revise(situation, proposals, scores)
+        situation.memory.expected = None
+        return actions, chosen
+
+
+def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
+    """Return the labels of some views."""
+    rows = slice(first, first + count)
+    return SceneLabels(labels.category[rows], labels.confidence[rows], labels.state[rows])
+
+
+def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
+    """Return the views at the end of a rollout, uint8 [V, H, W, 3], and their angle: one where only the front is shown."""
+    end = rollout.frames[-1]
+    if rollout.view == "panorama":
+        return np.stack([to_perspective(end, VIEW_SIZE, HFOV_DEG, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
+    return end[None] if end.ndim == 3 else end, 90.0
+
+
+def _look_at_surfaces(views: Views, labels: SceneLabels, categories: Sequence[str]) -> list[Surface]:
+    """Return looks at floors and walls: patches that are all of one surface, with their colour."""
+    looks = []
+    half = SURFACE_STRIDE // 2
+    for name in SURFACES:
+        if name not in categories:
+            continue
+        mask = (labels.category == categories.index(name)) & (views.depth > 0)
+        height, width = views.size
+        for view in range(len(mask)):
+            for row in range(half, height - half, SURFACE_STRIDE):
+                for column in range(half, width - half, SURFACE_STRIDE):
+                    patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
+                    if mask[patch].all():
+                        color, confidence = name_color(views.images[patch].reshape(-1, 3))
+                        point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
+                        looks.append(Surface(name, point[:2], color, confidence))
+    return looks
+
+

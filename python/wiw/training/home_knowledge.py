@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What homes are usually like, counted in train apartments: kinds of rooms, what is in them, what things are made of."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from wiw.datasets.questions.answers import MATERIALS
+from wiw.datasets.questions.facts import STRUCTURE, SceneTable, make_table
+from wiw.files import whole_file
+from wiw.scenes import open_scene
+
+SCENES = tuple(f"apartments:train/{i}" for i in range(60))
+"""Apartments that the package's knowledge is made from."""
+
+
+def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
+    """Return shares of rooms by kind, mean numbers of things by kind and category, and commonest materials."""
+    rooms, contents = Counter[str](), defaultdict[str, Counter[str]](Counter)
+    materials = defaultdict[str, Counter[str]](Counter)
+    for table in tables:
+        rooms.update(room.kind for room in table.rooms)
+        for thing in table.things:
+            material = MATERIALS.get(thing.material, thing.material)
+            materials[thing.category][material] += 1
+            materials[f"{thing.category}/{thing.color}"][material] += 1
+            if thing.category not in STRUCTURE and (kind := table.kind_of(thing.room)):
+                contents[kind][thing.category] += 1
+    total = sum(rooms.values())
+    return {
+        "rooms": {kind: round(count / total, 4) for kind, count in sorted(rooms.items())},
+        "contents": {
+            kind: {name: round(count / rooms[kind], 4) for name, count in sorted(contents[kind].items())}
+            for kind in sorted(contents)
+        },
+        "materials": {name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())},
+    }
+
+
+def write_knowledge(path: str | Path, scenes: Sequence[str] = SCENES) -> None:
+    """Count in some scenes and write the file that `wiw.policies.explorer.home.load_knowledge` reads."""
+    found = count_homes([make_table(open_scene(scene), scene) for scene in scenes])
+    with whole_file(Path(path)) as partial:
+        partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
