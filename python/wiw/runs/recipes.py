@@ -126,9 +126,8 @@ class AgentRecipe(AgentConfig):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> AgentRecipe:
-        """Return the recipe that a run store keeps; earlier versions called some of its parts otherwise."""
-        known = {_RENAMED.get(name, name): value for name, value in data.items()}
-        return cls(**{name: value for name, value in known.items() if value is not None})
+        """Return the recipe that a run store keeps."""
+        return cls(**{name: value for name, value in data.items() if value is not None})
 
     def describe(self) -> dict[str, Any]:
         """Return the identity of the agent before it is built: a model is made once, when its turn comes.
@@ -206,7 +205,6 @@ class AgentRecipe(AgentConfig):
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
-_RENAMED = {"revision": "reviser", "swaps": "ground_truth"}
 
 
 def _unwrap(part: Any) -> Any:

@@ -26,7 +26,7 @@ from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 DECISION_JSON = (
     "actions",
     "executed",
