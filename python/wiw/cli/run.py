@@ -15,9 +15,9 @@ from wiw.cli.options import Options, default_policy, model_options, policy_optio
 from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
 from wiw.loop.config import AgentConfig
-from wiw.runs.config import RunConfig
+from wiw.runs.config import ResumeConfig, RunConfig
 
-SEARCH, SETTINGS = AgentConfig(), RunConfig()
+SEARCH, SETTINGS, UNCHANGED = AgentConfig(), RunConfig(), ResumeConfig()
 """What holds where the command line says nothing."""
 Name = Annotated[str, arg(metavar="NAME")]
 MaybeName = Annotated[str | None, arg(metavar="NAME")]
@@ -144,17 +144,23 @@ def resume(
 ) -> int:
     """Go on with a run that was stopped: only the episodes that have not ended are run.
 
+    config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
     $ wiw resume runs/first
 
     Args:
         run: The run's folder.
+    $ wiw resume runs/first --retry-errors --deadline 1200
+
+    All that scores or measurements depend on stays as the run was begun.
         workers: Processes; as many as it was begun with if not given.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         report: Whether to write report.html at the end.
     """
     from wiw.studies.evaluate import resume_run
 
-    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors), run), report)
+        config: What may change.
+    changes = config.to_json()
+    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors, **changes), run), report)
 
 
 def finish(log: Any, report: bool) -> int:
