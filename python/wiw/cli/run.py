@@ -35,7 +35,7 @@ def run(
     policy: MaybeName = None,
     policy_option: Options = (),
     revision: MaybeName = None,
-    arms: Annotated[str | None, arg(metavar="A,B,...")] = None,
+    arms: Annotated[str | None, arg(metavar="[NAME=]MODEL[?KEY=VALUE],...")] = None,
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     per_scene: MaybeCount = None,
@@ -61,6 +61,7 @@ def run(
     $ wiw run imagenav --world-model warp --episodes 50
     $ wiw run imagenav --arms none,copy,warp,oracle --workers 2 --out runs/first
     $ wiw run imagenav --world-model my_model.py:MyModel --arms none,oracle,heuristic+none
+    $ wiw run imagenav --arms none,big=warpnet?weights=big.npz,small=warpnet?weights=small.npz,oracle
     $ wiw run imagenav --scenes house.glb --world-model warp
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
@@ -78,7 +79,8 @@ def run(
         revision: Scores imagined futures; the policy's own choice if not given.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
-            other plans, or from elsewhere; placebo-shuffled:MODEL names another.
+            other plans, or from elsewhere; placebo-shuffled:MODEL names another. NAME=MODEL?KEY=VALUE names an arm and
+            gives its model options, several with & between them (in quotes), besides those of --world-model-option.
         tasks: For manipulation: which of its tasks, taken in turn; all of them if not given.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
             apartments:val if not given.
@@ -105,6 +107,7 @@ def run(
     """
     from wiw.cli.announcement import announce
     from wiw.errors import ArgumentError
+    from wiw.runs.arm_text import parse_arm
     from wiw.runs.recipes import AgentRecipe, TaskRecipe, absolute, arm_recipes
 
     if search.width is not None and search.depth == 1:
@@ -118,7 +121,7 @@ def run(
     policy = policy or default_policy(task)
     model = None if world_model == "none" else absolute(world_model)
     names = _arms(arms, world_model)
-    speaking = [policy, revision or "", *(name.partition("+")[0] for name in names or [])]
+    speaking = [policy, revision or "", *(parse_arm(name).model.partition("+")[0] for name in names or [])]
     asked = {"vlm": vlm, "model": vlm_model, "prices": vlm_prices, "prompts": prompts}
     agent = AgentRecipe(
         absolute(policy), model, revision and absolute(revision), **search.numbers,
@@ -141,24 +144,24 @@ def resume(
     workers: MaybeCount = None,
     retry_errors: bool = False,
     report: bool = True,
+    config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
 ) -> int:
     """Go on with a run that was stopped: only the episodes that have not ended are run.
 
-    config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
     $ wiw resume runs/first
-
-    Args:
-        run: The run's folder.
     $ wiw resume runs/first --retry-errors --deadline 1200
 
     All that scores or measurements depend on stays as the run was begun.
+
+    Args:
+        run: The run's folder.
         workers: Processes; as many as it was begun with if not given.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         report: Whether to write report.html at the end.
+        config: What may change.
     """
     from wiw.studies.evaluate import resume_run
 
-        config: What may change.
     changes = config.to_json()
     return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors, **changes), run), report)
 
@@ -200,10 +203,13 @@ def vlm_options(given: dict[str, Any], policies: list[str]) -> dict[str, Any]:
 
 
 def _arms(arms: str | None, world_model: str) -> list[str] | None:
-    from wiw.runs.recipes import absolute
+    from wiw.runs.arm_text import parse_arm, split_arms
+    from wiw.runs.recipes import absolute, make_arm_absolute
 
     if arms is None:
         return None
-    names = [absolute(name.strip()) for name in arms.split(",") if name.strip()]
+    texts = [make_arm_absolute(text) for text in split_arms(arms)]
     own = absolute(world_model)
-    return names if own in names or own == "none" else [*names, own]
+    parsed = map(parse_arm, texts)
+    is_among = own == "none" or any(arm.model == own and not arm.options for arm in parsed)
+    return texts if is_among else [*texts, own]

@@ -45,7 +45,8 @@ def evaluate(
         episodes: how many; None means as many as the task says.
         arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
-            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
+            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another.
+            "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
             mapping gives the arms names of their own. None means the agent's own model.
         config: how the run goes.
         settings: any of `RunConfig`'s in place of the config's, such as seed, out, workers, keep_images, resume,
@@ -94,8 +95,8 @@ def resume_run(
         workers: processes; None means as many as it was begun with.
         progress: whether to show bars.
         retry_errors: whether to rerun episodes that ended with an infrastructure error.
-
         settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
+
     Raises:
         ArgumentError: a number out of range, or a setting that is fixed once a run is begun.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
@@ -105,8 +106,8 @@ def resume_run(
     """
     if workers is not None:
         RunConfig(workers=workers)  # its numbers are checked there
-    store = RunStore.resume(run)
     changes = read_resume_settings(settings).to_json()
+    store = RunStore.resume(run)
     try:
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
@@ -119,8 +120,8 @@ def resume_run(
         store.close()
         raise
     require_left(built, store, agents, retry_errors)
-    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
     store.change_settings(changes)
+    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
 
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
@@ -141,8 +142,8 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         store = RunStore.resume(settings.out, config)
         require_left(built, store, agents)
         require_own_sources(store, task, agents)
-    else:
         _take_over(store, settings)
+    else:
         started = time.perf_counter()
         episodes = built.episodes(count)
         used = built.require(episodes)
@@ -169,7 +170,6 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     return _finish(store, task, agents, settings.workers, settings.progress)
 
 
-def _finish(
 def _take_over(store: RunStore, settings: RunConfig) -> None:
     """Let a resumed run go on with these settings; closes the store where other things would be measured.
 
@@ -186,6 +186,7 @@ def _take_over(store: RunStore, settings: RunConfig) -> None:
     store.change_settings(ResumeConfig(**{name: getattr(settings, name) for name in changeable}).to_json())
 
 
+def _finish(
     store: RunStore,
     task: Any,
     agents: Mapping[str, Any],
