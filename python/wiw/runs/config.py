@@ -57,6 +57,51 @@ class RunConfig(Limits):
         return episodes if isinstance(self.keep_images, str) else self.keep_images
 
 
+@dataclass(frozen=True, kw_only=True)
+class ResumeConfig:
+    """Settings of `RunConfig` that a run may be resumed with in place of its own, from then on; None keeps its own.
+
+    No score depends on them. What scores or measurements depend on stays as the run was begun.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    live: Annotated[int | None, arg(metavar="N")] = None
+    """Episodes kept live at a time in a process, as in `wiw run`; the run's own number if not given."""
+    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Most seconds for a call of the world model; the run's own if not given."""
+    cache: Annotated[str | Path | None, arg(metavar="auto|off|DIR")] = None
+    """Where rollouts are cached, as in `wiw run`; where the run caches them if not given."""
+    cache_gb: Annotated[float | None, arg(metavar="N")] = None
+    """Most gigabytes of that folder; the run's own if not given."""
+
+    def __post_init__(self) -> None:
+        self.to_json()  # RunConfig checks the numbers
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings that are given, as the run store keeps them."""
+        changes = {name: value for name, value in vars(self).items() if value is not None}
+        config = RunConfig(**changes)
+        recorded = {**config.to_json(), "live": config.live}
+        return {name: recorded[name] for name in changes}
+
+
+def read_resume_settings(settings: Mapping[str, Any]) -> ResumeConfig:
+    """Return settings by name as a `ResumeConfig`.
+
+    Raises:
+        ArgumentError: one that is fixed once a run is begun.
+    """
+    names = [field.name for field in fields(ResumeConfig)]
+    if fixed := [name for name in settings if name not in names]:
+        raise ArgumentError(
+            f"resume: '{fixed[0]}' stays as the run was begun; expected settings among workers, {', '.join(names)}, on "
+            "which no score depends. For another value start a new run"
+        )
+    return ResumeConfig(**settings)
+
+
 def take_settings(
     config: RunConfig | None, settings: Mapping[str, Any], episodes: int | None = None
 ) -> tuple[RunConfig, dict[str, Any]]:

@@ -20,7 +20,9 @@ from wiw.loop.observers import Observer
 from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
+from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
@@ -28,6 +30,8 @@ from wiw.world_models.base import WorldModel
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
+REFERENCES = ("none", "copy", "oracle")
+"""Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
 """Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS = Limits()
@@ -126,9 +130,8 @@ class AgentRecipe(AgentConfig):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> AgentRecipe:
-        """Return the recipe that a run store keeps; earlier versions called some of its parts otherwise."""
-        known = {_RENAMED.get(name, name): value for name, value in data.items()}
-        return cls(**{name: value for name, value in known.items() if value is not None})
+        """Return the recipe that a run store keeps."""
+        return cls(**{name: value for name, value in data.items() if value is not None})
 
     def describe(self) -> dict[str, Any]:
         """Return the identity of the agent before it is built: a model is made once, when its turn comes.
@@ -206,7 +209,6 @@ class AgentRecipe(AgentConfig):
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
-_RENAMED = {"revision": "reviser", "swaps": "ground_truth"}
 
 
 def _unwrap(part: Any) -> Any:
@@ -313,10 +315,12 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
 def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]:
     """Return the same agent with each of several world models, by arm name; with its own where `arms` is None.
 
-    `arms` are names and world models (classes or instances), or a mapping of the arms' own names to these.
+    `arms` are texts (see `wiw.runs.arm_text`) and world models (classes or instances), or a mapping of the arms' own
+    names to these.
 
     Raises:
-        ArgumentError: an arm is named twice, or none is; an agent of another method, which has no world model.
+        ArgumentError: an arm is named twice, or none is; a name that is empty, has forbidden characters or is a
+            reference's; options that are no KEY=VALUE; an agent of another method, which has no world model.
     """
     recipe = agent_recipe(agent)
     if arms is None:
@@ -326,7 +330,10 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
     made = [_make_arm(recipe, name, model) for name, model in pairs]
     if len(dict(made)) < max(1, len(made)):
-        raise ArgumentError(f"arms: expected different world models, got {[name for name, _ in made]}")
+        raise ArgumentError(
+            f"arms: expected different world models, got {[name for name, _ in made]}; one model may be several arms "
+            f"with names of their own: {EXAMPLE}"
+        )
     return dict(made)
 
 
@@ -339,14 +346,46 @@ def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
 
 def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, AgentRecipe]:
     """Return name and recipe of an arm."""
+    if name is not None:
+        check_arm_name(name)
     if model is not None and not isinstance(model, str):
         changed = agent.with_model(model)
-        return name or changed.arm, changed
-    policy, of_model = _split_policy(model or "none")
+        return changed.arm if name is None else name, changed
+    arm = parse_arm(model or "none")
+    if name is not None and arm.name is not None:
+        raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
+    policy, of_model = _split_policy(arm.model)
     kind, named = placebo_of(of_model)
     own = agent if policy is None else replace(agent, policy=policy)
     changed = own.with_model(of_model) if kind is None else own.as_placebo(kind, named)
-    return name or _name_arm(policy, of_model), changed
+    changed = _with_options(changed, arm)
+    given = arm.name if name is None else name
+    if given in REFERENCES and (changed.arm != given or kind is not None):
+        raise ArgumentError(
+            f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
+        )
+    return given or _name_arm(policy, of_model), changed
+
+
+def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
+    """Return the agent whose world model takes an arm's options besides those that it has.
+
+    Raises:
+        ArgumentError: there is no world model that could take them.
+    """
+    if not arm.options:
+        return agent
+    if not isinstance(agent.model, str):
+        raise ArgumentError(f"arms: '{arm}' has options and no world model to take them; expected one by name")
+    options = parse_options(arm.options, WORLD_MODELS.find(agent.model), f"arms: '{arm}'")
+    return replace(agent, model_options={**agent.model_options, **options})
+
+
+def make_arm_absolute(text: str) -> str:
+    """Return an arm's text with the path of its model made absolute."""
+    arm = parse_arm(text)
+    policy, model = _split_policy(arm.model)
+    return str(replace(arm, model=f"{f'{policy}+' if policy else ''}{absolute(model)}"))
 
 
 def _split_policy(name: str) -> tuple[str | None, str]:

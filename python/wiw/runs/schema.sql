@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 9 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 10 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
