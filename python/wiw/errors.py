@@ -13,6 +13,7 @@ __all__ = [
     "Error",
     "FileError",
     "InfrastructureError",
+    "JudgeError",
     "NavigationError",
     "PromptError",
     "RegistryError",
@@ -116,6 +117,18 @@ class VlmError(InfrastructureError):
     """
 
     def __init__(self, message: str = "", kind: str = "unreachable") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class JudgeError(InfrastructureError):
+    """An answer could not be judged; it has no mark, which is not the same as a low one.
+
+    `kind` names what the language model replied: "empty", "refusal", "truncated", "huge", "malformed" (no mark is all
+    that it says) or "range" (a mark that is not from 1 to 5); or "no_rule", where no judge knows the answer's type.
+    """
+
+    def __init__(self, message: str = "", kind: str = "malformed") -> None:
         super().__init__(message)
         self.kind = kind
 
