@@ -122,12 +122,13 @@ class VlmError(InfrastructureError):
 
 
 class JudgeError(InfrastructureError):
-    """A judge gave no usable mark, however often it was asked.
+    """An answer could not be judged; it has no mark, which is not the same as a low one.
 
-    `kind` is "unparsable" (a reply that is no mark from 1 to 5), or the kind of the `VlmError` that the call ended in.
+    `kind` names what the language model replied: "empty", "refusal", "truncated", "huge", "malformed" (no mark is all
+    that it says) or "range" (a mark that is not from 1 to 5); or "no_rule", where no judge knows the answer's type.
     """
 
-    def __init__(self, message: str = "", kind: str = "unparsable") -> None:
+    def __init__(self, message: str = "", kind: str = "malformed") -> None:
         super().__init__(message)
         self.kind = kind
 

@@ -43,7 +43,7 @@ PYTHON_ROWS = [
     {"_core"},
     FACES,
     {"datasets", "metrics", "perception", "tabletop", "vlm", "wire"},
-    {"envs", "policies", "world_models"},
+    {"envs", "judging", "policies", "world_models"},
     {"tasks", "loop", "training"},
     {"experiments"},
     {"runs"},

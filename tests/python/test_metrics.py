@@ -143,3 +143,27 @@ def test_pose_errors_equal_scipy():
     metres, angle = metrics.pose_error(*poses)
     np.testing.assert_allclose(metres, np.linalg.norm(poses[0, :, :3, 3] - poses[1, :, :3, 3], axis=1))
     np.testing.assert_allclose(angle, (turns[0].inv() * turns[1]).magnitude(), atol=1e-9)
+
+
+def test_answer_scores_of_published_marks() -> None:
+    counts = {1: 79, 2: 37, 3: 6, 4: 28, 5: 34}  # of the published blind answers to 184 questions
+    marks = [mark for mark, count in counts.items() for _ in range(count)]
+    assert metrics.aeqa_score(marks) == pytest.approx(36.549, abs=5e-4)
+    assert metrics.aeqa_score([0, 1, 6]) == pytest.approx(100 / 3)  # clipped to 1 and 5
+
+
+@pytest.mark.parametrize(
+    ("mark", "shortest", "travelled", "answered", "expected"),
+    [
+        (5, 4.0, 4.0, True, 100.0),
+        (1, 4.0, 4.0, True, 0.0),
+        (5, 4.0, 2.0, True, 100.0),  # a shorter path than the shortest one counts as that
+        (5, 4.0, 8.0, True, 50.0),
+        (3, 4.0, 8.0, True, 25.0),
+        (5, 4.0, 4.0, False, 0.0),  # a blind answer was judged
+    ],
+)
+def test_answer_score_weighted_by_path_length(
+    mark: int, shortest: float, travelled: float, answered: bool, expected: float
+) -> None:
+    assert metrics.aeqa_spl([mark], [shortest], [travelled], answered=[answered]) == pytest.approx(expected)

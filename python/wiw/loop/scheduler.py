@@ -151,7 +151,7 @@ def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, E
                 raise
             trial.done = True
             sink.record_lost({**decision.spent, "seconds": sum(decision.seconds.values())})
-            kind = f"judge/{error.kind}" if isinstance(error, JudgeError) else "environment"
+            kind = f"judge/{error.kind}" if isinstance(error, JudgeError | VlmError) else "environment"
             sink.episode(_build_error_result(trial.index, trial.episode, trial.begin, kind, error))
             continue
         sink.decision(record)

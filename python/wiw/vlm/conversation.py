@@ -70,7 +70,8 @@ def _read_reply(request: Request, completion: Completion) -> Reply:
 def _make_call(request: Request, attempt: int) -> Call:
     temperature = request.temperature if attempt == 0 else max(request.temperature, RETRY_TEMPERATURE)
     schema = None if request.schema is None else request.schema.model_json_schema()
-    return Call(request.messages, temperature, _derive_seed(request.seed, attempt), request.max_tokens, schema=schema)
+    seed = request.seed if request.exact_seed and attempt == 0 else _derive_seed(request.seed, attempt)
+    return Call(request.messages, temperature, seed, request.max_tokens, schema=schema)
 
 
 def _derive_seed(seed: int, attempt: int) -> int:

@@ -45,6 +45,9 @@ class Request:
     schema: type[BaseModel] | None = None
     temperature: float = 0.0
     seed: int = 0
+    """What the seeds of its calls are derived from; they differ by the attempt."""
+    exact_seed: bool = False
+    """Whether the first call for text or JSON has `seed` itself, as a published protocol may ask for."""
     max_tokens: int = 1024
     """Most tokens of an answer that is not a choice."""
     tries: int = 3

@@ -7,7 +7,8 @@ and recognition: `obs_key` (the observation in words) and `actions` (name to mea
 `rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of its top), `colours` (names),
 `instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far).
 
-The shipped templates are filled here, a user's in a process with limits on time, memory and length (`filling.py`).
+The shipped templates are filled here, a user's in a process with limits on time, memory and length
+(`wiw.vlm.template_filling`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError, PromptError
-from wiw.policies.vlm.prompts import worker
-from wiw.policies.vlm.prompts.filling import Filling
+from wiw.vlm import template_worker
+from wiw.vlm.template_filling import Filling
 
 FOLDER = Path(__file__).parent
 SLOTS: dict[str, Any] = {
@@ -85,7 +86,8 @@ class Prompts:
             raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
         path, source = template
         own = self.folder is not None and path.is_relative_to(self.folder)
-        return (self._filling.fill(path, source, slots) if own else worker.fill_template(source, slots)).strip()
+        text = self._filling.fill(path, source, slots) if own else template_worker.fill_template(source, slots)
+        return text.strip()
 
     @cached_property
     def digest(self) -> str:

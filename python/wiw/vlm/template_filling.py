@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parent's side of `worker.py`: a user's templates are filled in a process that time and memory are limited for."""
+"""The parent's side of `template_worker.py`: a user's templates are filled within limits of time and memory."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from threading import Lock
 from typing import Any
 
 from wiw.errors import PromptError
-from wiw.policies.vlm.prompts import worker
+from wiw.vlm import template_worker
 
 
 class Filling:
@@ -55,14 +55,14 @@ class Filling:
         code = process.wait()
         if code == -signal.SIGPROF:
             raise PromptError(
-                f"{path}: expected a prompt that takes at most {worker.SECONDS:g} s to fill; it takes more"
+                f"{path}: expected a prompt that takes at most {template_worker.SECONDS:g} s to fill; it takes more"
             )
         raise PromptError(f"{path}: the process that fills it ended with {code}; it takes too much memory or recursion")
 
     def _start_process(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, worker.__file__],
+                [sys.executable, template_worker.__file__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Templates in Jinja's sandbox, and a process of its own that fills a user's within bounds: `python worker.py`.
+"""Templates in Jinja's sandbox, and a process of its own that fills a user's within bounds (`python FILE`).
 
 The sandbox keeps a template from the rest of the program, but not from taking all time or memory, and a single
 expression can do that inside compiled code. So the process has the kernel's limits. It reads pickled jobs from its

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers in a normal form, and what they say: concepts, yes or no, counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from wiw.judging.vocabulary import KINDS, Concept, Kind, Match, load_vocabulary
+from wiw.judging.words import (
+    ARTICLES,
+    cut_after_last_period,
+    merge_numbers,
+    split_clauses,
+    split_raw_words,
+    split_words,
+)
+
+__all__ = [
+    "cut_after_last_period",
+    "find_concepts",
+    "find_negated",
+    "has_negation",
+    "normalise",
+    "read_counts",
+    "read_polarity",
+]
+
+NEGATIONS = frozenset(
+    {"no", "not", "never", "none", "nothing", "nobody", "neither", "nor", "without", "nope", "nowhere"}
+)
+_REPLACED = frozenset({"instead", "rather"})
+"""Words before "of" or "than" and what is not the case."""
+_YES = frozenset({"yes", "yeah", "yep", "yup", "true", "correct", "affirmative", "indeed", "certainly", "definitely"})
+_NO = frozenset({"no", "nope", "nah", "false", "incorrect", "negative"})
+_UNSURE = frozenset({"maybe", "perhaps", "possibly", "unsure", "unknown", "uncertain", "unclear"})
+_FORMS_OF_BE = frozenset({"is", "are", "was", "were", "be", "am"})
+_PLACEHOLDERS = frozenset({"it", "there", "they", "that", "this", "i", "think", "so", "do", "does", "here", "yes"})
+_PREPOSITIONS = frozenset({
+    "on", "in", "at", "near", "next", "beside", "by", "under", "above", "below", "behind", "between", "of", "with",
+    "inside", "against", "over", "opposite", "from", "to", "across", "along", "around",
+})  # fmt: skip
+_COPULAS = _FORMS_OF_BE | {"look", "appear", "seem", "called"}
+_OPPOSITES = (("open", "closed"), ("on", "off"), ("made", "unmade"))
+_PAIRS = frozenset({"couple", "pair", "both"})
+
+
+def normalise(text: str) -> str:
+    """Return an answer in a normal form: NFKC, lower case, singular, no articles, digits, one name for each concept."""
+    words = split_words(text)
+    parts: list[str] = []
+    end = 0
+    for match in load_vocabulary().find(words, KINDS):
+        parts += words[end : match.start]
+        parts += [match.concept.shade, match.concept.name] if match.concept.shade else [match.concept.name]
+        end = match.end
+    return " ".join([*parts, *words[end:]])
+
+
+def has_negation(text: str) -> bool:
+    """Return whether an odd number of words negate a text."""
+    return sum(word in NEGATIONS for word in split_words(text)) % 2 == 1
+
+
+def find_concepts(text: str, kinds: Sequence[Kind], head: bool = True) -> list[Concept]:
+    """Return the different concepts that a text affirms, in order; "not a sofa but a chair" affirms the chair.
+
+    Args:
+        text: an answer.
+        kinds: of concepts to look for.
+        head: look first at what follows "is" and precedes a preposition, and at the rest only where nothing is found:
+            "the thing on the table is a vase by the wall" affirms the vase.
+    """
+    found: dict[Concept, None] = {}
+    for clause in split_clauses(text):
+        for words in _narrow_down(clause) if head else [clause]:
+            matches = [match for match in load_vocabulary().find(words, kinds) if not is_negated(words, match)]
+            if matches:
+                found |= dict.fromkeys(match.concept for match in matches)
+                break
+    return list(found)
+
+
+def find_negated(text: str, kinds: Sequence[Kind]) -> list[Concept]:
+    """Return the different concepts that a text denies, in order."""
+    found = [
+        match.concept
+        for clause in split_clauses(text)
+        for match in load_vocabulary().find(clause, kinds)
+        if is_negated(clause, match)
+    ]
+    return list(dict.fromkeys(found))
+
+
+def is_negated(words: Sequence[str], match: Match) -> bool:
+    """Return whether a word before a match negates it."""
+    return any(word in NEGATIONS or word in _REPLACED for word in words[: match.start])
+
+
+def _narrow_down(clause: list[str]) -> list[list[str]]:
+    """Return the parts of a clause that may name what is asked for, most specific first; each keeps its negation."""
+    verbs = [place for place, word in enumerate(clause) if word in _COPULAS]
+    rest = clause[verbs[-1] + 1 :] if verbs else clause
+    if any(word in NEGATIONS for word in clause) and not any(word in NEGATIONS for word in rest):
+        rest = ["not", *rest]
+    stop = next((place for place, word in enumerate(rest) if word in _PREPOSITIONS), len(rest))
+    return [rest[:stop], rest, clause]
+
+
+def read_counts(text: str) -> list[int]:
+    """Return the numbers that an answer states; "none" is 0, and "a chair" is 1 where no number stands."""
+    raw = split_raw_words(text)
+    words = merge_numbers(raw)
+    values = [float(word) for word in words if word[0].isdigit()]
+    counts = [int(value) for value in values if value == int(value)]
+    if values:
+        return list(dict.fromkeys(counts))
+    if any(word in _PAIRS for word in words):
+        return [2]
+    if any(word in NEGATIONS for word in words):
+        return [0]
+    return [1] if (len(raw) > 1 and raw[0] in ARTICLES - {"the"}) or {"single", "once"} & set(words) else []
+
+
+def read_polarity(text: str, question: str = "") -> bool | None:
+    """Return whether an answer says yes; None where it says neither, or both.
+
+    Args:
+        text: such as "yes", "No, there are no chairs", or with a question "it is shut".
+        question: a yes-no question, which tells what a statement without yes or no says about it.
+    """
+    words = split_words(text)
+    explicit = [word for word in words if word in _YES or word in _NO]
+    if not words or _UNSURE & set(words) or _says_both(words):
+        return None
+    if words[0] in _YES | _NO:
+        negated = words[1:2] == ["not"] and words[0] in _YES  # "certainly not"
+        return words[0] in _YES and not negated
+    negated = has_negation(text) != any(word in ("false", "incorrect") for word in words)
+    if explicit or (negated and not question):
+        return not negated
+    return _compare_statement(text, question, negated)
+
+
+def _says_both(words: Sequence[str]) -> bool:
+    """Return whether an answer begins with yes and no."""
+    first = [word for word in words[:3] if word not in ("and", "or")][:2]
+    return (
+        len(first) == 2
+        and first[0] in _YES | _NO
+        and first[1] in _YES | _NO
+        and (first[0] in _YES) != (first[1] in _YES)
+    )
+
+
+def _compare_statement(text: str, question: str, negated: bool) -> bool | None:
+    """Return whether a statement agrees with a question; None where they are about different things."""
+    vocabulary = load_vocabulary()
+    asked, said = split_words(question), split_words(text)
+    for one, other in _OPPOSITES:
+        states = [[m.concept.name for m in vocabulary.find(words, ["state"])][-1:] for words in (asked, said)]
+        if all(state and state[0] in (one, other) for state in states):
+            return (states[0] == states[1]) != negated
+    colors = [{m.concept for m in vocabulary.find(words, ["color"])} for words in (asked, said)]
+    if all(colors) and not negated:
+        return colors[0] == colors[1]
+    content = set(said) - NEGATIONS - _FORMS_OF_BE - _PLACEHOLDERS
+    if content <= set(asked) and _FORMS_OF_BE | {"do", "does", "can", "has"} & set(said) and (set(said) - content):
+        return not negated
+    return None
