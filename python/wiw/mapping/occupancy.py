@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from wiw.mapping.openings import Opening, find_openings, merge_openings
+from wiw.mapping.openings import Opening, clean_walls, find_openings, name_openings
 from wiw.mapping.views import CAMERA_HEIGHT, check_panorama
 
 CELL = 0.1
@@ -69,9 +69,10 @@ class OccupancyGrid:
     """Something is right under the ceiling: a wall, or a lintel."""
     ceiling: float = CEILING
     openings: tuple[Opening, ...] = ()
-    """Gaps between things that are as high as walls, seen so far."""
+    """Doorways and passages, by id."""
     visits: list[NDArray[np.float64]] = field(default_factory=list)
     """float64 [2] each: where the agent has observed."""
+    _opening_places: dict[int, NDArray[np.float64]] = field(default_factory=dict)
 
     def add(self, depth: NDArray[np.float32], odometry: NDArray[np.float64]) -> int:
         """Add a panorama of distances along the ray, float32 [H, W]; return how many cells were unknown before.
@@ -95,9 +96,10 @@ class OccupancyGrid:
             rows, columns = np.nonzero(mask)
             layer[self._place(odometry, flat[rows, columns], azimuth[columns])] = True
         self._sweep(flat, height, usable, solid, ground, azimuth, odometry)
-        self.openings = merge_openings(self.openings, find_openings(flat, height, usable, azimuth, odometry))
         self.visits.append(np.array(odometry[:2]))
         _forget(self)
+        found = find_openings(self.free & ~self.occupied, self.wall_cells, self.to_points)
+        self.openings = name_openings(found, self._opening_places)
         return int(self.known.sum()) - before
 
     def _sweep(
@@ -176,13 +178,18 @@ class OccupancyGrid:
         return tuple(sorted(found, key=lambda frontier: (-frontier.cells, *frontier.position.tolist())))
 
     @cached_property
+    def wall_cells(self) -> NDArray[np.bool_]:
+        """Cells of walls, those above doorways included."""
+        return clean_walls(self.walls)
+
+    @cached_property
     def rooms(self) -> NDArray[np.int32]:
         """int32 [rows, columns]: room of each known cell, from 1 on, 0 in walls, doorways and the unknown.
 
         Rooms are what walls and lintels, right under the ceiling, keep apart.
         """
-        barrier = cv2.morphologyEx(self.walls.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).view(bool)
-        barrier |= cv2.dilate(self.walls.view(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))).view(bool)
+        cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+        barrier = cv2.dilate(self.wall_cells.view(np.uint8), cross).view(bool)
         parts, count = ndimage.label(self.known & ~barrier)
         large = np.bincount(parts.ravel(), minlength=count + 1) * CELL**2 >= LEAST_ROOM
         large[0] = False
@@ -261,7 +268,7 @@ class OccupancyGrid:
 
 def _forget(grid: OccupancyGrid) -> None:
     """Drop what was computed of a map that has changed."""
-    for name in ("standable", "frontiers", "rooms", "_nearest_room"):
+    for name in ("standable", "frontiers", "wall_cells", "rooms", "_nearest_room"):
         grid.__dict__.pop(name, None)
 
 

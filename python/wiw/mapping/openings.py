@@ -1,36 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Openings: gaps between things as high as walls, through which there is a view of more space."""
+"""Openings: doorways and passages, gaps in the walls' depth through which floor goes on under what is a wall above."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-BAND = (1.35, 1.9)
-"""Heights in metres of what bounds an opening: above most furniture, below lintels."""
-STEP = 0.5
-"""Metres that the space behind an edge must reach further than the edge."""
-WIDTH = (0.55, 2.6)
-"""Metres between the edges."""
-FAR = 6.0
-"""Metres up to which openings are looked for."""
+WIDTH = (0.35, 3.0)
+"""Metres between the ends, as far as they are free of obstacles."""
+LEAST_WALL = 10
+"""Cells that a part of the walls reaches at least from end to end; lamps under the ceiling are smaller."""
+LEAST_SIDE = 4
+"""Free cells that must be known on either side of an opening."""
 SAME = 0.6
 """Metres within which two openings are one."""
 
 
 @dataclass(frozen=True)
 class Opening:
-    """A gap between two edges."""
+    """A gap in a wall."""
 
     id: int
     """From 1 on, in the order in which they were found; 0 before it is in a map."""
     edges: NDArray[np.float64]
     """float64 [2, 2]: its ends on the floor, in the frame of the start."""
-    decisions: int = 1
-    """Observations in which it was seen."""
 
     @property
     def position(self) -> NDArray[np.float64]:
@@ -43,76 +42,61 @@ class Opening:
         return float(np.linalg.norm(self.edges[1] - self.edges[0]))
 
 
+def clean_walls(walls: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what of the cells observed right under the ceiling is walls, small gaps closed: bool [rows, columns]."""
+    joined = cv2.morphologyEx(walls.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    _, parts, stats, _ = cv2.connectedComponentsWithStats(joined, connectivity=8)
+    large = np.maximum(stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]) >= LEAST_WALL
+    large[0] = False
+    return cv2.morphologyEx(large[parts].astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)).view(bool)
+
+
 def find_openings(
-    flat: NDArray[np.float32],
-    height: NDArray[np.float32],
-    usable: NDArray[np.bool_],
-    azimuth: NDArray[np.float64],
-    odometry: NDArray[np.float64],
+    free: NDArray[np.bool_], walls: NDArray[np.bool_], to_points: Callable[[NDArray[Any]], NDArray[np.float64]]
 ) -> list[Opening]:
-    """Find the openings in one panorama.
+    """Find the openings of a map.
 
     Args:
-        flat: horizontal distance of each pixel, [H, W], the columns a full circle.
-        height: above the floor.
-        usable: which pixels hold a depth.
-        azimuth: of each column, in the frame of the start.
-        odometry: where the panorama was taken.
+        free: cells of free floor without obstacles.
+        walls: as `clean_walls` returns them; they go on above openings.
+        to_points: gives the middles of cells [N, 2] in metres.
     """
-    tall = usable & (height > BAND[0]) & (height < BAND[1])
-    reach = np.where(tall, flat, np.inf).min(axis=0).astype(np.float64)
-    reach = np.minimum(reach, 2 * FAR)
-    points = odometry[:2] + np.minimum(reach, FAR)[:, None] * np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
-    jump = np.roll(reach, -1) - reach
-    starts = np.flatnonzero((jump > STEP) & (reach < FAR))  # the column before the gap
-    ends = np.flatnonzero((-jump > STEP) & (np.roll(reach, -1) < FAR))  # the last column in the gap
+    under, _ = ndimage.label(free & walls, np.ones((3, 3)))
     found = []
-    for start in starts.tolist():
-        pair = _find_far_edge(start, ends, reach, points)
-        if pair is not None:
-            found.append(Opening(0, np.stack([points[start], points[pair]])))
+    for number, box in enumerate(ndimage.find_objects(under), start=1):
+        cells = np.argwhere(under[box] == number) + [part.start for part in box]
+        edges = to_points(_find_ends(cells))
+        width = float(np.linalg.norm(edges[1] - edges[0]))
+        if WIDTH[0] <= width <= WIDTH[1] and _has_two_sides(under == number, box, free & ~walls):
+            found.append(Opening(0, edges))
     return found
 
 
-def _find_far_edge(
-    start: int, ends: NDArray[np.intp], reach: NDArray[np.float64], points: NDArray[np.float64]
-) -> int | None:
-    """Return the column of the first edge that closes the gap behind `start`, going round the circle."""
-    count = len(reach)
-    for steps in sorted(((ends - start) % count).tolist()):
-        if not 1 <= steps < count // 2:
-            continue
-        edge = (start + steps + 1) % count
-        width = float(np.linalg.norm(points[edge] - points[start]))
-        if width > WIDTH[1]:
-            return None
-        inside = (start + 1 + np.arange(steps)) % count
-        if width >= WIDTH[0]:
-            line = np.maximum(reach[start], reach[edge])
-            return edge if np.median(reach[inside]) > line + STEP / 2 else None
-    return None
+def _find_ends(cells: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the ends of a row of cells, along its longest direction: float64 [2, 2]."""
+    middle = cells.mean(axis=0)
+    _, vectors = np.linalg.eigh(np.cov((cells - middle).T) if len(cells) > 1 else np.eye(2))
+    along = (cells - middle) @ vectors[:, 1]
+    return np.stack([middle + along.min() * vectors[:, 1], middle + along.max() * vectors[:, 1]])
 
 
-def merge_openings(known: Sequence[Opening], found: Sequence[Opening]) -> tuple[Opening, ...]:
-    """Return the openings known, with those found: what is close to a known one is that one, seen again."""
-    merged = list(known)
-    again: set[int] = set()
-    for opening in found:
-        away = [float(np.linalg.norm(other.position - opening.position)) for other in merged]
-        nearest = int(np.argmin(away)) if away else -1
-        if nearest < 0 or away[nearest] > SAME:
-            merged.append(replace(opening, id=len(merged) + 1))
-        elif merged[nearest].id not in again:
-            old = merged[nearest]
-            edges = _align(opening.edges, old.edges)
-            mean = (old.edges * old.decisions + edges) / (old.decisions + 1)
-            merged[nearest] = Opening(old.id, mean, old.decisions + 1)
-            again.add(old.id)
-    return tuple(merged)
+def _has_two_sides(part: NDArray[np.bool_], box: tuple[slice, ...], open_floor: NDArray[np.bool_]) -> bool:
+    window = tuple(slice(max(0, side.start - 5), side.stop + 5) for side in box)
+    near = cv2.dilate(part[window].view(np.uint8), np.ones((9, 9), np.uint8)).view(bool)
+    sides, count = ndimage.label(near & open_floor[window])
+    return int((np.bincount(sides.ravel(), minlength=count + 1)[1:] >= LEAST_SIDE).sum()) >= 2
 
 
-def _align(edges: NDArray[np.float64], like: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the edges in the order of another opening's, which may have been seen from the other side."""
-    straight = np.linalg.norm(edges - like, axis=1).sum()
-    crossed = np.linalg.norm(edges[::-1] - like, axis=1).sum()
-    return edges if straight <= crossed else edges[::-1]
+def name_openings(found: Sequence[Opening], names: dict[int, NDArray[np.float64]]) -> tuple[Opening, ...]:
+    """Return the openings under their ids, those of the nearest that had a name before, or new ones.
+
+    `names` has the position of each id, and is brought up to date.
+    """
+    named: dict[int, Opening] = {}
+    for opening in sorted(found, key=lambda each: tuple(each.position)):
+        away = {name: float(np.linalg.norm(place - opening.position)) for name, place in names.items()}
+        free = sorted((distance, name) for name, distance in away.items() if name not in named)
+        number = free[0][1] if free and free[0][0] <= SAME else len(names) + 1
+        named[number] = replace(opening, id=number)
+        names[number] = opening.position
+    return tuple(named[number] for number in sorted(named))
