@@ -17,8 +17,9 @@ from wiw.mapping.views import CAMERA_HEIGHT, check_panorama
 CELL = 0.1
 """Metres."""
 AGENT_RADIUS = 0.1
-OBSTACLE = (0.1, 1.2)
-"""Heights above the floor, in metres, between which a surface is in the agent's way."""
+OBSTACLE = (0.1, 1.75)
+"""Heights above the floor, in metres, between which a surface is in the agent's way. Its body is 1.5 m high; navigation
+meshes lie, and are rounded, up to 0.2 m higher, so that a lamp that hangs down to 1.7 m stops it."""
 FLOOR = 0.08
 """Metres that floor may seem to lie above or below zero."""
 DROP = 0.2
@@ -147,6 +148,15 @@ class OccupancyGrid:
     def _place(self, odometry: NDArray[np.float64], flat: NDArray[np.float32], azimuth: NDArray[np.float64]) -> Cells:
         x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
         return np.floor(x / CELL).astype(np.intp) - self.origin[0], np.floor(y / CELL).astype(np.intp) - self.origin[1]
+
+    def mark_blocked(self, pose: NDArray[np.float64], step: float) -> None:
+        """Mark the place that a refused step would have led to as occupied, unless the agent itself stands in it."""
+        ahead = np.asarray(pose[:2]) + step * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        self._grow(np.asarray(pose[:2]), step)
+        cell, here = (tuple(int(c[0]) for c in self.to_cells(point[None])) for point in (ahead, np.asarray(pose)[:2]))
+        if cell != here:
+            self.occupied[cell] = True
+            _forget(self)
 
     # -- what is known -------------------------------------------------------------------------------------------------
 
