@@ -26,7 +26,7 @@ CONFUSABLE_OVERLAP = 0.5
 SAMPLE = 128
 """Voxels at most that an overlap is measured with."""
 INSIDE = 0.8
-"""Share of an object's voxels in the box of a larger one of its category that makes both one, such as a chair's legs."""
+"""Share of a small part in the box of a larger one of its category that makes both one, such as a chair's legs."""
 SCRAP = 0.1
 """Voxels that such a part has at most, relative to the larger one's."""
 TREE_POINTS = 1000

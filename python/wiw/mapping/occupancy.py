@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache, cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -145,7 +146,7 @@ class OccupancyGrid:
         self.free, self.occupied, self.walls = (np.pad(array, pad) for array in (self.free, self.occupied, self.walls))
         self.origin = (self.origin[0] - pad[0][0], self.origin[1] - pad[1][0])
 
-    def _place(self, odometry: NDArray[np.float64], flat: NDArray[np.float32], azimuth: NDArray[np.float64]) -> Cells:
+    def _place(self, odometry: NDArray[np.float64], flat: NDArray[Any], azimuth: NDArray[np.float64]) -> Cells:
         x, y = odometry[0] + flat * np.cos(azimuth), odometry[1] + flat * np.sin(azimuth)
         return np.floor(x / CELL).astype(np.intp) - self.origin[0], np.floor(y / CELL).astype(np.intp) - self.origin[1]
 

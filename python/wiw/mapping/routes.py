@@ -34,7 +34,7 @@ START_RADIUS = 0.35
 """Metres around the agent in which any cell that is not occupied is taken for free: it stands there."""
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
 """Steps between cells whose lengths make up distances: sixteen directions, counted both ways."""
-WEIGHT = 1.3
+WEIGHT = 1.15
 """Factor of the guide: what is still to go counts a little more, so that far fewer poses are looked at."""
 POSES = 20_000
 """Poses looked at before a search is given up."""
@@ -71,12 +71,14 @@ def route(
     radius: float = RADIUS,
     first: int | None = None,
 ) -> Route:
-    """Return the route to a point float [2] or [3], or the turns to a heading in radians.
+    """Return the route to a target.
 
     Where the target cannot be reached over known floor, the route ends where it is nearest, and `reached` is False.
 
     Args:
+        grid: what is known of the floor.
         pose: x, y, azimuth of the agent.
+        target: a point float [2] or [3], or a heading in radians, to turn to.
         radius: the route ends within so many metres of the point, where it is in sight if there is such a place.
         first: return at most so many primitives.
 
