@@ -38,12 +38,16 @@ def measure_gap(one: MapObject, other: MapObject) -> float:
 
 def rests_on(thing: MapObject, support: MapObject) -> bool:
     """Return whether an object stands on another, or in it, as a vase in a bookshelf does."""
-    if thing.id == support.id or thing.bounds[0, 2] < 0.05:
+    if thing.id == support.id or thing.bounds[0, 2] < 0.0:
         return False
     low, high = support.bounds
     bottom = float(thing.bounds[0, 2])
     if not low[2] - 0.05 <= bottom <= high[2] + 0.1 or thing.extent[:2].max() > support.extent[:2].max() + 0.1:
         return False
+    if bottom >= high[2] - 0.1:  # its top may not have been seen
+        inside = ((thing.points[:, :2] >= low[:2] - 0.05) & (thing.points[:, :2] <= high[:2] + 0.05)).all(axis=1)
+        if inside.mean() >= 0.8:
+            return True
     points = support.points
     near = (points[:, 2] <= bottom + 0.08) & (points[:, 2] >= bottom - UNDER)
     if not near.any():

@@ -9,7 +9,7 @@ to be free.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -123,25 +123,27 @@ def _route_to_point(grid: OccupancyGrid, pose: NDArray[np.float64], point: NDArr
     cells = np.argwhere(parts == parts[start])
     places = grid.to_points(cells)
     away = np.linalg.norm(places - point, axis=1)
-    within = away <= radius - CELL / 4
+    within = away <= radius
     if np.linalg.norm(pose[:2] - point) <= radius:
         return _simulate(pose, [], True)
-    reached = bool(within.any())
-    chosen = np.flatnonzero(within) if reached else np.flatnonzero(away <= away.min() + CELL / 2)
+    chosen = np.flatnonzero(within if within.any() else away <= away.min() + CELL / 2)
     visible = _is_in_sight(grid, places[chosen], point)
     goals = np.zeros_like(open_)
     goals[tuple(cells[chosen[visible] if visible.any() else chosen].T)] = True
-    return _search(grid, open_, pose, goals, _distance_field(open_, goals), reached)
+    within_reach = point, radius if within.any() else np.inf
+    actions = _search(grid, pose, goals, _distance_field(open_, goals), *within_reach)
+    found = _simulate(pose, actions, True)
+    return found if np.linalg.norm(found.poses[-1, :2] - point) <= radius else replace(found, reached=False)
 
 
 def _search(
     grid: OccupancyGrid,
-    open_: NDArray[np.bool_],
     pose: NDArray[np.float64],
     goals: NDArray[np.bool_],
     field: NDArray[np.float64],
-    reached: bool,
-) -> Route:
+    point: NDArray[np.float64],
+    radius: float,
+) -> list[int]:
     """Find the cheapest primitives to a goal's cell among poses that primitives lead to; one pose per cell and heading.
 
     Positions are kept as they are, not rounded to their cells, so that the walk is the one the agent takes.
@@ -169,8 +171,8 @@ def _search(
         if node in closed:
             continue
         closed.add(node)
-        if goal[node[0]]:
-            return _simulate(pose, _trace(came, node), reached)
+        if goal[node[0]] and np.hypot(x - point[0], y - point[1]) <= radius:
+            return _trace(came, node)
         if ahead[node[0]] < nearest[1]:
             nearest = node, ahead[node[0]]
         dx, dy = moves[heading]
@@ -188,7 +190,7 @@ def _search(
                 best[after], came[after] = total, (node, int(action))
                 count += 1
                 heapq.heappush(queue, (total + _guide(ahead, after[0]), count, total, to_x, to_y, turned))
-    return _simulate(pose, _trace(came, nearest[0]), False)
+    return _trace(came, nearest[0])
 
 
 def _guide(ahead: list[float], cell: int) -> float:
