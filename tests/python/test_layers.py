@@ -42,7 +42,7 @@ FACES = {
 PYTHON_ROWS = [
     {"_core"},
     FACES,
-    {"datasets", "metrics", "perception", "tabletop", "vlm", "wire"},
+    {"datasets", "mapping", "metrics", "perception", "tabletop", "vlm", "wire"},
     {"envs", "judging", "policies", "world_models"},
     {"tasks", "loop", "training"},
     {"experiments"},

@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The map of floor space and the routes over it, against navigation mesh and simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from mapping_tours import Mapped, Tour, add_all, mapped
+from numpy.typing import NDArray
+
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
+from wiw.errors import ArgumentError
+from wiw.mapping.occupancy import CELL, OccupancyGrid
+from wiw.mapping.openings import name_openings
+from wiw.mapping.routes import RADIUS, STEP, follow_heading, measure_distances, route
+
+SCENES = ["apartments:val/3", "apartments:val/12"]
+
+
+def make_grid(picture: str) -> OccupancyGrid:
+    """A map of a drawing: "." free, "#" occupied, "?" unknown; the first row and column begin at the start."""
+    rows = np.array([list(line.strip()) for line in picture.strip().splitlines()])
+    return OccupancyGrid(origin=(0, 0), free=rows == ".", occupied=rows == "#", walls=np.zeros(rows.shape, bool))
+
+
+def navigable(known: Mapped) -> NDArray[np.bool_]:
+    """Which cells' middles are on the largest island of the navigation mesh."""
+    mesh, shape = known.tour.world.navmesh, known.grid.free.shape
+    points = known.tour.to_world(known.grid.to_points(np.argwhere(np.ones(shape, bool)))).astype(np.float32)
+    return (np.asarray(mesh.is_navigable(points)) & (np.asarray(mesh.island_of(points)) == 0)).reshape(shape)
+
+
+# -- the grid ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_where_the_agent_fits_is_where_the_mesh_says(scene: str) -> None:
+    known = mapped(scene)
+    truth, fits = navigable(known), known.grid.standable
+    assert (truth & fits).sum() / fits.sum() > 0.985
+    assert (truth & fits).sum() / truth.sum() > 0.75
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_each_room_is_one(scene: str) -> None:
+    known = mapped(scene)
+    rooms = {}
+    for room in known.tour.world.scene.rooms:
+        low, high = np.asarray(room["bounds"], float)
+        cells = np.argwhere(known.grid.known)
+        places = known.tour.to_world(known.grid.to_points(cells))
+        inside = ((places > low + 0.2) & (places < high - 0.2))[:, [0, 2]].all(axis=1)
+        numbers = known.grid.rooms[tuple(cells[inside].T)]
+        most = np.bincount(numbers).argmax()
+        assert most > 0 and (numbers == most).mean() > 0.85
+        rooms[room["name"]] = int(most)
+    assert len(set(rooms.values())) == len(rooms)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_openings_are_the_doorways(scene: str) -> None:
+    known = mapped(scene)
+    doors = [thing for thing in known.tour.things() if thing.category in ("door frame", "passage")]
+    entrance = next(thing for thing in known.tour.things() if thing.name == "entrance door")
+    inner = [door for door in doors if np.linalg.norm((door.center - entrance.center)[:2]) > 0.5]
+    away = np.array([[np.linalg.norm(o.position - d.center[:2]) for o in known.grid.openings] for d in inner])
+    assert (away.min(axis=1) < 0.5).mean() >= 0.85
+    assert (away.min(axis=0) < 0.5).mean() >= 0.85
+    assert all(0.35 <= opening.width <= 3.0 for opening in known.grid.openings)
+
+
+def test_openings_keep_their_ids() -> None:
+    tour, ids = mapped(SCENES[0]).tour, {}
+    grid = OccupancyGrid()
+    for observation in tour.observations:
+        grid.add(observation["depth"], observation["odometry"])
+        for opening in grid.openings:
+            before = ids.setdefault(opening.id, opening.position)
+            assert np.linalg.norm(before - opening.position) < 1.2
+            ids[opening.id] = opening.position
+    assert len(ids) <= 12
+
+
+def test_naming_openings_takes_the_nearest() -> None:
+    opening = mapped(SCENES[0]).grid.openings[0]
+    names = {4: opening.position + np.array([0.1, 0]), 7: opening.position + np.array([0.5, 0])}
+    (named,) = name_openings([opening], names)
+    assert named.id == 4
+
+
+def test_frontiers_are_there_at_first_and_shrink() -> None:
+    tour = mapped(SCENES[0]).tour
+    sizes = [sum(frontier.cells for frontier in add_all(tour, count).grid.frontiers) for count in (1, 30)]
+    assert sizes[0] > 2 * sizes[1] and sizes[0] > 20
+
+
+def test_frontiers_are_free_cells_beside_the_unknown() -> None:
+    grid = make_grid("\n".join(["." * 12 + "?" * 12] * 12))
+    (frontier,) = grid.frontiers
+    assert frontier.cells == 12
+    np.testing.assert_allclose(frontier.position, [0.55, 1.15], atol=0.06)
+    speck = make_grid("\n".join(["......", "......", "..??..", "......", "......"]))
+    assert speck.frontiers == ()
+
+
+def test_a_look_into_the_unknown_adds_more_than_one_at_what_is_known() -> None:
+    tour = mapped(SCENES[0]).tour
+    early, late = add_all(tour, 1).grid, mapped(SCENES[0]).grid
+    gains = [early.measure_gain(frontier.position) for frontier in early.frontiers]
+    assert max(gains) > early.measure_gain(tour.observations[0]["odometry"][:2])
+    assert late.measure_gain(tour.observations[0]["odometry"][:2]) < 1.0
+
+
+def test_gain_counts_what_is_visible_only() -> None:
+    grid = make_grid("\n".join(["?" * 40] * 19 + ["?" * 10 + "#" * 20 + "?" * 10] + ["." * 40] * 20))
+    middle = np.array([2.5, 2.0])
+    assert grid.measure_gain(middle, np.pi, 40.0, 2.0) == 0.0  # behind the wall
+    assert grid.measure_gain(middle, 0.0, 90.0, 1.2) == 0.0  # known already
+    wide = grid.measure_gain(middle, 0.0, 90.0, 3.0)
+    assert 4.0 < wide < np.pi * 9 / 4
+
+
+def test_the_map_grows_with_the_walk() -> None:
+    grid, depth = OccupancyGrid(), np.zeros((64, 128), np.float32)
+    depth[32:] = 1.0 / np.sin((np.arange(32) + 0.5) / 64 * np.pi)[:, None]  # an endless floor
+    for x in (0.0, 30.0, -25.0):
+        grid.add(depth, np.array([x, 0.0, 0.3]))
+        assert grid.lookup(grid.free, np.array([[x, 0.0], [x + 1, 0.5]])).all()
+    assert grid.lookup(grid.free, np.array([[0.0, 0.0], [12.0, 0.0]])).tolist() == [True, False]
+
+
+def test_a_refused_step_is_remembered() -> None:
+    grid = make_grid("\n".join(["." * 30] * 30))
+    grid.mark_blocked(np.array([1.5, 1.5, 0.0]), STEP)
+    assert grid.occupied[17, 15] and not grid.standable[16, 15]
+    assert not grid.occupied[15, 15]
+
+
+# -- routes ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_routes_are_short_and_can_be_walked(scene: str) -> None:
+    known = mapped(scene)
+    tour, mesh = known.tour, known.tour.world.navmesh
+    poses = [observation["odometry"] for observation in tour.observations]
+    ratios, refused, steps = [], 0, 0
+    for index, pose in enumerate(poses):
+        goal = poses[(index * 7 + 11) % len(poses)][:2]
+        found = route(known.grid, pose, goal)
+        assert found.reached and np.linalg.norm(found.poses[-1, :2] - goal) <= RADIUS
+        tour.core.reset(tour.to_world(pose[:2]), tour.yaw + pose[2])
+        went = [tour.core.step(int(action)) for action in found.actions]
+        refused += went.count(False)
+        steps += len(went)
+        if all(went):
+            np.testing.assert_allclose(tour.odometry()[:2], found.poses[-1, :2], atol=1e-3)
+        shortest = float(mesh.geodesic_distance(tour.to_world(pose[:2]), tour.to_world(goal)))
+        if shortest > 1.5:
+            ratios.append(found.length / shortest)
+    assert refused / steps < 0.01
+    assert np.mean(ratios) < 1.05 and np.max(ratios) < 1.2
+
+
+def test_a_route_goes_round_what_is_in_the_way() -> None:
+    grid = make_grid("\n".join(["." * 40] * 18 + ["." * 8 + "#" * 32] * 2 + ["." * 40] * 20))
+    start, goal = np.array([1.0, 3.0, 0.0]), np.array([3.0, 3.0])
+    found = route(grid, start, goal)
+    assert found.reached and 4.5 < found.length < 6.0
+    cells = grid.to_cells(found.poses)
+    assert grid.standable[cells].all()
+    np.testing.assert_allclose(found.poses[1:, :2], start[:2] + to_trajectory(found.actions)[:, :2], atol=1e-9)
+    assert measure_distances(grid, start)[30, 30] == pytest.approx(found.length, abs=0.6)
+
+
+def test_a_target_beyond_the_known_is_approached() -> None:
+    grid = make_grid("\n".join(["." * 20 + "#" + "?" * 9] * 20))
+    found = route(grid, np.array([1.0, 0.5, 0.0]), np.array([1.0, 2.8]))
+    assert not found.reached and np.linalg.norm(found.poses[-1, :2] - [1.0, 1.85]) < 0.35
+
+
+def test_a_route_ends_where_its_target_is_in_sight() -> None:
+    """A wall hides the target from the side that is nearer."""
+    rows = ["." * 40] * 15 + ["." * 30 + "#" * 1 + "." * 9] * 10 + ["." * 40] * 15
+    grid = make_grid("\n".join(rows))
+    found = route(grid, np.array([2.0, 2.0, 0.0]), np.array([2.0, 3.6]), radius=1.0)
+    line = found.poses[-1, :2] + np.linspace(0, 1, 50)[:, None] * ([2.0, 3.6] - found.poses[-1, :2])
+    assert found.reached and not grid.lookup(grid.occupied, line).any()
+
+
+def test_first_and_radius() -> None:
+    grid = make_grid("\n".join(["." * 40] * 40))
+    whole = route(grid, np.array([1.0, 1.0, 0.0]), np.array([3.0, 1.0]))
+    part = route(grid, np.array([1.0, 1.0, 0.0]), np.array([3.0, 1.0]), first=4)
+    assert part.actions.tolist() == [FORWARD] * 4 and not part.reached and len(part.poses) == 5
+    assert whole.reached and whole.actions.tolist() == [FORWARD] * 9
+    assert len(route(grid, np.array([1.0, 1.0, 0.0]), np.array([3.0, 1.0]), radius=1.0).actions) == 6
+    there = route(grid, np.array([1.0, 1.0, 0.0]), np.array([1.1, 1.0]))
+    assert there.reached and len(there.actions) == 0
+
+
+@pytest.mark.parametrize(
+    ("azimuth", "expected"),
+    [(0.0, []), (np.pi / 2, [TURN_LEFT] * 4), (-0.8, [TURN_RIGHT] * 2), (2 * np.pi + 0.1, []), (-3.3, [TURN_LEFT] * 8)],
+)
+def test_a_heading_is_turned_to(azimuth: float, expected: list[int]) -> None:
+    found = route(make_grid("\n".join(["." * 9] * 9)), np.array([0.45, 0.45, 0.0]), azimuth)
+    assert found.actions.tolist() == expected and found.reached
+
+
+def test_following_a_heading_stops_before_a_wall() -> None:
+    grid = make_grid("\n".join(["." * 40] * 20 + ["#" * 40] + ["." * 40] * 19))
+    found = follow_heading(grid, np.array([1.0, 2.0, np.pi / 2]), 0.0, 3.0)
+    assert found.actions.tolist() == [TURN_RIGHT] * 4 + [FORWARD] * 4 and not found.reached
+    assert follow_heading(grid, np.array([1.0, 2.0, 0.0]), 0.0, 0.6).reached
+
+
+def test_a_target_of_another_kind_is_refused() -> None:
+    with pytest.raises(ArgumentError, match="finite point"):
+        route(OccupancyGrid(), np.zeros(3), np.zeros(4))
+    with pytest.raises(ArgumentError, match="finite point"):
+        route(OccupancyGrid(), np.zeros(3), np.array([np.nan, 0.0]))
+
+
+def test_cells_and_points_agree() -> None:
+    grid = OccupancyGrid()
+    points = np.random.default_rng(0).uniform(-5, 5, (100, 2))
+    middles = grid.to_points(np.stack(grid.to_cells(points), axis=1))
+    assert np.abs(middles - points).max() <= CELL / 2 + 1e-9
+
+
+def test_a_tour_of_few_places_is_of_the_same_start() -> None:
+    few = Tour(SCENES[0], 3)
+    np.testing.assert_allclose(few.observations[0]["odometry"], 0.0, atol=1e-9)
