@@ -11,10 +11,22 @@ from wiw.datasets.questions.grammar import ACTIVITIES, HABITS, TEMPLATES, USES
 
 Slots = Mapping[str, str]
 
-MATERIALS = {"wood planks": "wood", "wood parquet": "wood", "textile": "fabric", "plant": ""}
+MATERIALS = {"wood planks": "wood", "wood parquet": "wood", "textile": "fabric", "enamel": "metal", "plant": ""}
 """Words for materials that a table tells apart and nobody else does; "" is no answer."""
 ON_STATES, OPEN_STATES = ("on", "off"), ("open", "closed")
-COUNTED = ("chair", "picture", "plant", "window", "bottle", "cup", "bookshelf", "nightstand", "mirror", "armchair", "stool")
+COUNTED = (
+    "chair",
+    "picture",
+    "plant",
+    "window",
+    "bottle",
+    "cup",
+    "bookshelf",
+    "nightstand",
+    "mirror",
+    "armchair",
+    "stool",
+)
 """Categories that `count_in` counts."""
 LOOKED_FOR = (
     "armchair",
@@ -85,6 +97,13 @@ class Fact:
     def key(self) -> str:
         """What two answers must differ in to be different answers."""
         return self.gist or self.answer
+
+
+def differ(first: Fact, second: Fact, answer_type: str) -> bool:
+    """Return whether two answers to one question are so different that none is a good guess at the other."""
+    if answer_type == "color" and frozenset((first.answer, second.answer)) in CONFUSABLE:
+        return False
+    return first.key != second.key
 
 
 def find_answer(table: SceneTable, template: str, slots: Slots) -> Fact | None:
@@ -399,7 +418,11 @@ def _use(table: SceneTable, slots: Slots) -> Fact | None:
 
 def _count_rooms(table: SceneTable, slots: Slots) -> Fact | None:
     rooms = [room for room in table.rooms if room.kind == slots["rooms"]]
-    if slots["rooms"] not in ROOM_SIGNS or not rooms or (slots["rooms"] == "bedroom" and table.room_kinds.get("kids room")):
+    if (
+        slots["rooms"] not in ROOM_SIGNS
+        or not rooms
+        or (slots["rooms"] == "bedroom" and table.room_kinds.get("kids room"))
+    ):
         return None  # a kids room is a bedroom to some and not to others
     signs = [next(iter(table.find_all(ROOM_SIGNS[slots["rooms"]], room)), None) for room in rooms]
     if any(sign is None for sign in signs):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations
 from typing import Literal
@@ -140,7 +140,9 @@ class Surroundings:
         outside = ~np.any([view.any(axis=1) for view in views], axis=0)
         fit = np.flatnonzero(outside & (lengths >= self.rules.shortest) & (lengths <= self.rules.longest))
         text = phrase(template, slots)
-        draws = core.uniform(core.fold_key([place_key(self.seed, self.place.name.partition("?")[0]), *text.encode()]), 2)
+        draws = core.uniform(
+            core.fold_key([place_key(self.seed, self.place.name.partition("?")[0]), *text.encode()]), 2
+        )
         if not len(fit) or (start is not None and start not in fit):
             return None
         start = int(fit[int(draws[0] * len(fit))]) if start is None else start
@@ -251,7 +253,9 @@ def generate(
             raise ArgumentError(
                 f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; ask for fewer in a scene"
             )
-        chosen = min(free, key=lambda each: (tally[each.category], tally[each.template], CATEGORIES.index(each.category)))
+        chosen = min(
+            free, key=lambda each: (tally[each.category], tally[each.template], CATEGORIES.index(each.category))
+        )
         made.append(chosen)
         texts.add(chosen.text)
         tally.update([chosen.category, chosen.template])
@@ -300,17 +304,3 @@ def _walk(distances: NDArray[np.float64], start: int, stops: list[NDArray[np.int
 
 def _triple(point: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(point[0]), float(point[1]), float(point[2])
-
-
-def number_episodes(episodes: Iterable[Episode], first: int = 0) -> list[Episode]:
-    """Return episodes numbered on from `first`, their twins' ids with them."""
-    listed = list(episodes)
-    names = {episode.episode_id: f"{first + i:04d}" for i, episode in enumerate(listed)}
-    numbered = []
-    for episode in listed:
-        question = dict(episode.info["question"])
-        question["twin"] = names.get(question["twin"], "")
-        numbered.append(
-            replace(episode, episode_id=names[episode.episode_id], info={**episode.info, "question": question})
-        )
-    return numbered

@@ -133,7 +133,12 @@ def _templates() -> dict[str, Template]:
         ("where", "object localization", "place", "Where is the {object}?"),
         ("which_room", "object localization", "place", "In which room is the {object}?"),
         ("count_in", "spatial understanding", "count", "How many {objects} are in the {room}?"),
-        ("count_around", "spatial understanding", "count", "How many {objects} are around the {anchor}[ in the {room}]?"),
+        (
+            "count_around",
+            "spatial understanding",
+            "count",
+            "How many {objects} are around the {anchor}[ in the {room}]?",
+        ),
         ("count_on", "spatial understanding", "count", "How many things are on the {anchor}[ in the {room}]?"),
         ("exists", "spatial understanding", "yes_no", "Is there a {object} in the {room}?"),
         (
@@ -178,7 +183,9 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
     if not kind.required <= set(slots) <= set(kind.slots):
         raise ArgumentError(f"template '{template}' has the slots {', '.join(kind.slots)}, got {dict(slots)}")
     for name, word in slots.items():
-        if re.fullmatch(_SLOTS.get(name, _THING), word) is None or (name in _PLURALS and singular(plural(word)) != word):
+        if re.fullmatch(_SLOTS.get(name, _THING), word) is None or (
+            name in _PLURALS and singular(plural(word)) != word
+        ):
             raise ArgumentError(f"slot {name} of '{template}': '{word}' cannot be told from the words around it")
     words = {name: plural(word) if name in _PLURALS else word for name, word in slots.items()}
     text = re.sub(r"\[(.*?{(\w+)}.*?)\]", lambda part: part[1] if part[2] in words else "", kind.pattern)
@@ -226,7 +233,14 @@ def plural(word: str) -> str:
 
 def singular(word: str) -> str:
     """Return the name whose plural a word is; the word itself where it is none."""
-    for end, instead in (("shelves", "shelf"), ("ies", "y"), ("ches", "ch"), ("shes", "sh"), ("xes", "x"), ("sses", "ss")):
+    for end, instead in (
+        ("shelves", "shelf"),
+        ("ies", "y"),
+        ("ches", "ch"),
+        ("shes", "sh"),
+        ("xes", "x"),
+        ("sses", "ss"),
+    ):
         if word.endswith(end):
             return word.removesuffix(end) + instead
     return word.removesuffix("s")

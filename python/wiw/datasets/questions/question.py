@@ -51,7 +51,9 @@ class Question:
 
     def __post_init__(self) -> None:
         if not self.text.strip() or not self.answer.strip():
-            raise ArgumentError(f"expected a question and an answer with words in them, got {self.text!r}: {self.answer!r}")
+            raise ArgumentError(
+                f"expected a question and an answer with words in them, got {self.text!r}: {self.answer!r}"
+            )
         if self.category not in CATEGORIES:
             raise ArgumentError(f"category: expected one of {', '.join(CATEGORIES)}, got {self.category!r}")
         if self.answer_type not in ANSWER_TYPES:
