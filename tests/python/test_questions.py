@@ -40,6 +40,7 @@ WORDS = {
     "activity": st.sampled_from(list(grammar.ACTIVITIES)),
     "use": st.sampled_from(list(grammar.USES)),
     "habit": st.sampled_from(list(grammar.HABITS)),
+    "capacity": st.sampled_from(list(grammar.CAPACITIES)),
     "room": st.sampled_from(["kitchen", "living room", "kids room", "hallway"]),
 }
 
@@ -93,7 +94,13 @@ def test_words_that_cannot_be_found_again_are_refused(template: str, slots: dict
 def test_every_template_has_an_answer_function_and_all_categories_are_asked() -> None:
     table = SceneTable("empty", (), ())
     slots = {name: "x" for template in grammar.TEMPLATES.values() for name in template.slots}
-    slots |= {"use": "sit on", "activity": "take a bath", "habit": "make music", "state": "on"}
+    slots |= {
+        "use": "sit on",
+        "activity": "take a bath",
+        "habit": "make music",
+        "capacity": "work at a desk",
+        "state": "on",
+    }
     for template in grammar.TEMPLATES.values():
         given_slots = {name: slots[name] for name in template.slots if name in template.required}
         assert find_answer(table, template.name, given_slots) is None
@@ -190,7 +197,7 @@ def test_turning_an_anchor_round_exchanges_its_sides() -> None:
 
 
 def test_a_word_for_two_things_means_none() -> None:
-    second = replace(LAMP, id=8, low=LAMP.low + [0, 0, 1.5], high=LAMP.high + [0, 0, 1.5])
+    second = replace(LAMP, id=8, low=np.add(LAMP.low, [0, 0, 1.5]), high=np.add(LAMP.high, [0, 0, 1.5]))
     two_lamps = replace(TABLE, things=(*TABLE.things, second))
     assert answer("switch", two_lamps, object="table lamp") is None
     assert answer("where_colored", two_lamps, color="red", object="table lamp") is None
@@ -205,7 +212,7 @@ def test_a_word_for_two_things_means_none() -> None:
 def test_the_bedroom_of_two_is_rejected() -> None:
     assert answer("color", room="bedroom", object="bed") == "blue"
     two = replace(TABLE, rooms=(BEDROOM, replace(BEDROOM, name="bedroom 2")))
-    for template, slots in propose(two):
+    for _, slots in propose(two):
         assert slots.get("room") != "bedroom"
     assert answer("color", two, room="bedroom", object="bed") is None
     assert answer("floor_color", two, room="bedroom") is None

@@ -6,8 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from wiw.datasets.questions.facts import FLAT, FRONTED, HUNG, SMALL, STRUCTURE, Room, SceneTable, Thing
-from wiw.datasets.questions.grammar import ACTIVITIES, HABITS, TEMPLATES, USES
+from wiw.datasets.questions.facts import FRONTED, HUNG, STRUCTURE, Room, SceneTable, Thing
+from wiw.datasets.questions.grammar import ACTIVITIES, CAPACITIES, HABITS, TEMPLATES, USES
 
 Slots = Mapping[str, str]
 
@@ -57,13 +57,19 @@ PATTERNED = frozenset({"books", "mirror", "picture", "window"})
 """Categories that have no one colour or material to see."""
 ROOM_SIGNS = {"bedroom": "bed", "bathroom": "toilet"}
 """Rooms that are counted, and what shows that a room is one."""
-CONFUSABLE = frozenset(
-    frozenset(pair.split("/"))
-    for pair in (
-        "white/grey white/beige grey/black beige/grey beige/yellow beige/brown beige/pink brown/orange brown/red brown/black "
-        "pink/red pink/purple red/orange orange/yellow yellow/green green/turquoise turquoise/blue blue/purple"
-    ).split()
-)
+MOST_STOPS = 4
+"""Places that a walk which counts things all over a home may lead to."""
+_NEIGHBOURS = {
+    "white": ("grey", "beige"),
+    "black": ("grey", "brown"),
+    "beige": ("grey", "yellow", "brown", "pink"),
+    "brown": ("orange", "red"),
+    "red": ("pink", "orange"),
+    "yellow": ("orange", "green"),
+    "turquoise": ("green", "blue"),
+    "purple": ("blue", "pink"),
+}
+CONFUSABLE = frozenset(frozenset((name, other)) for name, others in _NEIGHBOURS.items() for other in others)
 """Colours that may be taken for each other."""
 
 
@@ -87,7 +93,7 @@ class Fact:
     target: tuple[int, ...]
     extra_answers: tuple[str, ...] = ()
     colored: int = 0
-    """Id of the instance whose colour the question speaks of, and whose rendered colour must be of that name; 0 without."""
+    """Id of the instance whose colour the question speaks of, and which must be rendered in it; 0 without."""
     color: str = ""
     """Name of that colour."""
     gist: str = ""
@@ -104,6 +110,19 @@ def differ(first: Fact, second: Fact, answer_type: str) -> bool:
     if answer_type == "color" and frozenset((first.answer, second.answer)) in CONFUSABLE:
         return False
     return first.key != second.key
+
+
+def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
+    """Return about how much a guess is worth, from 0 to 1 for the right answer."""
+    if guess == fact.answer:
+        return 1.0
+    if answer_type == "place":
+        return 0.5 * (guess.rpartition("in the ")[2] == fact.key.rpartition("in the ")[2])
+    if answer_type == "color":
+        return 0.5 * (frozenset((guess, fact.answer)) in CONFUSABLE)
+    if answer_type == "count" and guess.isdecimal():
+        return 0.25 * (abs(int(guess) - int(fact.answer)) == 1)
+    return 0.0
 
 
 def find_answer(table: SceneTable, template: str, slots: Slots) -> Fact | None:
@@ -132,6 +151,8 @@ def propose(table: SceneTable) -> Iterator[tuple[str, dict[str, str]]]:
         yield "habit", {"habit": habit}
     for rooms in ROOM_SIGNS:
         yield "count_rooms", {"rooms": rooms}
+    for capacity in CAPACITIES:
+        yield "capacity", {"capacity": capacity}
     yield "sleepers", {}
 
 
@@ -433,11 +454,21 @@ def _count_rooms(table: SceneTable, slots: Slots) -> Fact | None:
 
 def _sleepers(table: SceneTable, slots: Slots) -> Fact | None:
     beds = table.find_all("bed")
-    if not beds or any(1.15 < _width(bed) < 1.4 for bed in beds):  # wide for one and narrow for two
+    if not 0 < len(beds) <= MOST_STOPS or any(
+        1.15 < _width(bed) < 1.4 for bed in beds
+    ):  # wide for one and narrow for two
         return None
     count = sum(2 if bed.category == "bunk bed" or _width(bed) >= 1.4 else 1 for bed in beds)
     ids = tuple(bed.id for bed in beds)
     return Fact(str(count), tuple(Sight((each,)) for each in ids), ids)
+
+
+def _capacity(table: SceneTable, slots: Slots) -> Fact | None:
+    found = table.find_all(CAPACITIES[slots["capacity"]])
+    if not 0 < len(found) <= MOST_STOPS:
+        return None
+    ids = tuple(thing.id for thing in found)
+    return Fact(str(len(found)), tuple(Sight((each,)) for each in ids), ids)
 
 
 def _width(bed: Thing) -> float:
@@ -472,6 +503,7 @@ _ANSWERS: Mapping[str, Callable[[SceneTable, Slots], Fact | None]] = {
     "use": _use,
     "count_rooms": _count_rooms,
     "sleepers": _sleepers,
+    "capacity": _capacity,
     "seats": lambda table, slots: _count_around(table, {**slots, "objects": "chair"}),
     "habit": _habit,
 }

@@ -19,9 +19,10 @@ import numpy as np
 
 from wiw import scenes as scene_specs
 from wiw._core import core
-from wiw.datasets.questions.answers import differ
+from wiw.datasets.questions.answers import differ, resemblance
+from wiw.datasets.questions.blind import blind_answer
 from wiw.datasets.questions.facts import make_table
-from wiw.datasets.questions.generate import Answerable, Backend, EpisodeRules, questions_of
+from wiw.datasets.questions.generate import DEFAULT_RULES, Answerable, Backend, EpisodeRules, questions_of
 from wiw.datasets.questions.question import CATEGORIES
 from wiw.datasets.questions.survey import place_key
 from wiw.datasets.questions.twins import Edit, PossibleEdits, find_twin, may_have_twin
@@ -46,7 +47,7 @@ def make_episodes(
     scenes: Sequence[str],
     count: int,
     seed: int,
-    rules: EpisodeRules = EpisodeRules(),
+    rules: EpisodeRules = DEFAULT_RULES,
     *,
     per_scene: int = 8,
     backend: Backend = "auto",
@@ -112,6 +113,12 @@ class _Tally:
         self.counts.update(_answer(each) for each in pair)
         self.targets.update((_home(each), each.fact.target[0]) for each in pair if each.fact.target)
 
+    def excess(self, pair: Pair, rules: EpisodeRules) -> float:
+        """Return what guessing from the text is worth for a pair, 0 where that would not make it worth too much."""
+        value = guess_value(pair)
+        total = sum(guess_value(each) for each in self.pairs)
+        return value if total + value > rules.guessing * (len(self.pairs) + 1) else 0.0
+
     def admits_yes_no(self, rules: EpisodeRules) -> bool:
         """Return whether one more yes-no question keeps them few."""
         asked = sum(pair[0].answer_type == "yes_no" for pair in self.pairs)
@@ -128,8 +135,8 @@ def pair_questions(
 ) -> list[Pair]:
     """Return the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
 
-    Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, so that
-    the most frequent answer is of little use.
+    Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, and once
+    the most frequent answers of train apartments are worth as much as `rules.guessing`, pairs with others.
     """
     pools = {scene: questions_of(scene, seed, rules, backend) for scene in block}
     candidates = _candidates(pools, core.fold_key([seed, *"/".join(block).encode()]))
@@ -145,6 +152,12 @@ def pair_questions(
             break
         tally.add(pair)
     return tally.pairs
+
+
+def guess_value(pair: Pair) -> float:
+    """Return about what train apartments' most frequent answer is worth for the two questions of a pair, 0 to 1."""
+    guess = blind_answer(pair[0].text)
+    return sum(resemblance(guess, each.fact, each.answer_type) for each in pair) / 2
 
 
 def _candidates(pools: Mapping[str, Sequence[Answerable]], key: int) -> list[Pair]:
@@ -180,6 +193,7 @@ def _next_pair(
         category = pair[0].category
         return (
             tally.counts[category],
+            tally.excess(pair, rules),
             tally.counts[_family(pair[0])],
             repeated,
             sum(answers),

@@ -2,7 +2,7 @@
 """The best guess at an answer from the text alone: what is most often true in train apartments.
 
 It is the score that seeing is measured against, and the answer of an episode that ends without one. The table ships
-with the package; `make_table` makes it anew.
+with the package; `write_table` makes it anew.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from wiw.datasets.questions.generate import Answerable, EpisodeRules, questions_of
+from wiw.datasets.questions.generate import DEFAULT_RULES, Answerable, EpisodeRules, questions_of
 from wiw.datasets.questions.grammar import parse
 from wiw.errors import FileError
 from wiw.json_text import parse_json
@@ -60,7 +60,7 @@ def count_answers(questions: Iterable[Answerable]) -> dict[str, Counter[str]]:
 
 
 def choose_answers(counts: Mapping[str, Counter[str]]) -> dict[str, str]:
-    """Return the most frequent answer of every kind of which there were at least `LEAST`; the first by name of equals."""
+    """Return the most frequent answer of every kind of which there were at least `LEAST`; of equals the first."""
     return {
         key: min(answers, key=lambda answer: (-answers[answer], answer))
         for key, answers in sorted(counts.items())
@@ -68,8 +68,8 @@ def choose_answers(counts: Mapping[str, Counter[str]]) -> dict[str, str]:
     }
 
 
-def make_table(
-    path: str | Path = TABLE, scenes: Iterable[str] = SCENES, seed: int = 0, rules: EpisodeRules = EpisodeRules()
+def write_table(
+    path: str | Path = TABLE, scenes: Iterable[str] = SCENES, seed: int = 0, rules: EpisodeRules = DEFAULT_RULES
 ) -> dict[str, str]:
     """Write the table of the most frequent answers in some scenes, and return it. Takes seconds a scene."""
     named = list(scenes)
@@ -85,5 +85,5 @@ def _load_table() -> dict[str, str]:
     try:
         body: Any = parse_json(TABLE.read_bytes())
     except (OSError, ValueError) as error:
-        raise FileError(f"{TABLE}: {error}; install the package again, or call blind.make_table()") from error
+        raise FileError(f"{TABLE}: {error}; install the package again, or call blind.write_table()") from error
     return dict(body["answers"])

@@ -31,10 +31,8 @@ LEAST_PIXELS = 20
 def name_colors(pixels: NDArray[np.uint8]) -> NDArray[np.str_]:
     """Return the name of each pixel's colour, str [n] of uint8 [n, 3]."""
     linear = (np.asarray(pixels, np.float64) / 255) ** _GAMMA
-    l, m, s = np.cbrt(linear @ _TO_CONES.T).T
-    lightness = 0.2104542553 * l + 0.7936177850 * m - 0.0040720468 * s
-    a = 1.9779984951 * l - 2.4285922050 * m + 0.4505937099 * s
-    b = 0.0259040371 * l + 0.7827717662 * m - 0.8086757660 * s
+    cones = np.cbrt(linear @ _TO_CONES.T)
+    lightness, a, b = (cones @ _TO_OKLAB.T).T
     chroma, hue = np.hypot(a, b), np.degrees(np.arctan2(b, a)) % 360
     names = np.array([name for _, name in _HUES])[
         np.minimum(np.searchsorted([end for end, _ in _HUES], hue, side="right"), len(_HUES) - 1)
@@ -51,6 +49,15 @@ _TO_CONES = np.array(
         [0.4122214708, 0.5363325363, 0.0514459929],
         [0.2119034982, 0.6806995451, 0.1073969566],
         [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+
+
+_TO_OKLAB = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
     ]
 )
 

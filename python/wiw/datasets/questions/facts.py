@@ -6,7 +6,6 @@ Relations are measured on axis-aligned bounds in metres, Y up. The words follow 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +17,10 @@ from wiw.scenes import Scene
 STRUCTURE = frozenset({"floor", "ceiling", "wall", "passage", "door frame", "door", "window"})
 """Categories that are the building's and not in it."""
 SMALL = frozenset(
-    "table lamp,laptop,microwave,kettle,bowl,vase,plant pot,photo,box,candles,books,bottle,cup,television".split(",")
+    {
+        *("table lamp", "laptop", "microwave", "kettle", "bowl", "vase", "plant pot"),
+        *("photo", "box", "candles", "books", "bottle", "cup", "television"),
+    }
 )
 """Categories that stand on furniture."""
 HUNG = frozenset({"picture", "mirror", "clock", "wall shelf"})
@@ -26,8 +28,10 @@ HUNG = frozenset({"picture", "mirror", "clock", "wall shelf"})
 FLAT = frozenset({"rug", "curtain", "radiator", "ceiling lamp", "pendant lamp"})
 """Categories that nothing stands on or next to."""
 FRONTED = frozenset(
-    "sofa,bed,desk,wardrobe,dresser,bookshelf,sink,kitchen sink,toilet,stove,refrigerator,tv stand,sideboard,"
-    "washing machine,piano,console table".split(",")
+    {
+        *("sofa", "bed", "desk", "wardrobe", "dresser", "bookshelf", "sink", "kitchen sink", "toilet", "stove"),
+        *("refrigerator", "tv stand", "sideboard", "washing machine", "piano", "console table"),
+    }
 )
 """Categories with a front, so that they have a left and a right."""
 BROADER = {
@@ -56,7 +60,9 @@ class Room:
 
     def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether places [N, 3] lie within the walls."""
-        return ((points[:, [0, 2]] >= self.low[[0, 2]]) & (points[:, [0, 2]] <= self.high[[0, 2]])).all(axis=1)
+        across = points[:, [0, 2]]
+        inside = (across >= self.low[[0, 2]]) & (across <= self.high[[0, 2]])
+        return np.logical_and(inside[:, 0], inside[:, 1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,11 +243,6 @@ def _thing(instance: dict[str, object]) -> Thing:
     )
 
 
-def categories_of(things: Iterable[Thing]) -> list[str]:
-    """Return the categories of things, sorted, each once."""
-    return sorted({thing.category for thing in things})
-
-
 def _is_over(thing: Thing, other: Thing, margin: float = 0.03) -> bool:
     """Return whether the middle of a thing is above, below or within another's footprint."""
     middle, axes = thing.centre, [0, 2]
@@ -259,8 +260,3 @@ def _least(thing: Thing, axis: NDArray[np.float64]) -> float:
 
 def _greatest(thing: Thing, axis: NDArray[np.float64]) -> float:
     return float((_corners(thing) @ axis).max())
-
-
-def find_pairs(things: Sequence[Thing]) -> list[tuple[Thing, Thing]]:
-    """Return every pair of things, each once."""
-    return [(a, b) for i, a in enumerate(things) for b in things[i + 1 :]]

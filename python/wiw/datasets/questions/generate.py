@@ -54,8 +54,13 @@ class EpisodeRules:
     """Most places that an episode names as those from which it can be answered."""
     yes_no: float = 0.2
     """Greatest share of questions that are answered by yes or no; half of these by yes."""
+    guessing: float = 0.2
+    """What a guess from the text alone may be worth on average, 0 to 1, as far as there are questions to choose from."""
     twins: float = 0.25
     """Share of the questions that are also asked in a copy of the apartment where something else is true."""
+
+
+DEFAULT_RULES = EpisodeRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +171,7 @@ class Surroundings:
     def _viewpoints(
         self, fact: Fact, views: list[NDArray[np.bool_]], route: list[tuple[int, int]], start: int
     ) -> tuple[Viewpoint, ...]:
-        """Return the end of the shortest route, its other stops, then further places, the nearest to the start first."""
+        """Return the end of the shortest route and its other stops, or the places nearest to the start."""
         stops = [self._viewpoint(fact, views, sight, place) for sight, place in reversed(route)]
         if len(views) > 1:
             return tuple(stops)
@@ -228,7 +233,7 @@ def generate(
     world: World,
     count: int,
     seed: int,
-    rules: EpisodeRules = EpisodeRules(),
+    rules: EpisodeRules = DEFAULT_RULES,
     *,
     first: int = 0,
     before: Iterable[str] = (),

@@ -48,6 +48,18 @@ ACTIVITIES: Mapping[str, tuple[str, ...]] = {
     "listen to music from a speaker": ("speaker",),
     "find a book to read": ("bookshelf", "books"),
     "find toys": ("toy box",),
+    "sit in an armchair": ("armchair",),
+    "rest my feet on a pouf": ("pouf",),
+    "arrange flowers in a vase": ("vase",),
+    "look at a framed photo": ("photo",),
+    "light a candle": ("candles",),
+    "keep small things in a box": ("box",),
+    "read under a floor lamp": ("floor lamp",),
+    "sit on a bench": ("bench",),
+    "sit on a stool": ("stool",),
+    "water a plant": ("plant",),
+    "keep clothes in a dresser": ("dresser",),
+    "keep dishes in a sideboard": ("sideboard",),
 }
 """What one can do in a home, and categories that allow it."""
 
@@ -56,6 +68,8 @@ USES: Mapping[str, tuple[str, ...]] = {
     "use to store clothes": ("wardrobe", "dresser"),
     "use to store books": ("bookshelf", "wall shelf"),
     "use to wash myself": ("bathtub", "shower"),
+    "use as a reading light": ("floor lamp", "table lamp"),
+    "use to entertain myself": ("television", "piano", "laptop"),
     "put a cup down on": ("coffee table", "side table", "dining table", "desk", "nightstand", "console table"),
 }
 """What one can use something in a room for, and categories that serve."""
@@ -68,8 +82,22 @@ HABITS: Mapping[str, tuple[str, ...]] = {
     "make music": ("piano",),
     "keep most of their books": ("bookshelf",),
     "leave their shoes": ("shoe rack",),
+    "use a laptop": ("laptop",),
+    "relax in an armchair": ("armchair",),
+    "listen to music from a speaker": ("speaker",),
+    "collect their dirty laundry": ("laundry basket",),
+    "look at the clock": ("clock",),
 }
 """What people do at home, and the furniture that gives it away."""
+
+CAPACITIES: Mapping[str, str] = {
+    "wash their hands at a sink": "sink",
+    "work at a desk": "desk",
+    "relax in an armchair": "armchair",
+    "read by a floor lamp": "floor lamp",
+    "look into a mirror": "mirror",
+}
+"""What each of several people needs a thing of their own for."""
 
 _RESERVED = "above are around can does home how in is it left many nearer of off on open closed or people right the to"
 _TOKEN = rf"(?!(?:{'|'.join(_RESERVED.split())})\b)[a-z0-9]+"
@@ -87,6 +115,7 @@ _SLOTS = {
     "activity": _one_of(ACTIVITIES),
     "use": _one_of(USES),
     "habit": _one_of(HABITS),
+    "capacity": _one_of(CAPACITIES),
     "objects": _THING,
     "rooms": _THING,
 }
@@ -152,6 +181,7 @@ def _templates() -> dict[str, Template]:
         ("count_rooms", "world knowledge", "count", "How many {rooms} does this home have?"),
         ("sleepers", "world knowledge", "count", "How many people can sleep in the beds of this home?"),
         ("seats", "world knowledge", "count", "How many people can be seated at the {anchor}[ in the {room}]?"),
+        ("capacity", "world knowledge", "count", "How many people can {capacity} here, each at one of their own?"),
         ("habit", "world knowledge", "place", "In which room do the people who live here {habit}?"),
     )
     return {row[0]: Template(*row) for row in rows}

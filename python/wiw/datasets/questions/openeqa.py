@@ -37,12 +37,12 @@ _PLACES = 64
 def load(path: str | Path, scenes: str | Path = "", path_lengths: str | Path | None = None) -> list[Episode]:
     """Return one episode for each question of a published list, in its order.
 
-    Starts are those of the file, else NaN: `locate_start` gives such an episode one, once its scene is open. Lengths are
-    those of `path_lengths`, else of `gt_path_length.json` beside the list, else NaN.
+    Starts are those of the file, else NaN: `locate_start` gives such an episode one, once its scene is open. Lengths
+    are those of `path_lengths`, else of `gt_path_length.json` beside the list, else NaN.
 
     Args:
         path: the list, `open-eqa-184.json` or like it.
-        scenes: folder of the scenes. Without it episodes name their scenes as the list does: enough to read, not to run.
+        scenes: folder of the scenes. Without it episodes name scenes as the list does: enough to read, not to run.
         path_lengths: file of metres by question id.
 
     Raises:
