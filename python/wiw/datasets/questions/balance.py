@@ -1,0 +1,260 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Episodes that a text alone does not give away.
+
+Scenes are taken in blocks of four, in the order given, and a block's questions are made in pairs: the same text in two
+scenes of the block, or in a scene and its twin, with different answers. So in every run each text occurs in two scenes
+at least, no answer of a text is right more than half of the time, and half of the yes-no questions are answered by yes.
+A block's episodes depend on its own scenes only, and pairs stay together: the first N episodes are the same however
+many are asked for, and every even N has the property.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+
+from wiw import scenes as scene_specs
+from wiw._core import core
+from wiw.datasets.questions.answers import differ, resemblance
+from wiw.datasets.questions.blind import blind_answer
+from wiw.datasets.questions.facts import make_table
+from wiw.datasets.questions.generate import DEFAULT_RULES, Answerable, Backend, EpisodeRules, questions_of
+from wiw.datasets.questions.question import CATEGORIES
+from wiw.datasets.questions.survey import place_key
+from wiw.datasets.questions.twins import Edit, PossibleEdits, find_twin, may_have_twin
+from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError
+from wiw.types import Episode
+
+BLOCK = 4
+"""Scenes among which questions are paired; as many as a process keeps open."""
+TWIN_TRIES = 6
+"""Questions of a block that are tried for one twin."""
+
+SPARE = 2
+"""Questions that a scene may have beyond its share, so that the last pairs of a block can be found."""
+FAMILIES = {"floor_material": "material", "which_room": "where"}
+"""Templates that take one turn with another, which asks for the same."""
+
+Pair = tuple[Answerable, Answerable]
+
+
+def make_episodes(
+    scenes: Sequence[str],
+    count: int,
+    seed: int,
+    rules: EpisodeRules = DEFAULT_RULES,
+    *,
+    per_scene: int = 8,
+    backend: Backend = "auto",
+    possible_edits: PossibleEdits | None = None,
+) -> list[Episode]:
+    """Return the first `count` episodes of scenes that are named by single specs.
+
+    `possible_edits` says what copies of a scene can be made; without it there are no twins.
+
+    Raises:
+        ArgumentError: the scenes have too few questions, or too few rooms; says how many.
+    """
+    made: list[Episode] = []
+    blocks = 0
+    for block in compose_blocks(scenes, rules):
+        blocks += 1
+        for pair in pair_questions(block, seed, rules, per_scene, backend, possible_edits):
+            made += to_episodes(pair, len(made))
+            if len(made) >= count:
+                return made[:count]
+    raise ArgumentError(
+        f"only {len(made)} of {count} questions in {blocks} blocks of up to {BLOCK} scenes with {rules.rooms} rooms or "
+        "more, each asked in two of them with different answers; name more scenes (apartments:val:N), raise per_scene, "
+        "or lower rooms"
+    )
+
+
+def compose_blocks(scenes: Sequence[str], rules: EpisodeRules) -> Iterator[list[str]]:
+    """Yield blocks of scenes that have enough rooms, in their order; the last may be smaller."""
+    block: list[str] = []
+    for scene in scenes:
+        if len(scene_specs.open_scene(scene).rooms) >= rules.rooms:
+            block.append(scene)
+        if len(block) == BLOCK:
+            yield block
+            block = []
+    if block:
+        yield block
+
+
+def to_episodes(pair: Pair, first: int) -> list[Episode]:
+    """Return the two episodes of a pair, numbered on from `first`; twins name each other."""
+    twins = pair[0].scene.partition("?")[0] == pair[1].scene.partition("?")[0]
+    names = [f"{first + i:04d}" for i in range(2)]
+    return [question.to_episode(first + i, names[1 - i] if twins else "") for i, question in enumerate(pair)]
+
+
+@dataclass
+class _Tally:
+    """What a block has so far."""
+
+    pairs: list[Pair] = field(default_factory=list)
+    counts: Counter[str] = field(default_factory=Counter)
+    """By category, template, scene and answer."""
+    texts: set[str] = field(default_factory=set)
+    targets: Counter[tuple[str, int]] = field(default_factory=Counter)
+
+    def add(self, pair: Pair) -> None:
+        """Count one more pair."""
+        self.pairs.append(pair)
+        self.texts.add(pair[0].text)
+        self.counts.update([pair[0].category, _family(pair[0]), *(_home(each) for each in pair)])
+        self.counts.update(_answer(each) for each in pair)
+        self.targets.update((_home(each), each.fact.target[0]) for each in pair if each.fact.target)
+
+    def excess(self, pair: Pair, rules: EpisodeRules) -> float:
+        """Return what guessing from the text is worth for a pair, 0 where that would not make it worth too much."""
+        value = guess_value(pair)
+        total = sum(guess_value(each) for each in self.pairs)
+        return value if total + value > rules.guessing * (len(self.pairs) + 1) else 0.0
+
+    def admits_yes_no(self, rules: EpisodeRules) -> bool:
+        """Return whether one more yes-no question keeps them few."""
+        asked = sum(pair[0].answer_type == "yes_no" for pair in self.pairs)
+        return asked + 1 <= rules.yes_no * (len(self.pairs) + 1)
+
+
+def pair_questions(
+    block: Sequence[str],
+    seed: int,
+    rules: EpisodeRules,
+    per_scene: int,
+    backend: Backend = "auto",
+    possible_edits: PossibleEdits | None = None,
+) -> list[Pair]:
+    """Return the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
+
+    Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, and once
+    the most frequent answers of train apartments are worth as much as `rules.guessing`, pairs with others.
+    """
+    pools = {scene: questions_of(scene, seed, rules, backend) for scene in block}
+    candidates = _candidates(pools, core.fold_key([seed, *"/".join(block).encode()]))
+    shares = _answer_shares(pools)
+    tally = _Tally()
+    wanted = len(block) * per_scene // 2
+    spacing = round(1 / rules.twins) if possible_edits is not None and rules.twins > 0 else 0
+    while len(tally.pairs) < wanted:
+        twins = spacing and len(tally.pairs) % spacing == spacing - 1
+        pair = _next_twins(pools, tally, seed, rules, backend, possible_edits) if twins and possible_edits else None
+        pair = pair or _next_pair(candidates, tally, shares, rules, per_scene)
+        if pair is None:
+            break
+        tally.add(pair)
+    return tally.pairs
+
+
+def guess_value(pair: Pair) -> float:
+    """Return about what train apartments' most frequent answer is worth for the two questions of a pair, 0 to 1."""
+    guess = blind_answer(pair[0].text)
+    return sum(resemblance(guess, each.fact, each.answer_type) for each in pair) / 2
+
+
+def _candidates(pools: Mapping[str, Sequence[Answerable]], key: int) -> list[Pair]:
+    """Return every pair of scenes with one text and different answers, in an order drawn with `key`."""
+    by_text: dict[str, list[Answerable]] = {}
+    for pool in pools.values():
+        for question in pool:
+            by_text.setdefault(question.text, []).append(question)
+    pairs = [
+        pair
+        for questions in by_text.values()
+        for pair in combinations(questions, 2)
+        if differ(pair[0].fact, pair[1].fact, pair[0].answer_type)
+    ]
+    return [pairs[i] for i in np.argsort(core.uniform(key, len(pairs)), kind="stable")]
+
+
+def _answer_shares(pools: Mapping[str, Sequence[Answerable]]) -> dict[str, float]:
+    """Return how often each answer of a template is right in the scenes of a block, 0 to 1."""
+    every = [question for pool in pools.values() for question in pool]
+    templates, answers = Counter(each.template for each in every), Counter(_answer(each) for each in every)
+    return {_answer(each): answers[_answer(each)] / templates[each.template] for each in every}
+
+
+def _next_pair(
+    candidates: Sequence[Pair], tally: _Tally, shares: Mapping[str, float], rules: EpisodeRules, per_scene: int
+) -> Pair | None:
+    """Return the pair that a block lacks most, if there is one."""
+
+    def rank(pair: Pair) -> tuple[float, ...]:
+        answers = [tally.counts[_answer(each)] + shares[_answer(each)] for each in pair]
+        repeated = sum(tally.targets[_home(each), each.fact.target[0]] for each in pair if each.fact.target)
+        category = pair[0].category
+        return (
+            tally.counts[category],
+            tally.excess(pair, rules),
+            tally.counts[_family(pair[0])],
+            repeated,
+            sum(answers),
+            sum(tally.counts[_home(each)] for each in pair),
+            CATEGORIES.index(category),
+        )
+
+    yes_no = tally.admits_yes_no(rules)
+    free = [
+        pair
+        for pair in candidates
+        if pair[0].text not in tally.texts
+        and (yes_no or pair[0].answer_type != "yes_no")
+        and all(tally.counts[_home(each)] < per_scene + SPARE for each in pair)
+    ]
+    return min(free, key=rank, default=None)
+
+
+def _next_twins(
+    pools: Mapping[str, Sequence[Answerable]],
+    tally: _Tally,
+    seed: int,
+    rules: EpisodeRules,
+    backend: Backend,
+    possible_edits: PossibleEdits,
+) -> Pair | None:
+    """Return a question and its twin, of the scene that has fewest, if one of a few questions tried has a twin."""
+    scene = min(pools, key=lambda each: (tally.counts[each], list(pools).index(each)))
+    table = make_table(world(scene, backend).scene, scene)
+    edits = [Edit.parse(text) for text in possible_edits(scene)]
+    free = [
+        each
+        for each in pools[scene]
+        if each.text not in tally.texts and (each.answer_type != "yes_no" or tally.admits_yes_no(rules))
+    ]
+    draws = core.uniform(core.fold_key([place_key(seed, scene), 0x7F1B, len(tally.pairs)]), len(free))
+    order = sorted(
+        range(len(free)),
+        key=lambda i: (tally.counts[free[i].category], tally.counts[_family(free[i])], float(draws[i])),
+    )
+    tried = 0
+    for i in order:
+        if not may_have_twin(free[i], table, edits):
+            continue
+        twin = find_twin(free[i], seed, rules, backend, possible_edits)
+        if twin is not None:
+            return free[i], twin
+        tried += 1
+        if tried == TWIN_TRIES:
+            break
+    return None
+
+
+def _home(question: Answerable) -> str:
+    """Return the scene of a question without its edits."""
+    return question.scene.partition("?")[0]
+
+
+def _family(question: Answerable) -> str:
+    return FAMILIES.get(question.template, question.template)
+
+
+def _answer(question: Answerable) -> str:
+    return f"{question.template}: {question.fact.key}"
