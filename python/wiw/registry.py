@@ -281,6 +281,16 @@ SEGMENTERS = Registry(
     "",
     {"sam2": "wiw.perception.sam2_image:Sam2Image", "simulator": "wiw.perception.simulator:TrueMasks"},
 )
+LABELLERS = Registry(
+    "labeller",
+    "",
+    {
+        "learned": "wiw.perception.learned_labeller:LearnedLabeller",
+        "oracle": "wiw.perception.oracle_labeller:OracleLabeller",
+        "detector": "wiw.perception.detector_labeller:DetectorLabeller",
+    },
+    "wiw.perception.scene_labels:Labeller",
+)
 SEMANTICS = Registry(
     "source of semantics",
     "",

@@ -15,7 +15,7 @@ from tyro.conf import Positional, arg
 from wiw.cli.stop import announce_resume
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
-ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet"), ("armnet",), ("armnet", "diffuser")
+ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "scenes": (ON_SCENES, "does not train on scenes"),
     "val": (ON_SCENES, "does not train on scenes"),
@@ -31,7 +31,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 def train(
     what: Positional[
-        Annotated[Literal["recogniser", "warpnet", "armnet", "diffuser"], arg(metavar="WHAT")]
+        Annotated[Literal["recogniser", "warpnet", "perception", "armnet", "diffuser"], arg(metavar="WHAT")]
     ] = "recogniser",
     /,
     *,
@@ -48,11 +48,13 @@ def train(
     workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Train one of four networks: recogniser, warpnet, armnet or diffuser.
+    """Train one of five networks: recogniser, warpnet, perception, armnet or diffuser.
 
     recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
     imagined views. Trained on scenes.
     warpnet: a world model of navigation; it predicts the panorama that is seen from a place nearby. Trained on scenes.
+    perception: the labeller of question answering; it gives each pixel of a view a category and a state, on or off,
+    open or closed. Colour words are calibrated along with it. Trained on scenes.
     armnet: a world model of manipulation; it predicts the front view after each gripper pose of a plan. Trained on
     simulated play at the tables of the manipulation tasks, and on demonstrations if there are any.
     diffuser: the 3D diffusion policy of manipulation. Trained on demonstrations.
@@ -61,33 +63,35 @@ def train(
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
     $ wiw train warpnet --out warpnet.safetensors
     $ wiw run imagenav --world-model warpnet --world-model-option weights=warpnet.safetensors
+    $ wiw train perception --out perception.safetensors
     $ wiw train armnet --out armnet.safetensors
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
     it again. Training then takes 15 to 30 minutes on two idle cores; diffuser takes a night, or less with --minutes.
-    An interrupted training of armnet or diffuser resumes from its checkpoint, which lies beside FILE.
+    An interrupted training of perception, armnet or diffuser resumes from its checkpoint, which lies beside FILE.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
-    beside copy and warp; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
+    beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
+    val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
     diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults.
 
     Args:
-        what: recogniser, warpnet, armnet or diffuser.
+        what: recogniser, warpnet, perception, armnet or diffuser.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors.
-        scenes: Training scenes of recogniser and warpnet: apartments:train[:N], a mesh or a Gazebo world. Default:
+        scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world. Default:
             apartments:train:80.
-        val: Held-out scenes of recogniser and warpnet. recogniser splits them, or the samples of a single one, into
+        val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single one, into
             halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 4 for armnet,
-            400 for diffuser.
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 8 for perception, 4
+            for armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
-        places: Places sampled in each scene, for recogniser (default: 16), or walks recorded in each scene, for warpnet
-            (default: 24).
+        places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 10), or walks
+            recorded in each scene, for warpnet (default: 24).
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
         workers: Processes that prepare training data from scenes or plays. Default: 2.
@@ -124,6 +128,8 @@ def train(
             _train_diffuser(out, demonstrations, minutes, {**recipe, "seed": seed})
         elif what == "armnet":
             _train_armnet(out, data, minutes, DEFAULT_PLAYS if plays is None else plays, demonstrations, recipe)
+        elif what == "perception":
+            _train_perception(out, data, minutes, rules, recipe)
         else:
             _train_warpnet(out, data, minutes, rules, recipe)
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
@@ -153,6 +159,10 @@ def _require_torch(what: str) -> None:
         require_torch()
     elif what == "diffuser":
         from wiw.policies.diffuser import require_torch
+
+        require_torch()
+    elif what == "perception":
+        from wiw.perception.learned_labeller import require_torch
 
         require_torch()
     else:
@@ -210,6 +220,44 @@ def _train_warpnet(
     card["held_out"] = training.evaluate(WarpNet(out), data.val, data.seed, bar=_show_bar)
     save(out, load(out)[0], card)
     _report_warpnet(card)
+
+
+def _train_perception(
+    out: Path, data: _DataOptions, minutes: float | None, rule_options: dict[str, Any], recipe_options: dict[str, Any]
+) -> None:
+    from dataclasses import replace
+
+    from wiw.networks import single_thread
+    from wiw.perception.labeller_weights import load, save
+    from wiw.perception.scene_labels import CATEGORIES
+    from wiw.training import color_naming
+    from wiw.training import perception as training
+    from wiw.training.checkpoint import Checkpoint
+    from wiw.training.gather import gather_views
+    from wiw.training.labelled_views import HELD_OUT_FIELD, ViewRules
+
+    rules, recipe = ViewRules(**rule_options), training.Recipe(seed=data.seed, **recipe_options)
+    views = gather_views(data.scenes, data.seed, rules, **data.gathering)
+    held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
+    held_out = gather_views(data.val, data.seed, held_out_rules, **data.gathering)
+    card: dict[str, Any] = {"scenes": data.scenes, "val": data.val, "views": len(views), "sampling": asdict(rules)}
+    identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
+    checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)
+    with single_thread():
+        with _StepBar() as steps:
+            network, recipe = training.train(views, recipe, minutes, steps, checkpoint)
+        namer = color_naming.calibrate(views, data.seed)
+    card |= {"recipe": asdict(recipe), "categories": list(CATEGORIES), "states": training.find_possible_states(views)}
+    save(out, network, card)  # before the evaluation, which takes another minute
+    colors = out.with_suffix(".colors.json")
+    namer.save(colors)
+    network = load(out)[0]  # as it is stored, in half precision
+    card["held_out"] = training.evaluate(network, card["states"], held_out, data.seed)
+    card["held_out"]["colors"] = color_naming.evaluate(namer.load(colors), held_out)
+    save(out, network, card)
+    checkpoint.remove()
+    _report_perception(card)
+    print(f"colours   {colors}")
 
 
 def _train_diffuser(
@@ -356,6 +404,23 @@ def _report_warpnet(card: dict[str, Any]) -> None:
         cells = [f"{held_out['psnr'][name][n]:8.1f} {held_out['ssim'][name][n]:6.3f}" for n in held_out["psnr"][name]]
         print(f"  {name:<18}" + "".join(cells))
     print("PSNR in dB and SSIM of whole panoramas, weighted by latitude")
+
+
+def _report_perception(card: dict[str, Any]) -> None:
+    held_out = card["held_out"]
+    plain, degraded, colors = held_out["plain"], held_out["degraded"], held_out["colors"]
+    print(f"{card['views']} views, {card['recipe']['epochs']} epochs; held out: {held_out['views']} views")
+    print(f"{'':<20}{'as rendered':>14}{'degraded':>14}")
+    for name, key in (("pixel accuracy", "pixel_accuracy"), ("mean IoU", "mean_iou"), ("states", "state_accuracy")):
+        print(f"  {name:<18}" + "".join(f"{_to_percent(part[key]):>14}" for part in (plain, degraded)))
+    print(f"  {'colours of things':<18}{_to_percent(colors['accuracy']):>14}")
+    print("IoU by category: " + ", ".join(f"{name} {value:.2f}" for name, value in plain["iou"].items() if name))
+    for name, values in plain["states"].items():
+        print(f"  {name:<18}" + ", ".join(f"{state} {_to_percent(value)}" for state, value in values.items()))
+
+
+def _to_percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.1f} %"
 
 
 def _report_armnet(card: dict[str, Any]) -> None:

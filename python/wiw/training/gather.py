@@ -23,8 +23,11 @@ from wiw import scenes
 from wiw.datasets.worlds import world
 from wiw.files import whole_file
 from wiw.perception.glimpses import Glimpses
+from wiw.perception.scene_labels import CATEGORIES
 from wiw.scenes.store import build_digest
 from wiw.training.glimpse_sets import GlimpseSetRules, GlimpseSets, collect_glimpse_sets, merge_glimpse_sets
+from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
+from wiw.training.labelled_views import LabelledViews, ViewRules, merge_views, record_views
 from wiw.training.walks import WalkRules, Walks, record_walks
 from wiw.training.walks import merge_walks as merged_walks
 
@@ -96,6 +99,20 @@ def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers:
     )
 
 
+def gather_views(specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar) -> LabelledViews:
+    """Load the labelled views of all scenes of a spec; build those that `folder` lacks in `workers` processes.
+
+    Raises:
+        FileError: the folder cannot be written.
+        ArgumentError: nowhere in the scenes can one stand.
+    """
+    make = partial(_build_views, seed=seed, rules=rules)
+    identity = ("views", 1, list(CATEGORIES), seed, asdict(rules))
+    job = Job(f"views of {specs}", VIEW_FIELDS, make, identity)
+    found = gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
+    return merge_views([LabelledViews(*(arrays[name] for name in VIEW_FIELDS)) for arrays in found])
+
+
 def _resolve_scenes(specs: str) -> dict[str, str]:
     """Map the names of a spec's scenes to names that are valid in any working directory."""
     return {name: scenes.absolute(name) for name in scenes.resolve(specs)}
@@ -106,6 +123,11 @@ def _build_glimpse_sets(name: str, seed: int, categories: Sequence[str], rules: 
     glimpses = sets.glimpses
     values = (glimpses.images, glimpses.boxes, glimpses.scalars, sets.owners, sets.kinds, sets.labels)
     return dict(zip(GLIMPSE_SET_FIELDS, values, strict=True))
+
+
+def _build_views(name: str, seed: int, rules: ViewRules) -> Arrays:
+    views = record_views(world(name), seed, rules)
+    return {name: getattr(views, name) for name in VIEW_FIELDS}
 
 
 def _build_walks(name: str, seed: int, rules: WalkRules) -> Arrays:

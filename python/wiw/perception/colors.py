@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Colour words of things under the light of a scene, calibrated on apartments whose colours are known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.errors import ArgumentError, FileError, WeightsError
+from wiw.files import whole_file
+
+COLORS = (
+    "white", "grey", "black", "brown", "beige", "red", "orange", "yellow", "green", "turquoise", "blue", "purple",
+    "pink",
+)  # fmt: skip
+"""Colour words, as apartments use them."""
+PARAMETERS = Path(__file__).parent / "colors.json"
+QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
+HUES = 8
+"""Sectors of hue among which pixels are counted."""
+FEATURES = 3 * len(QUANTILES) + HUES + 3
+GREY_CHROMA = 0.02
+"""Oklab chroma that weighs half in the histogram of hues: hues of nearly grey pixels are noise."""
+_TO_CONES = np.array(
+    [[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
+     [0.0883024619, 0.2817188376, 0.6299787005]]
+)  # fmt: skip
+_TO_LAB = np.array(
+    [[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
+     [0.0259040371, 0.7827717662, -0.8086757660]]
+)  # fmt: skip
+"""Linear sRGB to cone responses, their cube roots to Oklab (B. Ottosson, 2020)."""
+
+
+@dataclass(frozen=True)
+class ColorNamer:
+    """A small network that names the colour of a set of pixels.
+
+    Made by `wiw train perception`; arrays are float64.
+    """
+
+    shift: NDArray[np.float64]
+    """[FEATURES]; features are normalised by (x - shift) * scale."""
+    scale: NDArray[np.float64]
+    hidden: NDArray[np.float64]
+    """[hidden, FEATURES]."""
+    hidden_bias: NDArray[np.float64]
+    output: NDArray[np.float64]
+    """[len(COLORS), hidden]."""
+    output_bias: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        units = len(self.hidden_bias)
+        expected = [(FEATURES,), (FEATURES,), (units, FEATURES), (units,), (len(COLORS), units), (len(COLORS),)]
+        arrays = [getattr(self, name) for name in self.__dataclass_fields__]
+        if [array.shape for array in arrays] != expected or not all(np.isfinite(array).all() for array in arrays):
+            raise ArgumentError(
+                f"ColorNamer: expected finite arrays of {expected}, got {[array.shape for array in arrays]}"
+            )
+
+    @classmethod
+    def load(cls, path: str | Path) -> ColorNamer:
+        """Read the JSON file that `save` wrote.
+
+        Raises:
+            WeightsError: there is no such file, or it is damaged or of something else.
+        """
+        try:
+            values = json.loads(Path(path).expanduser().read_text())
+            if values.pop("colors") != list(COLORS):
+                raise ValueError(f"its colours are not {', '.join(COLORS)}")
+            return cls(**{name: np.array(value, np.float64) for name, value in values.items()})
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ArgumentError) as error:
+            raise WeightsError(
+                f"{path}: expected parameters of colour naming: {error}; `wiw train perception` makes some",
+                "missing" if isinstance(error, OSError) else "unfit",
+            ) from error
+
+    def save(self, path: Path) -> None:
+        """Write the parameters as JSON, whole or not at all.
+
+        Raises:
+            FileError: the file cannot be written.
+        """
+        values: dict[str, Any] = {"colors": list(COLORS)}
+        values |= {name: np.asarray(value).round(5).tolist() for name, value in asdict(self).items()}
+        with whole_file(path) as draft:
+            try:
+                draft.write_text(json.dumps(values) + "\n")
+            except OSError as error:
+                raise FileError(f"{path}: cannot be written: {error}") from error
+
+    def compute_probabilities(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the probability of each colour for rows of features: float64 [N, len(COLORS)]."""
+        inner = np.maximum((features - self.shift) * self.scale @ self.hidden.T + self.hidden_bias, 0.0)
+        logits = inner @ self.output.T + self.output_bias
+        weights = np.exp(logits - logits.max(axis=1, keepdims=True))
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+        """Name the colour of pixels; see `name_color`."""
+        if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 2 or pixels.shape[1] != 3:
+            came = f"{pixels.dtype} {pixels.shape}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
+            raise ArgumentError(f"name_color: expected pixels uint8 [n, 3], got {came}")
+        if not len(pixels):
+            return "", 0.0
+        found = self.compute_probabilities(compute_features(pixels[None]))[0]
+        best = int(found.argmax())
+        return COLORS[best], float(found[best])
+
+
+def name_color(pixels: NDArray[np.uint8]) -> tuple[str, float]:
+    """Return the colour word for the pixels uint8 [n, 3] of a mask, and its probability; ("", 0.0) for no pixels.
+
+    Raises:
+        ArgumentError: an array of another shape or type.
+    """
+    return _load_built_in()(pixels)
+
+
+@cache
+def _load_built_in() -> ColorNamer:
+    return ColorNamer.load(PARAMETERS)
+
+
+def compute_features(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Describe sets of pixels uint8 [N, n, 3]: float64 [N, FEATURES].
+
+    Quantiles of Oklab's three axes, the share of each sector of hue among the pixels that have one, and mean,
+    standard deviation and largest value of the chroma.
+    """
+    lab = to_oklab(pixels)
+    chroma = np.hypot(lab[..., 1], lab[..., 2])
+    quantiles = np.quantile(lab, QUANTILES, axis=1).transpose(1, 0, 2).reshape(len(lab), -1)
+    sector = (np.arctan2(lab[..., 2], lab[..., 1]) / (2 * np.pi) % 1.0) * HUES
+    weight = chroma / (chroma + GREY_CHROMA)
+    low, part = np.floor(sector).astype(np.int64) % HUES, sector % 1.0
+    shares = np.stack(
+        [
+            (weight * np.where(low == hue, 1 - part, np.where((low + 1) % HUES == hue, part, 0.0))).mean(axis=1)
+            for hue in range(HUES)
+        ],
+        axis=1,
+    )
+    spread = np.stack([chroma.mean(axis=1), chroma.std(axis=1), chroma.max(axis=1)], axis=1)
+    return np.concatenate([quantiles, shares, spread], axis=1)
+
+
+@cache
+def _decoded() -> NDArray[np.float64]:
+    """Return the linear value of each byte, by the power law that the apartments are lit and drawn with."""
+    return np.asarray((np.arange(256) / 255.0) ** 2.2)
+
+
+def to_oklab(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return Oklab lightness, a and b of display-encoded colours [..., 3]."""
+    return np.asarray(np.cbrt(_decoded()[pixels] @ _TO_CONES.T) @ _TO_LAB.T)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Calibrate colour naming on things whose colours are known, and evaluate it on held-out ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from wiw._core import core
+from wiw.errors import ArgumentError
+from wiw.perception.colors import COLORS, FEATURES, ColorNamer, compute_features
+from wiw.perception.scene_labels import CATEGORIES, STRUCTURE
+from wiw.training.labelled_views import LabelledViews
+
+HIDDEN = 48
+STEPS, BATCH, RATE, DECAY = 3000, 256, 3e-3, 1e-3
+BALANCE = 0.5
+"""Sets of pixels are sampled with the frequency of their category and colour to minus this."""
+
+
+def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer:
+    """Train a namer on the pixels of the views' instances.
+
+    Raises:
+        ArgumentError: the views show nothing of a known colour.
+    """
+    if not len(views.pixels):
+        raise ArgumentError("expected scenes with things of known colours, got none; name others (--scenes)")
+    features = compute_features(views.pixels)
+    shift, scale = features.mean(axis=0), 1 / (features.std(axis=0) + 1e-3)
+    inputs = torch.from_numpy(((features - shift) * scale).astype(np.float32))
+    targets = torch.from_numpy(views.color.astype(np.int64))
+    torch.manual_seed(core.fold_key([seed, 0x4C24]) % 2**63)
+    network = torch.nn.Sequential(
+        torch.nn.Linear(FEATURES, HIDDEN), torch.nn.ReLU(), torch.nn.Linear(HIDDEN, len(COLORS))
+    )
+    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
+    rng = np.random.default_rng(core.fold_key([seed, 0x4C25]))
+    weights = _compute_weights(views)
+    for _ in range(steps):
+        rows = torch.from_numpy(rng.choice(len(inputs), BATCH, p=weights))
+        loss = torch.nn.functional.cross_entropy(network(inputs[rows]), targets[rows])
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    first, _, last = network
+    arrays = [each.detach().double().numpy() for each in (first.weight, first.bias, last.weight, last.bias)]
+    return ColorNamer(shift, scale, *arrays)
+
+
+def _compute_weights(views: LabelledViews) -> NDArray[np.float64]:
+    """Return the sampling probability of each set of pixels."""
+    pairs = views.colored_category.astype(np.int64) * len(COLORS) + views.color
+    weights = np.bincount(pairs)[pairs] ** -BALANCE
+    return np.asarray(weights / weights.sum())
+
+
+def evaluate(namer: ColorNamer, views: LabelledViews) -> dict[str, Any]:
+    """Measure accuracy on held-out things.
+
+    Returns:
+        {"things": N, "accuracy": of things in rooms, "structure": of walls, floors and the like, "by_category",
+        "by_color"}: shares of the sets of pixels whose colour was named as the scene names it, None where there are
+        none.
+    """
+    if not len(views.pixels):
+        return {"things": 0, "accuracy": None, "structure": None, "by_category": {}, "by_color": {}}
+    right = namer.compute_probabilities(compute_features(views.pixels)).argmax(axis=1) == views.color
+    names = np.array(CATEGORIES)[views.colored_category]
+    colors = np.array(COLORS)[views.color]
+    structure = np.isin(names, STRUCTURE)
+    return {
+        "things": int((~structure).sum()),
+        "accuracy": _mean(right[~structure]),
+        "structure": _mean(right[structure]),
+        "by_category": {str(name): _mean(right[names == name]) for name in np.unique(names)},
+        "by_color": {str(name): _mean(right[(colors == name) & ~structure]) for name in np.unique(colors[~structure])},
+    }
+
+
+def _mean(flags: NDArray[np.bool_]) -> float | None:
+    return round(float(flags.mean()), 4) if len(flags) else None

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training data of the learned labeller and of colour naming: views of scenes with the truth about each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import core
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.worlds import World
+from wiw.errors import ArgumentError
+from wiw.panorama import PerspectivePlan
+from wiw.perception.colors import COLORS
+from wiw.perception.labelling_network import FOCAL, STRIDE, InputSize, compute_tangents
+from wiw.perception.scene_labels import CATEGORIES, STATES, merge_category
+
+SIZE = (384, 448)
+"""(H, W) of the views as they are cut out of panoramas."""
+PANORAMA_SIZE = (576, 1024)
+INPUT = InputSize(176, 208, FOCAL)
+"""The views as they are stored."""
+STATE_WORDS = {"half drawn": "closed"}
+"""States of scenes that are learned under another name. A curtain that is half drawn is on the closed side of one that
+is open, so that the network learns to look at how much of the window shows.
+"""
+COLOR_SAMPLES = 64
+"""Pixels stored of an instance in a view, for learning colour names."""
+LEAST_PIXELS = 150
+"""Pixels of a view that an instance must fill for its colour to be learned: 8 by 8 centimetres at 1 m."""
+HELD_OUT_FIELD = 105.0
+"""Field of view in degrees of the views that labellers are evaluated on, the width at which they are used."""
+COLORLESS = ("mirror", "picture", "photo", "window", "opening", "")
+"""Categories whose pixels do not show the colour that the scene names."""
+
+
+@dataclass(frozen=True)
+class ViewRules:
+    """How a scene is sampled."""
+
+    places: int = 10
+    views: int = 4
+    """Views of a place, in directions spread evenly around it."""
+    fields: tuple[float, float] = (90.0, 110.0)
+    """Least and greatest horizontal field of view in degrees."""
+
+
+@dataclass(frozen=True)
+class LabelledViews:
+    """N views and what they show, and the colours of the K instances in them."""
+
+    images: NDArray[np.uint8]
+    """uint8 [N, h, w, 3] in the network's size."""
+    category: NDArray[np.uint8]
+    """uint8 [N, h/2, w/2]: index into `CATEGORIES`."""
+    state: NDArray[np.uint8]
+    """uint8 [N, h/2, w/2]: index into `STATES`."""
+    hfov_deg: NDArray[np.float32]
+    """float32 [N]."""
+    pixels: NDArray[np.uint8]
+    """uint8 [K, COLOR_SAMPLES, 3]: pixels of one instance each."""
+    color: NDArray[np.uint8]
+    """uint8 [K]: index into `COLORS`, the instance's colour."""
+    colored_category: NDArray[np.uint8]
+    """uint8 [K]: index into `CATEGORIES`."""
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+
+FIELDS = tuple(field.name for field in fields(LabelledViews))
+
+
+def merge_views(parts: Sequence[LabelledViews]) -> LabelledViews:
+    """Concatenate the views of several scenes.
+
+    Raises:
+        ArgumentError: there is not one view in them.
+    """
+    if not sum(map(len, parts)):
+        raise ArgumentError("expected scenes in which one can stand, got none; name others (--scenes)")
+    return LabelledViews(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
+
+
+@dataclass(frozen=True)
+class InstanceTable:
+    """Each instance's labels, by id; row 0 is nothing."""
+
+    category: NDArray[np.uint8]
+    state: NDArray[np.uint8]
+    color: NDArray[np.int64]
+    """-1 where pixels do not show it."""
+
+
+def read_instances(instances: Sequence[Mapping[str, Any]]) -> InstanceTable:
+    """Return the labels of a scene's instances."""
+    numbers = {name: i for i, name in enumerate(CATEGORIES)}
+    table = InstanceTable(*np.zeros((2, len(instances) + 1), np.uint8), np.full(len(instances) + 1, -1))
+    for each in instances:
+        name = merge_category(each["category"])
+        state = each["attributes"].get("state", "")
+        state, color = STATE_WORDS.get(state, state), each["attributes"].get("color", "")
+        table.category[each["id"]] = numbers.get(name, 0)
+        table.state[each["id"]] = STATES.index(state) if state in STATES else 0
+        if color in COLORS and name in numbers and name not in COLORLESS:
+            table.color[each["id"]] = COLORS.index(color)
+    return table
+
+
+def record_views(world: World, seed: int, rules: ViewRules = ViewRules()) -> LabelledViews:
+    """Record views of a scene from places where an agent can stand; a pure function of (scene, seed, rules)."""
+    key = core.fold_key([seed, 0x4C20])
+    points = world.ground.put_down(world.navmesh.sample(rules.places, key)).astype(np.float64)
+    draws = core.uniform(core.fold_key([key, 1]), len(points) * 2).reshape(-1, 2)
+    table = read_instances(world.scene.instances)
+    parts = []
+    for number, (point, (turn, zoom)) in enumerate(zip(points, draws, strict=True)):
+        shown = world.renderer.panorama(camera_pose(point, 0.0)[None], PANORAMA_SIZE, outputs=("color", "instance"))
+        hfov_deg = rules.fields[0] + zoom * (rules.fields[1] - rules.fields[0])
+        yaws = [float(360 * (turn + i / rules.views)) for i in range(rules.views)]
+        plan = PerspectivePlan(PANORAMA_SIZE, SIZE, hfov_deg)
+        images = plan(shown["color"][0], yaws)
+        ids = plan(shown["instance"][0][..., None], yaws, interpolation="nearest")[..., 0]
+        parts.append(_label_views(images, ids, table, hfov_deg, core.fold_key([key, 2, number])))
+    if not parts:
+        return _label_views(np.zeros((0, *SIZE, 3), np.uint8), np.zeros((0, *SIZE), np.uint32), table, 90.0, 0)
+    return merge_views(parts)
+
+
+def _label_views(
+    images: NDArray[np.uint8], ids: NDArray[np.uint32], table: InstanceTable, hfov_deg: float, key: int
+) -> LabelledViews:
+    rows = (np.arange(INPUT.height // STRIDE) * 2 + 1) * SIZE[0] * STRIDE // (2 * INPUT.height)
+    columns = (np.arange(INPUT.width // STRIDE) * 2 + 1) * SIZE[1] * STRIDE // (2 * INPUT.width)
+    small = ids[:, rows[:, None], columns]
+    shrunk = [cv2.resize(image, (INPUT.width, INPUT.height), interpolation=cv2.INTER_AREA) for image in images]
+    return LabelledViews(
+        np.array(shrunk, np.uint8).reshape(-1, INPUT.height, INPUT.width, 3),
+        table.category[small],
+        table.state[small],
+        np.full(len(images), hfov_deg, np.float32),
+        *_sample_colors(images, ids, table, np.random.default_rng(key)),
+    )
+
+
+def _sample_colors(
+    images: NDArray[np.uint8], ids: NDArray[np.uint32], table: InstanceTable, rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return pixels of each instance that is large enough in a view, its colour and its category."""
+    pixels, found = [], []
+    for image, numbers in zip(images, ids, strict=True):
+        flat, shown = numbers.ravel(), image.reshape(-1, 3)
+        order = np.argsort(flat, kind="stable")
+        for instance, first, count in zip(*np.unique(flat[order], return_index=True, return_counts=True), strict=True):
+            if count >= LEAST_PIXELS and table.color[instance] >= 0:
+                pixels.append(shown[order[first + rng.integers(0, count, COLOR_SAMPLES)]])
+                found.append(int(instance))
+    return (
+        np.array(pixels, np.uint8).reshape(-1, COLOR_SAMPLES, 3),
+        table.color[found].astype(np.uint8),
+        table.category[found],
+    )
+
+
+def compute_view_tangents(hfov_deg: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the directions of the stored views' pixels, float32 [N, h, w, 2]."""
+    focal = SIZE[1] / (2 * np.tan(np.radians(hfov_deg.astype(np.float64)) / 2))
+    return np.stack([compute_tangents(SIZE, InputSize(INPUT.height, INPUT.width, float(each))) for each in focal])

@@ -1,0 +1,296 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train the learned labeller on views of scenes, and evaluate it on held-out ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+from wiw._core import core
+from wiw.errors import ArgumentError
+from wiw.perception.labelling_network import STRIDE, Network, fuse, to_network_input
+from wiw.perception.learned_labeller import LearnedLabeller
+from wiw.perception.scene_labels import CATEGORIES, STATES
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer
+from wiw.training.labelled_views import LabelledViews, compute_view_tangents
+from wiw.training.trainer import run_training, warmup_cosine_schedule
+
+LEAST_PIXELS = 20
+"""Pixels of the network's output that an object must fill for its state to be evaluated."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Hyper-parameters of the training."""
+
+    epochs: int = 8
+    """How often each view is used, on average."""
+    batch: int = 4
+    widths: tuple[int, int, int, int] = (24, 48, 96, 160)
+    """Channels of the U-Net's levels."""
+    rate: float = 2e-3
+    decay: float = 0.01
+    balance: float = 0.35
+    """Weight of a category's pixels is their frequency to minus this."""
+    states: float = 0.3
+    """Weight of the states' loss beside that of the categories."""
+    degraded: float = 0.4
+    """Share of views that are warped, blurred and noisy, as imagined ones are."""
+    bfloat16: bool = True
+    """Compute products in bfloat16: faster on CPUs with AVX512-BF16, slower on others."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.batch, *self.widths) < 1:
+            raise ArgumentError(f"Recipe: epochs, batch and widths must be positive, got {self}")
+
+
+def train(
+    views: LabelledViews,
+    recipe: Recipe = Recipe(),
+    minutes: float | None = None,
+    on_step: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    checkpoint: Checkpoint | None = None,
+) -> tuple[Network, Recipe]:
+    """Train a network; return it without batch normalisation, and the recipe that reproduces it without a time limit.
+
+    Args:
+        views: to learn from.
+        recipe: how to train; see `Recipe`.
+        minutes: if given, reduces the number of epochs so that training takes about this long.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        checkpoint: where the state of training is saved, and from where it resumes.
+    """
+    steps_per_epoch = max(1, len(views) // recipe.batch)
+    trainer, recipe = run_training(
+        lambda: _Trainer(views, recipe),
+        recipe,
+        steps_per_epoch,
+        minutes,
+        warmup_cosine_schedule(0.05),
+        on_step,
+        checkpoint,
+    )
+    return fuse(trainer.network), recipe
+
+
+class _Trainer(ResumableTrainer):
+    """The network in training, with everything that its next step depends on."""
+
+    stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_optimiser")
+
+    def __init__(self, views: LabelledViews, recipe: Recipe) -> None:
+        torch.manual_seed(core.fold_key([recipe.seed, 0x4C21]) % 2**63)
+        self.views, self.recipe = views, recipe
+        self.network = Network(len(CATEGORIES), len(STATES), recipe.widths)
+        self._set_prior()
+        self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        self._sampling_weights = _compute_sampling_weights(views.category)
+        self._category_weights = torch.from_numpy(_compute_category_weights(views.category, recipe.balance))
+
+    def _set_prior(self) -> None:
+        """Start from the categories' frequencies, as they are weighted."""
+        share = np.bincount(self.views.category.ravel(), minlength=len(CATEGORIES)) / self.views.category.size
+        prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
+        with torch.no_grad():
+            assert self.network.head.bias is not None
+            self.network.head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
+
+    def train_step(self, learning_rate: float) -> float:
+        """Train on one batch of views and return its loss."""
+        for group in self._optimiser.param_groups:
+            group["lr"] = learning_rate
+        rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
+        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
+            categories, states = self.network.train()(batch.shown)
+        loss = functional.cross_entropy(categories.float(), batch.category, self._category_weights)
+        stateful = batch.state > 0
+        if stateful.any():
+            loss = loss + self.recipe.states * functional.cross_entropy(
+                states.float().permute(0, 2, 3, 1)[stateful], batch.state[stateful]
+            )
+        self._optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self._optimiser.step()
+        self.step_count += 1
+        return float(loss.detach())
+
+
+def _compute_sampling_weights(category: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return each view's sampling probability, proportional to the number of categories that it shows."""
+    shown = np.array([len(np.unique(view)) for view in category], np.float64)
+    return np.asarray(shown / shown.sum())
+
+
+def _compute_category_weights(category: NDArray[np.uint8], balance: float) -> NDArray[np.float32]:
+    """Return the weights of the categories' pixels; their mean over all pixels is 1."""
+    share = np.bincount(category.ravel(), minlength=len(CATEGORIES)) / category.size
+    weights = np.maximum(share, 1e-5) ** -balance
+    return np.asarray(weights / (weights * share).sum(), np.float32)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Views as the network takes them, and their labels."""
+
+    shown: Tensor
+    """float [B, 5, h, w]."""
+    category: Tensor
+    """int64 [B, h/2, w/2]."""
+    state: Tensor
+
+
+def sample_batch(
+    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator
+) -> Batch:
+    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded."""
+    rows = rng.choice(len(views), recipe.batch, p=weights)
+    images, category, state = views.images[rows], views.category[rows], views.state[rows]
+    for i in np.flatnonzero(rng.random(recipe.batch) < recipe.degraded):
+        images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
+        category[i], state[i] = labels[..., 0], labels[..., 1]
+    mirrored = rng.random(recipe.batch) < 0.5
+    for array in (images, category, state):
+        array[mirrored] = array[mirrored, :, ::-1]
+    light = rng.uniform(0.75, 1.3, (recipe.batch, 1, 1, 1)) * rng.uniform(0.92, 1.08, (recipe.batch, 1, 1, 3))
+    images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
+    return Batch(
+        to_network_input(images, compute_view_tangents(views.hfov_deg[rows])),
+        torch.from_numpy(category.astype(np.int64)),
+        torch.from_numpy(state.astype(np.int64)),
+    )
+
+
+def degrade_view(
+    image: NDArray[np.uint8], labels: NDArray[np.uint8], rng: np.random.Generator
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Make a view as imperfect as imagined ones: warped, with its labels, then blurred or coarse, and noisy.
+
+    Args:
+        image: uint8 [h, w, 3].
+        labels: uint8 [h/2, w/2, C].
+        rng: what chance decides.
+    """
+    height, width = image.shape[:2]
+    field = rng.normal(0, rng.uniform(0, 4), (5, 6, 2)).astype(np.float32)
+    offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
+    across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    image = np.asarray(
+        cv2.remap(image, across + offset[..., 0], down + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    )
+    middle = (slice(STRIDE // 2, None, STRIDE),) * 2
+    source = (np.stack([across, down], axis=-1) + offset)[middle] / STRIDE
+    columns, rows = np.clip(source, 0, (width // STRIDE - 1, height // STRIDE - 1)).astype(np.intp).transpose(2, 0, 1)
+    labels = labels[rows, columns]
+    if rng.random() < 0.5:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.8)))
+    else:
+        coarse = 1 / rng.uniform(1.0, 2.6)
+        small = cv2.resize(image, None, fx=coarse, fy=coarse, interpolation=cv2.INTER_AREA)
+        image = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
+    noise = rng.normal(0, rng.uniform(0, 10), image.shape)
+    return np.clip(image + noise, 0, 255).astype(np.uint8), labels
+
+
+def find_possible_states(views: LabelledViews) -> dict[str, list[str]]:
+    """Return the states that each category is shown in, in the order of `STATES`; only categories that have some."""
+    pairs = np.unique(views.category.astype(np.int64) * len(STATES) + views.state)
+    found: dict[str, list[str]] = {}
+    for category, state in zip(*np.divmod(pairs, len(STATES)), strict=True):
+        if category and state:
+            found.setdefault(CATEGORIES[category], []).append(STATES[state])
+    return found
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+def evaluate(network: Network, states: dict[str, list[str]], views: LabelledViews, seed: int) -> dict[str, Any]:
+    """Measure the labeller on held-out views, as they are and degraded.
+
+    Returns:
+        {"views": N, "plain": measures, "degraded": measures}; see `_measure`.
+    """
+    labeller = LearnedLabeller.of(network, {"categories": list(CATEGORIES), "states": states})
+    rng = np.random.default_rng(core.fold_key([seed, 0x4C23]))
+    degraded = [
+        degrade_view(image, np.stack([category, state], axis=-1), rng)
+        for image, category, state in zip(views.images, views.category, views.state, strict=True)
+    ]
+    labels = np.array([each for _, each in degraded])
+    return {
+        "views": len(views),
+        "plain": _measure(labeller, views.images, views.category, views.state, views.hfov_deg),
+        "degraded": _measure(
+            labeller, np.array([image for image, _ in degraded]), labels[..., 0], labels[..., 1], views.hfov_deg
+        ),
+    }
+
+
+def _measure(
+    labeller: LearnedLabeller,
+    images: NDArray[np.uint8],
+    category: NDArray[np.uint8],
+    state: NDArray[np.uint8],
+    hfov_deg: NDArray[np.float32],
+) -> dict[str, Any]:
+    """Return pixel accuracy, IoU by category and its mean, and the accuracy of states by category and its mean.
+
+    A state counts as right where most pixels that the labeller gives an object's category have its state; objects
+    without such pixels do not count. The means are over categories that are shown, those of states over categories
+    that are shown in more than one.
+    """
+    confusion = np.zeros((len(CATEGORIES), len(CATEGORIES)), np.int64)
+    right: dict[str, dict[str, list[bool]]] = {}
+    for image, truth, states, angle in zip(images, category, state, hfov_deg, strict=True):
+        found = labeller.label(image[None], float(angle))
+        predicted, predicted_state = (array[0, ::STRIDE, ::STRIDE] for array in (found.category, found.state))
+        pairs = truth.astype(np.int64) * len(CATEGORIES) + predicted
+        confusion += np.bincount(pairs.ravel(), minlength=confusion.size).reshape(confusion.shape)
+        for name, value, correct in _judge_states(truth, states, predicted, predicted_state):
+            right.setdefault(name, {}).setdefault(value, []).append(correct)
+    shown, hits = confusion.sum(axis=1), np.diag(confusion)
+    union = shown + confusion.sum(axis=0) - hits
+    iou = {name: round(float(hits[i] / union[i]), 4) for i, name in enumerate(CATEGORIES) if shown[i]}
+    by_state = {
+        name: {value: round(float(np.mean(flags)), 4) for value, flags in sorted(values.items())}
+        for name, values in sorted(right.items())
+    }
+    varied = [np.mean(list(values.values())) for values in by_state.values() if len(values) > 1]
+    named = [value for name, value in iou.items() if name]
+    return {
+        "pixel_accuracy": round(float(hits.sum() / max(1, confusion.sum())), 4),
+        "mean_iou": round(float(np.mean(named)), 4) if named else None,
+        "iou": iou,
+        "state_accuracy": round(float(np.mean(varied)), 4) if varied else None,
+        "states": by_state,
+    }
+
+
+def _judge_states(
+    truth: NDArray[np.uint8],
+    states: NDArray[np.uint8],
+    predicted: NDArray[np.uint8],
+    predicted_state: NDArray[np.uint8],
+) -> list[tuple[str, str, bool]]:
+    """Return category, true state and whether it was found, for what fills `LEAST_PIXELS` of a view."""
+    judged = []
+    stateful = np.where(states > 0, truth.astype(np.int64) * len(STATES) + states, 0)
+    for pair, count in zip(*np.unique(stateful, return_counts=True), strict=True):
+        category, state = divmod(int(pair), len(STATES))
+        votes = predicted_state[(stateful == pair) & (predicted == category)]
+        if pair and count >= LEAST_PIXELS and len(votes):
+            most = int(np.bincount(votes, minlength=len(STATES)).argmax())
+            judged.append((CATEGORIES[category], STATES[state], most == state))
+    return judged
