@@ -262,16 +262,15 @@ def test_polarity_and_counts() -> None:
 
 def test_the_vocabulary_knows_what_apartments_have() -> None:
     known = load_vocabulary()
-    for split in ("train", "val"):
-        scene = wiw.scenes.apartment(0, split)
-        for instance in scene.instances:
-            attributes = instance["attributes"]
-            values = {kind: attributes[kind] for kind in ("color", "material", "state") if kind in attributes}
-            for kind, value in {"object": instance["category"], **values}.items():
-                words = split_words(value)
-                assert [match.end for match in known.find(words, [kind])] == [len(words)], (kind, value)
-        for room in scene.rooms:
-            assert known.find(split_words(room["type"]), ["room"]), room["type"]
+    scene = wiw.scenes.apartment(0, "val")
+    for instance in scene.instances:
+        attributes = instance["attributes"]
+        values = {kind: attributes[kind] for kind in ("color", "material", "state") if kind in attributes}
+        for kind, value in {"object": instance["category"], **values}.items():
+            words = split_words(value)
+            assert [match.end for match in known.find(words, [kind])] == [len(words)], (kind, value)
+    for room in scene.rooms:
+        assert known.find(split_words(room["type"]), ["room"]), room["type"]
 
 
 def test_every_name_of_the_vocabulary_is_itself() -> None:
