@@ -60,6 +60,10 @@ class NavigationSpec(ABC):
     def episode(self, index: int) -> Episode:
         """Return an episode by its number."""
 
+    def locate(self, place: World, episode: Episode) -> Episode:
+        """Return an episode with everything that only its open scene tells; most tell it beforehand."""
+        return episode
+
     @abstractmethod
     def make_goal(self, place: World, episode: Episode) -> Goal:
         """Return what the agent is asked to do."""
@@ -216,6 +220,7 @@ def wrap_episode(task: NavigationSpec, index: int) -> int:
 def start_episode(task: NavigationSpec, episode: Episode) -> tuple[Any, EpisodeState, Goal]:
     """Return the simulator at the start of an episode, the episode's record, and what the agent is asked to do."""
     place = world(episode.scene, task.backend)
+    episode = task.locate(place, episode)
     config = _env.NavigationConfig(motion=_env.Motion.__members__[task.motion])
     core = _env.NavigationEnv(place.renderer.core, place.navmesh, place.ground, config)
     core.reset(np.asarray(episode.start_position), episode.start_yaw)

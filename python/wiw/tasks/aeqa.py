@@ -9,7 +9,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.questions import EpisodeRules, Question, blind_answer, load, make_episodes
+from wiw.datasets.episodes import read_json
+from wiw.datasets.questions import Question, openeqa
+from wiw.datasets.questions.balance import make_episodes
+from wiw.datasets.questions.blind import blind_answer
+from wiw.datasets.questions.generate import EpisodeRules
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
@@ -46,8 +50,6 @@ class AEQARules:
     unanswered: Literal["blind", "blind_with_path", "lowest"]
     """Mark of an episode without a final answer: that of the answer by the text alone, with an SPL of 0 or with the
     path's, or 1."""
-    shortest: Literal["viewpoint", "file"]
-    """L*: the shortest path to a place from where the answer is seen, or the length that the episode file gives."""
     turns: Literal["counted", "first_free"]
     """Whether the turn at the start of a segment counts as primitives."""
     motion: Literal["refuse", "slide"]
@@ -63,8 +65,8 @@ class AEQA(NavigationTask):
     What is asked, when an episode ends, and what is measured. `NavigationTask` documents the rest of the arguments.
 
     Args:
-        judge: who marks answers, see `wiw.judging.make_judge`: "auto" marks typed questions by rules and all others by
-            an approximate score, "llm:URL" asks a language model for those.
+        judge: who marks answers, see `wiw.judging.make_judge`: "rules" marks typed questions by rules and all others
+            by an approximate score, "rules+llm:URL" asks a language model for those.
     """
 
     name = "aeqa"
@@ -80,7 +82,7 @@ class AEQA(NavigationTask):
         asked="The question",
     )
 
-    def __init__(self, *args: Any, judge: str | Judge = "auto", **options: Any) -> None:
+    def __init__(self, *args: Any, judge: str | Judge = "rules", **options: Any) -> None:
         super().__init__(*args, **options)
         self.judge = make_judge(judge)
 
@@ -119,9 +121,15 @@ class AEQA(NavigationTask):
     # -- episodes ------------------------------------------------------------------------------------------------------
 
     def load_episodes(self) -> list[Episode]:
-        """Return the file's episodes: wiw's own, or OpenEQA's."""
+        """Return the file's episodes: wiw's own, or one of OpenEQA's lists."""
         assert self.episode_file is not None
-        return [_name_kind(episode) for episode in load(self.episode_file, self.scene_folder)]
+        published = isinstance(read_json(self.episode_file), list)
+        found = openeqa.load(self.episode_file, self.scene_folder) if published else super().load_episodes()
+        return [_name_kind(episode) for episode in found]
+
+    def locate(self, place: World, episode: Episode) -> Episode:
+        """Return the episode with a start on the floor: OpenEQA's lists may give none."""
+        return openeqa.locate_start(place, episode) if episode.info.get("source") == openeqa.SOURCE else episode
 
     def generate_first(self, count: int) -> list[Episode]:
         """Return questions, each asked in two scenes at least with different answers, from where none is seen."""
@@ -182,7 +190,7 @@ class AEQA(NavigationTask):
         judged = self._judge_final(state) if answer else self._judge_unanswered(blind)
         score = _score(judged.mark)
         counts = bool(answer) or self.rules.unanswered == "blind_with_path"
-        shortest = self._shortest(state)
+        shortest = state.episode.geodesic if np.isfinite(state.episode.geodesic) else 0.0
         cuts = {f"score_at_{cut}": score if answer and state.actions <= cut else _score(blind.mark) for cut in CUTS}
         return {
             "success": float(bool(answer) and judged.mark == 5),
@@ -220,12 +228,6 @@ class AEQA(NavigationTask):
             reference = Reference(question.text, question.answer, question.extra_answers, question.answer_type)
             known[answer] = self.judge.judge([reference], [answer])[0]
         return known[answer]
-
-    def _shortest(self, state: EpisodeState) -> float:
-        length = state.episode.geodesic
-        if self.rules.shortest == "file":
-            length = float(state.episode.info.get("file_length", length))
-        return length if np.isfinite(length) else 0.0
 
     def _measure_grounding(self, state: EpisodeState) -> dict[str, float]:
         targets = list(read_question(state.episode).target)

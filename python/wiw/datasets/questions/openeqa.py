@@ -25,6 +25,8 @@ from wiw.datasets.worlds import World
 from wiw.errors import FileError
 from wiw.types import Episode
 
+SOURCE = "open-eqa"
+"""`Episode.info["source"]` of such episodes."""
 PATH_LENGTHS = "gt_path_length.json"
 """Name of the published file of metres by question id, each the length of a recorded tour of the scene."""
 ENDINGS = (".glb", ".basis.glb", ".gltf", ".obj", ".ply", ".dae")
@@ -96,7 +98,7 @@ def _episode(item: Any, where: str, lengths: Mapping[str, float]) -> Episode:
             goal_position=(math.nan,) * 3,
             goal_yaw=0.0,
             geodesic=lengths.get(name, math.nan),
-            info={"question": question.to_info(), "source": "open-eqa"},
+            info={"question": question.to_info(), "source": SOURCE},
         )
     except (TypeError, ValueError) as error:
         raise FileError(f"{where}: {error}") from error
