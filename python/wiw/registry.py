@@ -243,6 +243,8 @@ POLICIES = Registry(
         "vlm": "wiw.policies.vlm.make:make_vlm",
         "scripted": "wiw.policies.scripted:Scripted",
         "diffuser": "wiw.policies.diffuser:Diffuser",
+        "explorer": "wiw.policies.explorer:Explorer",
+        "explorer-oracle": "wiw.experiments.true_perception:OracleExplorer",
     },
     "wiw.policies.base:Policy",
 )

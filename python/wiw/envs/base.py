@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -102,6 +102,10 @@ class Env(ABC):
     def semantic(self) -> NDArray[np.uint32]:
         """Return the true category of each pixel of the panorama, uint32 [H, W], for `--semantics simulator`."""
         raise self._lacks("has no true semantics, which `--semantics simulator` asks for", "semantic")
+
+    def instances(self) -> tuple[NDArray[np.uint32], Sequence[Mapping[str, Any]]]:
+        """Return the true instance of each pixel of the panorama, uint32 [H, W], and the scene's table of them."""
+        raise self._lacks("does not tell which instance each pixel shows", "instances")
 
     def close(self) -> None:
         """Release the resources of the environment."""

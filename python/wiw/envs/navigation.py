@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -181,6 +181,10 @@ class NavigationEnv(gymnasium.Env[dict[str, Any], int], Env):
         source = TrueSemantics(read_categories(self.state.world.scene))
         ids = self._core.observe(["panorama_ids"])["panorama_ids"]
         return source.label_panoramas(self.observation.panorama[None], ids=ids[None])[0]
+
+    def instances(self) -> tuple[NDArray[np.uint32], Sequence[Mapping[str, Any]]]:
+        """Return the true instance of each pixel of the panorama, uint32 [576, 1024], and the scene's table of them."""
+        return self._core.observe(["panorama_ids"])["panorama_ids"], self.state.world.scene.instances
 
     # -- privileged ----------------------------------------------------------------------------------------------------
 

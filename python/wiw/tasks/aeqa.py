@@ -70,6 +70,7 @@ class AEQA(NavigationTask):
     """
 
     name = "aeqa"
+    default_policy = "explorer"
     metrics = ("answer_score", "spl", "path_length")
     rules_class = AEQARules
     generator_class = EpisodeRules

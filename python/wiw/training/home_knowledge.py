@@ -11,10 +11,10 @@ from pathlib import Path
 from wiw.datasets.questions.answers import MATERIALS
 from wiw.datasets.questions.facts import STRUCTURE, SceneTable, make_table
 from wiw.files import whole_file
-from wiw.scenes import open_scene
+from wiw.scenes import apartment_table
 
-SCENES = tuple(f"apartments:train/{i}" for i in range(60))
-"""Apartments that the package's knowledge is made from."""
+APARTMENTS = 200
+"""Train apartments that the package's knowledge is made from."""
 
 
 def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
@@ -36,12 +36,14 @@ def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
             kind: {name: round(count / rooms[kind], 4) for name, count in sorted(contents[kind].items())}
             for kind in sorted(contents)
         },
-        "materials": {name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())},
+        "materials": {
+            name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())
+        },
     }
 
 
-def write_knowledge(path: str | Path, scenes: Sequence[str] = SCENES) -> None:
-    """Count in some scenes and write the file that `wiw.policies.explorer.home.load_knowledge` reads."""
-    found = count_homes([make_table(open_scene(scene), scene) for scene in scenes])
+def write_knowledge(path: str | Path, apartments: int = APARTMENTS) -> None:
+    """Count in the first train apartments and write the file that `wiw.policies.explorer.home.load_knowledge` reads."""
+    found = count_homes([make_table(apartment_table(seed, "train")) for seed in range(apartments)])
     with whole_file(Path(path)) as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

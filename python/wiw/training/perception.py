@@ -151,9 +151,7 @@ class Batch:
     state: Tensor
 
 
-def sample_batch(
-    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator
-) -> Batch:
+def sample_batch(views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator) -> Batch:
     """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded."""
     rows = rng.choice(len(views), recipe.batch, p=weights)
     images, category, state = views.images[rows], views.category[rows], views.state[rows]
@@ -187,7 +185,9 @@ def degrade_view(
     offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
     across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     image = np.asarray(
-        cv2.remap(image, across + offset[..., 0], down + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        cv2.remap(
+            image, across + offset[..., 0], down + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        )
     )
     middle = (slice(STRIDE // 2, None, STRIDE),) * 2
     source = (np.stack([across, down], axis=-1) + offset)[middle] / STRIDE

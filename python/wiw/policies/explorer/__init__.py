@@ -68,6 +68,7 @@ class Explorer(Policy):
         budget: primitives of an episode; with its last segment the agent answers, however sure it is.
 
     Raises:
+        ArgumentError: a labeller that needs the simulator's instance ids.
         BackendError: torch is not installed.
         FileError: the weights cannot be read.
     """
@@ -85,6 +86,11 @@ class Explorer(Policy):
         budget: int = 250,
     ) -> None:
         self.labeller: Labeller = LABELLERS.make(perception)
+        if "ids" in self.labeller.needs:
+            raise ArgumentError(
+                f"explorer: {type(self.labeller).__name__} knows the simulator's instances, which no agent is given; "
+                "policy explorer-oracle is an explorer with true perception"
+            )
         self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
         self.knowledge = load_knowledge()
 
@@ -121,10 +127,16 @@ class Explorer(Policy):
 
     def observe(self, situations: Sequence[Situation]) -> None:
         """Add the real views to the maps, labelled in one batch, and ask them the questions."""
-        cut = [cut_views(own.panorama, own.depth, own.odometry, VIEW_SIZE) for own in (s.observation for s in situations)]
-        labels = self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
+        cut = [
+            cut_views(own.panorama, own.depth, own.odometry, VIEW_SIZE) for own in (s.observation for s in situations)
+        ]
+        labels = self.label_real(situations, cut)
         for i, (situation, views) in enumerate(zip(situations, cut, strict=True)):
             self._add_views(situation, views, _take(labels, 4 * i, 4))
+
+    def label_real(self, situations: Sequence[Situation], cut: Sequence[Views]) -> SceneLabels:
+        """Return the labels of the real views of all episodes, four of each."""
+        return self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
 
     def _add_views(self, situation: Situation, views: Views, labels: SceneLabels) -> None:
         memory, observation = situation.memory, situation.observation
@@ -221,7 +233,9 @@ class Explorer(Policy):
     ) -> list[Answer | TextAnswer | None]:
         """Answer from the map of real views."""
         return [
-            TextAnswer(own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self._is_final(situation))
+            TextAnswer(
+                own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self._is_final(situation)
+            )
             for situation, own in ((situation, situation.memory) for situation in situations)
         ]
 
@@ -271,5 +285,3 @@ def _look_at_surfaces(views: Views, labels: SceneLabels, categories: Sequence[st
                         point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
                         looks.append(Surface(name, point[:2], color, confidence))
     return looks
-
-

@@ -89,9 +89,7 @@ class Home:
     """Probability of the kind that each room is taken for, by the room's name."""
 
 
-def believe_home(
-    objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Surface], knowledge: Knowledge
-) -> Home:
+def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Surface], knowledge: Knowledge) -> Home:
     """Return the home that a map of it shows."""
     seen = [thing for thing in objects.objects if thing.size >= LEAST_SIZE and thing.category_share >= LEAST_SHARE]
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
