@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Active Embodied Question Answering: the protocol, its presets and metrics, and what never reaches a policy."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.action import FORWARD, STOP, TURN_LEFT
+from wiw.datasets.questions import Question
+from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError, ContractError, JudgeError
+from wiw.judging import Judge, Judgement
+from wiw.loop.scheduler import run_episodes
+from wiw.policies.base import Policy
+from wiw.tasks.aeqa import AEQA
+from wiw.types import Answer, Episode, EpisodeResult, Goal, Proposal, TextAnswer
+
+SCENE = "apartments:val/1"
+QUESTION = Question(
+    "What color is the sofa?", "blue", "attribute recognition", "color", template="color", slots={"object": "sofa"}
+)
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    """A question in an apartment, asked from a place with 4 m of floor ahead."""
+    place = world(SCENE)
+    start = place.ground.put_down(place.navmesh.sample(1, 3)[0])
+    sofa = next(each["id"] for each in place.scene.instances if each["category"] == "sofa")
+    info = {"question": {**QUESTION.to_info(), "target": [sofa]}}
+    x, y, z = (float(value) for value in start)
+    return Episode("0000", SCENE, (x, y, z), 0.0, (x, y, z), 0.0, 2.0, info)
+
+
+def make_task(episode: Episode, **options: Any) -> AEQA:
+    task = AEQA(SCENE, **options)
+    task._episodes = [episode]
+    return task
+
+
+def begin(episode: Episode, **options: Any) -> Any:
+    env = make_task(episode, **options).environment()
+    env.begin(episode)
+    return env
+
+
+def final(text: str = "blue") -> TextAnswer:
+    return TextAnswer(text, 0.9, final=True)
+
+
+TURNS = [int(TURN_LEFT)] * 15
+
+
+def test_an_answer_counts_once_another_view_confirms_it(episode):
+    env = begin(episode)
+    assert not env.run(TURNS, final("red")).terminated
+    assert not env.run(TURNS, TextAnswer("red", 0.4)).terminated  # taken back
+    assert not env.run(TURNS, final()).terminated
+    segment = env.run(TURNS, final())
+    assert segment.terminated and len(segment.executed) == 0
+    assert env.result()["success"] == 1 and env.result()["primitives"] == 45
+
+
+def test_on_the_same_view_nothing_is_carried_out_in_between(episode):
+    env = begin(episode, preset="official")
+    first = env.run(TURNS, final("red"))
+    assert len(first.executed) == 0 and not first.terminated
+    assert env.run(TURNS, final()).terminated and env.details()["answer"] == "blue"
+
+
+def test_one_answer_is_enough_where_none_confirms_it(episode):
+    env = begin(episode, confirm="none")
+    assert env.run(TURNS, final()).terminated and env.result()["mark"] == 5
+
+
+def test_primitives_are_limited_in_the_middle_of_a_plan(episode):
+    env = begin(episode, actions=20)
+    assert not env.run(TURNS, TextAnswer()).truncated
+    segment = env.run(TURNS, TextAnswer("blue", 0.3))
+    assert segment.truncated and len(segment.executed) == 5
+    assert env.result()["answered"] == 0 and env.details()["answer"] == ""
+
+
+def test_a_final_answer_that_there_is_no_time_to_confirm_counts(episode):
+    env = begin(episode, actions=15)
+    segment = env.run(TURNS, final("red"))
+    assert segment.truncated and env.result()["answered"] == 1 and env.result()["success"] == 0
+
+
+def test_turns_at_the_start_of_a_segment_are_free_in_the_published_code(episode):
+    env = begin(episode, preset="official", actions=4)
+    segment = env.run([int(TURN_LEFT)] * 6 + [int(FORWARD)] * 3, TextAnswer())
+    assert len(segment.executed) == 9 and not segment.truncated and env.result()["primitives"] == 3
+    segment = env.run([int(TURN_LEFT)] * 2 + [int(FORWARD)] * 3, TextAnswer())
+    assert segment.executed.tolist() == [TURN_LEFT, TURN_LEFT, FORWARD] and segment.truncated
+
+
+def test_an_agent_that_only_turns_for_nothing_comes_to_an_end(episode):
+    env = begin(episode, preset="official", actions=3)
+    ends = [env.run([int(TURN_LEFT)], TextAnswer()).truncated for _ in range(6)]
+    assert ends == [False] * 5 + [True]
+
+
+@pytest.mark.parametrize(
+    ("rule", "mark_is_blind", "spl_counts"),
+    [("blind", True, False), ("blind_with_path", True, True), ("lowest", False, False)],
+)
+def test_episodes_without_an_answer_are_marked_as_the_rules_say(episode, monkeypatch, rule, mark_is_blind, spl_counts):
+    monkeypatch.setattr("wiw.tasks.aeqa.blind_answer", lambda text: "blue")
+    env = begin(episode, actions=1, unanswered=rule)
+    env.run([int(TURN_LEFT)], TextAnswer())
+    found = env.result()
+    assert found["mark"] == (5 if mark_is_blind else 1) and found["answered"] == 0
+    assert found["spl"] == (1.0 if spl_counts else 0.0) and found["success"] == 0
+
+
+def test_spl_is_the_papers(episode):
+    env = begin(episode, confirm="none")
+    env.run([int(FORWARD)] * 12, TextAnswer())
+    env.run([], final("light blue"))
+    found = env.result()
+    assert found["path_length"] > 1.0 and found["shortest"] == 2.0
+    credit = (found["mark"] - 1) / 4
+    assert found["answer_score"] == credit > 0
+    assert found["spl"] == pytest.approx(credit * 2.0 / max(2.0, found["path_length"]))
+
+
+def test_the_anytime_curve_has_the_blind_mark_until_the_answer(episode, monkeypatch):
+    monkeypatch.setattr("wiw.tasks.aeqa.blind_answer", lambda text: "red")
+    env = begin(episode, confirm="none")
+    for _ in range(3):
+        env.run(TURNS, TextAnswer())
+    env.run(TURNS, final())
+    found = env.result()
+    assert [found[f"score_at_{cut}"] for cut in (30, 60, 120, 250)] == [0.0, 1.0, 1.0, 1.0]
+
+
+def test_grounding_says_whether_the_thing_was_in_sight(episode):
+    place = world(SCENE)
+    sofa = next(each for each in place.scene.instances if each["category"] == "sofa")
+    low, high = np.asarray(sofa["bounds"], float)
+    near = place.ground.put_down(place.navmesh.snap([(low[0] + high[0]) / 2, 0.0, (low[2] + high[2]) / 2]))
+    moved = Episode("1", SCENE, tuple(map(float, near)), 0.0, tuple(map(float, near)), 0.0, 1.0, episode.info)
+    hidden = min(
+        (place.ground.put_down(point) for point in place.navmesh.sample(40, 0)),
+        key=lambda point: -np.linalg.norm(point - near),
+    )
+    away = Episode("2", SCENE, tuple(map(float, hidden)), 0.0, tuple(map(float, near)), 0.0, 1.0, episode.info)
+    grounded = []
+    for each in (moved, away):
+        env = begin(each, confirm="none")
+        env.run([], final())
+        grounded.append(env.result()["grounded"])
+    assert grounded == [1.0, 0.0]
+
+
+def test_stopping_ends_without_an_answer_and_an_answer_ends_what_is_stepped(episode):
+    env = begin(episode)
+    assert env.run([int(STOP)], TextAnswer("blue", 0.9)).terminated and env.result()["answered"] == 0
+    stepped = wiw.make("AEQA-v0", scenes=SCENE)
+    stepped.task._episodes = [episode]
+    stepped.reset(options={"episode": 0})
+    stepped.step(int(FORWARD))
+    assert stepped.answer("blue")["success"] == 1
+    with pytest.raises(ArgumentError, match="reply to a question"):
+        stepped.answer(" ")
+
+
+# -- what policies are given and must return ---------------------------------------------------------------------------
+
+
+def test_the_goal_is_the_text_alone(episode):
+    """A canary: no hidden field of a question reaches a policy."""
+    canary = "XYZZY"
+    question = {**QUESTION.to_info(), "answer": canary, "extra_answers": [canary], "slots": {"object": canary}}
+    marked = Episode("0", SCENE, episode.start_position, 0.0, episode.goal_position, 0.0, 2.0, {"question": question})
+    seen: list[Any] = []
+
+    class Spy(Talker):
+        def propose(self, situations, candidates, horizon):
+            seen.extend(situations)
+            return super().propose(situations, candidates, horizon)
+
+    run(make_task(marked, actions=30), Spy(final()), [marked])
+    assert seen and all(each.goal == Goal("aeqa", text=QUESTION.text, question=True) for each in seen)
+    assert not any(canary in repr((each.goal, each.key, each.memory, vars(each.observation))) for each in seen)
+
+
+class Talker(Policy):
+    """Turns, and says the same at every decision."""
+
+    def __init__(self, says: Any) -> None:
+        self.says = says
+
+    def propose(self, situations, candidates, horizon):
+        return [[Proposal(np.full(15, TURN_LEFT, np.int8))] for _ in situations]
+
+    def score(self, situations, proposals, rollouts):
+        return [np.zeros(len(plans)) for plans in proposals]
+
+    def answer(self, situations, proposals, rollouts):
+        return [self.says] * len(situations)
+
+
+class Records:
+    def __init__(self) -> None:
+        self.results: list[EpisodeResult] = []
+        self.answers: list[Any] = []
+
+    def decision(self, record):
+        self.answers.append(record.decision.answer)
+
+    def episode(self, result):
+        self.results.append(result)
+
+    def again(self, episodes):
+        pass
+
+    def record_lost(self, spent):
+        pass
+
+
+def run(task: AEQA, policy: Policy, episodes: list[Episode]) -> Records:
+    sink = Records()
+    agent = wiw.Agent(policy, **{name: value for name, value in task.defaults.items()})
+    run_episodes(task, agent, list(enumerate(episodes)), seed=0, live=2, sink=sink)
+    return sink
+
+
+@pytest.mark.parametrize(
+    ("says", "expected"),
+    [
+        (None, "expected a TextAnswer"),
+        (Answer(("a", "b"), np.array([0.5, 0.5])), "expected a TextAnswer"),
+        (TextAnswer("blue", 1.5), "confidence from 0 to 1"),
+        (TextAnswer("blue", math.nan), "confidence from 0 to 1"),
+        (TextAnswer(" ", 0.5, final=True), "a text in a final answer"),
+    ],
+)
+def test_answers_that_are_none_break_the_contract(episode, says, expected):
+    with pytest.raises(ContractError, match=expected):
+        run(make_task(episode), Talker(says), [episode])
+
+
+def test_a_policy_that_does_not_answer_is_refused(episode):
+    with pytest.raises(ContractError, match="asks for one in words"):
+        run(make_task(episode), wiw.policy("heuristic"), [episode])
+
+
+class Broken(Judge):
+    name = "broken"
+
+    def describe(self):
+        return {"judge": "broken"}
+
+    def _judge_answers(self, references, answers):
+        return [JudgeError("a novel", "huge") if answer == "novel" else Judgement(3, "broken") for answer in answers]
+
+
+def test_an_answer_that_cannot_be_judged_is_an_error_and_no_failure(episode):
+    task = make_task(episode, judge=Broken())
+    sink = run(task, Talker(final("novel")), [episode])
+    assert [(each.status, each.kind) for each in sink.results] == [("error", "judge/huge")]
+    sink = run(task, Talker(final("anything")), [episode])
+    assert [(each.status, each.metrics["answer_score"]) for each in sink.results] == [("done", 0.5)]
+    assert sink.results[0].details["judgement"]["judge"] == "broken"
+
+
+# -- the store ---------------------------------------------------------------------------------------------------------
+
+
+def test_runs_keep_answers_and_judgements_apart_from_numbers(episode, tmp_path):
+    log = wiw.evaluate(make_task(episode), wiw.Agent(Talker(final())), 1, out=tmp_path / "run", progress=False)
+    (outcome,) = log.store.outcomes()
+    assert outcome["details"]["answer"] == "blue" and outcome["details"]["judgement"]["mark"] == 5
+    assert [row["answer"] for row in log.store.decisions()] == [{"label": "blue", "confidence": 0.9, "final": True}] * 2
+    assert log.store.config["task"]["judge"] == make_task(episode).judge.describe()
+    (line,) = log.numbers().arms
+    assert line.estimates["answer_score"].value == 100 and line.estimates["answered"].value == 100
+    assert "blue" in log.report().read_text()
+    json.dumps(make_task(episode).describe())
+
+
+def test_presets_differ_in_what_the_published_code_does():
+    paper, official = AEQA(SCENE), AEQA(SCENE, preset="official")
+    assert paper.defaults == {"candidates": 3, "horizon": 21, "execute": 15} and paper.limit == 250
+    assert official.defaults["execute"] == 50
+    changed = {name for name, value in official.describe().items() if value != paper.describe()[name]}
+    assert changed == {"execute", "confirm", "unanswered", "turns"}
