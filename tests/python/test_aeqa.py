@@ -228,7 +228,7 @@ class Records:
 
 def run(task: AEQA, policy: Policy, episodes: list[Episode]) -> Records:
     sink = Records()
-    agent = wiw.Agent(policy, **{name: value for name, value in task.defaults.items()})
+    agent = wiw.Agent(policy, **task.defaults)
     run_episodes(task, agent, list(enumerate(episodes)), seed=0, live=2, sink=sink)
     return sink
 

@@ -19,6 +19,7 @@ from wiw.mapping.relations import find_around, find_support, hangs_above, is_bes
 from wiw.mapping.views import (
     HFOV_DEG,
     SIZE,
+    VIEW_NAMES,
     VIEW_YAWS_DEG,
     Views,
     cut_labels,
@@ -83,6 +84,21 @@ def test_views_are_what_a_camera_there_would_draw() -> None:
     for view, pose in enumerate(poses):
         np.testing.assert_allclose(tour.to_start(pose[:3, 3]), views.T_start_camera[view, :3, 3], atol=1e-6)
         np.testing.assert_allclose(tour.axes() @ pose[:3, :3], views.T_start_camera[view, :3, :3], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "place"), [("front", (3, 0)), ("left", (0, 3)), ("right", (0, -3)), ("back", (-3, 0))]
+)
+def test_each_view_looks_where_its_name_says(name: str, place: tuple[float, float]) -> None:
+    pixels, depth = project(blank_views(), np.array([[*place, 1.0], [*place, 1.5]]))
+    view = VIEW_NAMES.index(name)
+    np.testing.assert_allclose(pixels[view, 0], [SIZE[1] / 2, SIZE[0] / 2], atol=1e-6)
+    assert depth[view, 0] == pytest.approx(3.0) and pixels[view, 1, 1] < SIZE[0] / 2  # higher is further up
+    panorama = np.zeros((64, 128, 3), np.uint8)
+    column = round(64 - np.degrees(np.arctan2(place[1], place[0])) / 360 * 128) % 128
+    panorama[30:34, [column - 1, column]] = 255
+    views = cut_views(panorama, np.ones((64, 128), np.float32), np.zeros(3))
+    assert views.images[:, SIZE[0] // 2, SIZE[1] // 2, 0].argmax() == view
 
 
 def test_points_come_back_to_their_pixels() -> None:

@@ -69,8 +69,8 @@ def draw_marks(images: NDArray[np.uint8], landmarks: Sequence[Landmark], asked: 
 def place_labels(masks: Mapping[int, NDArray[np.bool_]], spared: Sequence[int] = ()) -> dict[int, LabelBox]:
     """Return where the number of each mask [H, W] stands: no two overlap, and all lie in the picture.
 
-    No other number hides anything of the masks in `spared`, as long as there is room elsewhere. A mask whose number fits nowhere is
-    left out.
+    No other number hides anything of the masks in `spared`, as long as there is room elsewhere. A mask whose number
+    fits nowhere is left out.
     """
     boxes: dict[int, LabelBox] = {}
     filled = [number for number in masks if masks[number].any()]
@@ -85,7 +85,7 @@ def place_labels(masks: Mapping[int, NDArray[np.bool_]], spared: Sequence[int] =
     order = sorted(filled, key=lambda number: (number not in spared, int(masks[number].sum()), number))
     for number in order:
         label = _measure_label(number)
-        box = _place(masks[number], label, taken, kept)
+        box = _place(masks[number], label, taken, kept & ~masks[number] if number in spared else kept)
         if box is not None:
             boxes[number] = box
             taken[box[1] : box[3], box[0] : box[2]] = True
@@ -105,7 +105,7 @@ def _place(
     height, width = mask.shape
     if label[0] > width or label[1] > height:
         return None
-    own, used, spared = _integrate(mask), _integrate(taken), _integrate(taken | (kept & ~mask))
+    own, used, spared = _integrate(mask), _integrate(taken), _integrate(taken | kept)
     most = COVERED * int(mask.sum())
     inside = [_center_box(x, y, label, mask.shape) for x, y in _find_inner_points(mask)]
     for box in inside:

@@ -31,7 +31,7 @@ RADIUS = 0.25
 TURN_COST = 0.05
 """Metres that a turn is worth: enough to prefer straight ways, too little for a detour."""
 START_RADIUS = 0.35
-"""Metres around the agent in which any cell that is not occupied is taken for free: it stands there."""
+"""Metres around the agent in which it may pass closer to obstacles than it fits: it stands there."""
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (2, -1), (1, -2))
 """Steps between cells whose lengths make up distances: sixteen directions, counted both ways."""
 WEIGHT = 1.15
@@ -112,28 +112,47 @@ def measure_distances(grid: OccupancyGrid, pose: NDArray[np.float64]) -> NDArray
     """Return the metres from the agent to each cell, over known floor where it fits: inf where it cannot go."""
     open_ = _open_cells(grid, np.asarray(pose, np.float64))
     here = np.zeros_like(open_)
-    here[_nearest_cell(grid, open_, np.asarray(pose[:2]))] = True
+    here[_find_cell(grid, np.asarray(pose))] = True
     return _distance_field(open_, here)
 
 
 def _route_to_point(grid: OccupancyGrid, pose: NDArray[np.float64], point: NDArray[np.float64], radius: float) -> Route:
-    open_ = _open_cells(grid, pose)
-    start = _nearest_cell(grid, open_, pose[:2])
+    if np.linalg.norm(pose[:2] - point) <= radius:
+        return _simulate(pose, [], True)
+    nearest = _simulate(pose, [], False)
+    for squeeze in (False, True):  # between things only where there is no other way
+        found = _find_route(grid, pose, point, radius, _open_cells(grid, pose, squeeze))
+        if found.reached:
+            return found
+        if _measure_rest(found, point) < _measure_rest(nearest, point) - CELL:
+            nearest = found
+    return nearest
+
+
+def _measure_rest(found: Route, point: NDArray[np.float64]) -> float:
+    return float(np.linalg.norm(found.poses[-1, :2] - point))
+
+
+def _find_route(
+    grid: OccupancyGrid,
+    pose: NDArray[np.float64],
+    point: NDArray[np.float64],
+    radius: float,
+    open_: NDArray[np.bool_],
+) -> Route:
+    """Return the route over the open cells, to the radius or as near as they lead."""
     _, parts = cv2.connectedComponents(open_.view(np.uint8), connectivity=8)
-    cells = np.argwhere(parts == parts[start])
+    cells = np.argwhere(parts == parts[_find_cell(grid, pose)])
     places = grid.to_points(cells)
     away = np.linalg.norm(places - point, axis=1)
     within = away <= radius
-    if np.linalg.norm(pose[:2] - point) <= radius:
-        return _simulate(pose, [], True)
     chosen = np.flatnonzero(within if within.any() else away <= away.min() + CELL / 2)
     visible = _is_in_sight(grid, places[chosen], point)
     goals = np.zeros_like(open_)
     goals[tuple(cells[chosen[visible] if visible.any() else chosen].T)] = True
-    within_reach = point, radius if within.any() else np.inf
-    actions = _search(grid, pose, goals, _distance_field(open_, goals), *within_reach)
+    actions = _search(grid, pose, goals, _distance_field(open_, goals), point, radius if within.any() else np.inf)
     found = _simulate(pose, actions, True)
-    return found if np.linalg.norm(found.poses[-1, :2] - point) <= radius else replace(found, reached=False)
+    return found if _measure_rest(found, point) <= radius else replace(found, reached=False)
 
 
 def _search(
@@ -222,20 +241,25 @@ def _simulate(pose: NDArray[np.float64], actions: list[Any], reached: bool) -> R
     return Route(ids, poses, reached)
 
 
-def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return the cells where the agent fits, and those close around it that are not occupied."""
-    open_ = grid.standable.copy()
-    rows, columns = grid.to_cells(pose[None, :2])
+def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64], squeeze: bool = False) -> NDArray[np.bool_]:
+    """Return the cells where the agent fits, and those close around it that it may leave its place over.
+
+    With `squeeze` those are all that are free, else only those with no obstacle right beside them.
+    """
+    ((row,), (column,)) = grid.to_cells(pose[None, :2])
     reach = int(START_RADIUS / CELL)
-    window = tuple(slice(max(0, int(c[0]) - reach), int(c[0]) + reach + 1) for c in (rows, columns))
-    open_[window] |= grid.free[window] & ~grid.occupied[window]
-    open_[rows, columns] = True
+    window = slice(max(0, row - reach), row + reach + 1), slice(max(0, column - reach), column + reach + 1)
+    size = (1, 1) if squeeze else (3, 3)
+    near = cv2.dilate(grid.occupied.view(np.uint8), cv2.getStructuringElement(cv2.MORPH_CROSS, size))
+    open_ = grid.standable.copy()
+    open_[window] |= grid.free[window] & (near[window] == 0)
+    open_[row, column] = True
     return open_
 
 
-def _nearest_cell(grid: OccupancyGrid, open_: NDArray[np.bool_], point: NDArray[np.float64]) -> tuple[int, int]:
-    rows, columns = grid.to_cells(point[None])
-    return int(rows[0]), int(columns[0])
+def _find_cell(grid: OccupancyGrid, pose: NDArray[np.float64]) -> tuple[int, int]:
+    ((row,), (column,)) = grid.to_cells(pose[None, :2])
+    return int(row), int(column)
 
 
 def _is_in_sight(grid: OccupancyGrid, places: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.bool_]:

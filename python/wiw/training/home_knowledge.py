@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What homes are usually like, counted in train apartments: kinds of rooms, what is in them, what things are made of."""
+"""What homes are usually like, counted in train apartments: kinds of rooms, their contents, materials."""
 
 from __future__ import annotations
 
@@ -40,6 +40,10 @@ def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
             name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())
         },
     }
+
+
+def _find_commonest(counts: Counter[str]) -> str:
+    return min(counts, key=lambda name: (-counts[name], name))
 
 
 def write_knowledge(path: str | Path, apartments: int = APARTMENTS) -> None:

@@ -50,7 +50,7 @@ class Memory:
     objects: ObjectMap
     grid: OccupancyGrid = field(default_factory=OccupancyGrid)
     surfaces: list[Surface] = field(default_factory=list)
-    belief: Belief = Belief("", 0.0)
+    belief: Belief = field(default_factory=lambda: Belief("", 0.0))
     home: Any = None
     expected: NDArray[np.float64] | None = None
     """Where the last segment should have ended: a step that was refused shows in the odometry."""
@@ -151,7 +151,7 @@ class Explorer(Policy):
     # -- plans ---------------------------------------------------------------------------------------------------------
 
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
-        """Return routes to different places worth going to, the best first; a short second look where an answer stands."""
+        """Return routes to different places, the one most worth going to first; a short second look after an answer."""
         return [self._plan(situation, candidates, horizon) for situation in situations]
 
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
@@ -260,7 +260,7 @@ def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
 
 
 def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
-    """Return the views at the end of a rollout, uint8 [V, H, W, 3], and their angle: one where only the front is shown."""
+    """Return the views at the end of a rollout, uint8 [V, H, W, 3] (one where only the front is shown), and their HFOV."""
     end = rollout.frames[-1]
     if rollout.view == "panorama":
         return np.stack([to_perspective(end, VIEW_SIZE, HFOV_DEG, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG

@@ -54,7 +54,7 @@ def list_wanted(question: ParsedQuestion | None) -> tuple[str, ...]:
 
 
 def answer(question: ParsedQuestion | None, text: str, home: Home, grid: OccupancyGrid) -> Belief:
-    """Return what the map says in answer to a question; the most frequent answer to such a text where it says nothing."""
+    """Return what the map says in answer to a question, or the most frequent answer to such a text."""
     fact = None if question is None else find_answer(home.table, question.template, question.slots)
     if question is None or fact is None:
         return Belief(blind_answer(text), 0.0, _locate(home, list_wanted(question)))

@@ -140,7 +140,7 @@ def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Kno
 
 
 def _find_front(thing: MapObject, grid: OccupancyGrid) -> NDArray[np.float64]:
-    """Return the horizontal axis along which the floor beside a thing is most free: furniture has its back to a wall."""
+    """Return the horizontal axis on which the floor beside a thing is most free: furniture stands against walls."""
     low, high = thing.bounds[:, :2]
     middle, half = (low + high) / 2, (high - low) / 2
     best, most = np.array([1.0, 0.0]), -1.0
