@@ -116,10 +116,10 @@ class _Tally:
         self.targets.update((_home(each), each.fact.target[0]) for each in pair if each.fact.target)
 
     def excess(self, pair: Pair, rules: EpisodeRules) -> float:
-        """Return what guessing from the text is worth for a pair, 0 where that would not make it worth too much."""
+        """Return what guessing from the text is worth for a pair, 0 where its category can do with such a pair."""
+        worth = [guess_value(each) for each in self.pairs if each[0].category == pair[0].category]
         value = guess_value(pair)
-        total = sum(guess_value(each) for each in self.pairs)
-        return value if total + value > rules.guessing * (len(self.pairs) + 1) else 0.0
+        return value if sum(worth) + value > rules.guessing * (len(worth) + 1) else 0.0
 
     def admits_yes_no(self, rules: EpisodeRules) -> bool:
         """Return whether one more yes-no question keeps them few."""
@@ -137,7 +137,7 @@ def pair_questions(
     """Return the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
 
     Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, and once
-    the most frequent answers of train apartments are worth as much as `rules.guessing`, pairs with others.
+    the most frequent answers of train apartments are worth `rules.guessing` in a category, pairs with other answers.
     """
     pools = {scene: questions_of(scene, seed, rules, backend) for scene in block}
     candidates = _candidates(pools, core.fold_key([seed, *"/".join(block).encode()]))
