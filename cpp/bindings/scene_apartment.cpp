@@ -54,8 +54,7 @@ void bind_apartment(py::module_& module) {
         return texts;
       },
       py::arg("edits"), "The same edits in one order and spelling. Raises ArgumentError where one is none.");
-  module.def(
-      "color_names", [] { return apartment::color_names(); }, "Names of colours, sorted.");
+  module.def("color_names", [] { return apartment::color_names(); }, "Names of colours, sorted.");
   module.def(
       "apartment_identity",
       [](std::uint64_t seed, const std::string& split) {

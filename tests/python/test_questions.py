@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from wiw import scenes
+from wiw.datasets import episodes as episode_file
 from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.questions import Question, balance, blind, generate, grammar, parse, phrase, twins
 from wiw.datasets.questions.answers import LOOKED_FOR, Fact, differ, find_answer, propose
 from wiw.datasets.questions.colors import name_colors
-from wiw.datasets.questions.facts import BROADER, SMALL, Room, SceneTable, Thing, make_table
+from wiw.datasets.questions.facts import BROADER, SMALL, Room, SceneTable, Thing
 from wiw.datasets.questions.generate import EpisodeRules
 from wiw.datasets.questions.survey import HFOV, YAWS, Survey
 from wiw.datasets.worlds import World, world
@@ -388,6 +390,7 @@ def test_no_text_gives_its_answer_away_in_eight_apartments() -> None:
     assert len(categories) == 7
     assert max(categories.values()) <= 12
     assert len({scene for scene, _ in questions_in(episodes)}) >= 6
+    assert sum(bool(question.twin) for _, question in questions_in(episodes)) >= 6
     for count in (2, 10, 30):
         first = balance.make_episodes(specs, count, 0, RULES, per_scene=8, backend="cpu")
         assert first == episodes[:count]
@@ -397,7 +400,7 @@ def test_no_text_gives_its_answer_away_in_eight_apartments() -> None:
 
 def test_too_few_scenes_are_a_typed_error() -> None:
     with pytest.raises(ArgumentError, match="0 of 4 questions in 1 blocks"):
-        balance.make_episodes(["apartments:val/0"], 4, 0, RULES, backend="cpu")
+        balance.make_episodes(["apartments:val/0"], 4, 0, replace(RULES, twins=0), backend="cpu")
     with pytest.raises(ArgumentError, match="with 12 rooms"):
         balance.make_episodes(["apartments:val/0"], 4, 0, replace(RULES, rooms=12), backend="cpu")
 
@@ -412,62 +415,45 @@ def test_adjacent_colors_and_other_corners_of_a_room_are_no_different_answers() 
 # -- twins -------------------------------------------------------------------------------------------------------------
 
 
-class EditedScene:
-    """Stands for a copy of a scene in which a state or a colour of the table is another one; pictures are the same."""
-
-    def __init__(self, scene: Any, edit: twins.Edit) -> None:
-        field = {"state": "state", "color": "color"}[edit.kind]
-        self.rooms, self.name = scene.rooms, scene.name
-        self.instances = [
-            {**each, "attributes": {**each["attributes"], field: edit.value}} if each["name"] in edit.names else each
-            for each in scene.instances
-        ]
-
-
-@pytest.fixture
-def edited_worlds(monkeypatch: pytest.MonkeyPatch) -> None:
-    def open_world(spec: str, backend: str) -> World:
-        scene, _, edit = spec.partition("?")
-        place = world(scene, "cpu")
-        if not edit:
-            return place
-        return replace(place, name=spec, scene=EditedScene(place.scene, twins.Edit.parse(edit)))  # type: ignore[arg-type]
-
-    monkeypatch.setattr(twins, "world", open_world)
-
-
-def switch_all(spec: str) -> list[str]:
-    """Every lamp of an apartment may be switched."""
-    table = make_table(scenes.open_scene(spec))
-    return [
-        f"state:{each.name.replace(' ', '+')}={'off' if each.state == 'on' else 'on'}"
-        for each in table.things
-        if each.state in ("on", "off")
-    ]
-
-
 def test_a_twin_asks_the_same_from_the_same_start_where_something_else_is_true(
-    edited_worlds: None, asked: list[generate.Answerable]
+    around: generate.Surroundings, asked: list[generate.Answerable]
 ) -> None:
-    lamps = [each for each in asked if each.template in ("switch", "is_state") and each.slots.get("state") != "open"]
-    found = [(each, twins.find_twin(each, 0, RULES, "cpu", switch_all)) for each in lamps[:4]]
-    assert any(twin is not None for _, twin in found)
-    for each, twin in found:
-        assert twin is not None
-        assert (twin.text, twin.start_position, twin.start_yaw) == (each.text, each.start_position, each.start_yaw)
-        assert twin.fact.answer != each.fact.answer
-        assert twin.scene.startswith(f"{each.scene}?state:")
-    sofa = next(each for each in asked if each.category == "spatial understanding")
-    assert twins.find_twin(sofa, 0, RULES, "cpu", switch_all) is None
+    edits = twins.edits_of("apartments:val/0")
+    found = []
+    for template in ("switch", "count_in", "exists", "where"):
+        for each in [each for each in asked if each.template == template and each.fact.answer != "no"][:4]:
+            twin = twins.find_twin(each, around.table, edits, 0, RULES, "cpu")
+            if twin is None:
+                continue
+            found.append(template)
+            assert (twin.text, twin.start_position, twin.start_yaw) == (each.text, each.start_position, each.start_yaw)
+            assert differ(twin.fact, each.fact, each.answer_type)
+            assert twin.scene.startswith(f"{each.scene}?")
+            assert RULES.shortest <= twin.geodesic <= RULES.longest
+    assert {"switch", "exists"} <= set(found)
 
 
-def test_twin_episodes_name_each_other(edited_worlds: None) -> None:
-    pairs = balance.pair_questions(
-        ["apartments:val/0"], 0, replace(RULES, twins=1.0), 8, "cpu", possible_edits=switch_all
-    )
-    assert pairs
+def test_edits_of_other_things_make_no_twin(around: generate.Surroundings, asked: list[generate.Answerable]) -> None:
+    lamp = next(each for each in asked if each.template == "switch" and each.slots["object"] == "ceiling lamp")
+    (name,) = {thing.name for thing in around.table.things if thing.id in lamp.fact.target}
+    edits = [edit for edit in twins.edits_of("apartments:val/0") if edit.kind == "state"]
+    assert twins.may_have_twin(lamp, around.table, edits)
+    assert not twins.may_have_twin(lamp, around.table, [edit for edit in edits if name not in edit.names])
+
+
+def test_an_apartment_without_light_is_the_same_to_walk_and_see(around: generate.Surroundings) -> None:
+    unlit = generate.look_around(twins.open_unlit("apartments:val/0", "cpu"), 0, RULES, around.survey.points[:20])
+    np.testing.assert_array_equal(unlit.survey.shares, around.survey.shares[:20])
+    np.testing.assert_allclose(unlit.survey.distances, around.survey.distances[:20, :20], rtol=1e-12)
+
+
+def test_twin_episodes_name_each_other(tmp_path: Path) -> None:
+    pairs = balance.pair_questions(["apartments:val/0"], 0, replace(RULES, twins=1.0), 8, "cpu")
+    assert len(pairs) == 4
     episodes = [episode for i, pair in enumerate(pairs) for episode in balance.to_episodes(pair, 2 * i)]
-    check_balance([each for each in episodes if each.info["question"]["answer_type"] != "yes_no"])
+    check_balance(episodes)
+    episode_file.save(tmp_path / "twins.json", episodes, "aeqa")
+    assert episode_file.load(tmp_path / "twins.json") == episodes
     by_id = {episode.episode_id: episode for episode in episodes}
     for episode in episodes:
         question = Question.from_info(episode.info["question"])
@@ -485,14 +471,12 @@ def test_an_unknown_edit_is_a_typed_error(text: str) -> None:
         twins.Edit.parse(text)
 
 
-def test_edits_are_previewed_in_the_table() -> None:
-    recolored = twins.Edit.parse("color:bed+1=red").preview(TABLE)
-    assert recolored is not None
-    assert answer("color", recolored, object="bed") == "red"
-    removed = twins.Edit.parse("remove:wardrobe_5").preview(TABLE)
-    assert removed is not None
-    assert answer("exists", removed, object="wardrobe", room="bedroom") == "no"
-    assert twins.Edit.parse("swap:bed 1,wardrobe 5").names == ("bed 1", "wardrobe 5")
+def test_an_edit_names_what_it_changes() -> None:
+    assert twins.Edit.parse("swap:plant_1,floor_lamp_2").names == ("plant 1", "floor lamp 2")
+    assert twins.Edit.parse("state:curtain_2=half_drawn").names == ("curtain 2",)
+    assert twins.edits_of("house.glb") == []
+    with pytest.raises(ArgumentError, match="single apartment"):
+        twins.outline("apartments:val")
 
 
 # -- answers without looking -------------------------------------------------------------------------------------------

@@ -153,7 +153,7 @@ class InstanceBaker {
 
   const Draft& draft_;
   scene::Scene& scene_;
-  const Atlas* atlas_ = nullptr;             // neither atlas nor light: an outline
+  const Atlas* atlas_ = nullptr;  // neither atlas nor light: an outline
   const std::vector<Rgb>* light_ = nullptr;
   std::size_t next_ = 0;
 };

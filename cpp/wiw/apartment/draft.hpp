@@ -47,10 +47,10 @@ struct Object {
   FurnitureShape shape;  // lit at its vertices
   std::vector<Panel> panels;
   bool casts_shadow = true;
-  Rgb color = Rgb::Ones();                   // that the attribute "color" names
-  std::optional<Design> design{};            // of furniture
-  std::int32_t support = scene::kNone;       // index of the object that it stands on
-  float headroom = 0.f;                      // free height above `support`
+  Rgb color = Rgb::Ones();                    // that the attribute "color" names
+  std::optional<Design> design{};             // of furniture
+  std::int32_t support = scene::kNone;        // index of the object that it stands on
+  float headroom = 0.f;                       // free height above `support`
   std::vector<Eigen::AlignedBox3f> leaves{};  // open doors, in its own frame
 };
 
@@ -96,7 +96,8 @@ struct BuiltPiece {
   std::vector<Support> supports;
 };
 /// `state` is one of states_of(category), or empty for the design's own.
-BuiltPiece build_piece(const Design& design, const std::string& state, MaterialTable& materials, const Palette& palette);
+BuiltPiece build_piece(const Design& design, const std::string& state, MaterialTable& materials,
+                       const Palette& palette);
 /// Colour of lamps' light.
 Rgb lamp_color();
 /// Gives each room its share of light for its size.

@@ -17,9 +17,10 @@ namespace {
 
 using Box = Eigen::AlignedBox3f;
 
-constexpr float kHead = 1.5f;      // what hangs higher is in nobody's way
-constexpr float kTouch = 0.01f;    // by which boxes may overlap
-constexpr float kSheer = 0.35f;    // share of daylight that a closed curtain lets through
+constexpr float kHead = 1.5f;     // what hangs higher is in nobody's way
+constexpr float kCounter = 1.2f;  // furniture to put things on is lower
+constexpr float kTouch = 0.01f;   // by which boxes may overlap
+constexpr float kSheer = 0.35f;   // share of daylight that a closed curtain lets through
 
 [[noreturn]] void refuse(const Edit& edit, const std::string& why) {
   throw ArgumentError("edit '" + to_text(edit) + "': " + why);
@@ -97,15 +98,14 @@ Eigen::Affine3f pose_in_place_of(const Object& a, const Object& b) {
 /// Colours that go with an object's main colour, as functions of it.
 const std::vector<std::function<Rgb(const Rgb&)>>& shades() {
   static const std::vector<std::function<Rgb(const Rgb&)>> kShades{
-      [](const Rgb& color) { return color; },
-      [](const Rgb& color) { return Rgb(0.85f * color); },  // lids of boxes
+      [](const Rgb& color) { return color; }, [](const Rgb& color) { return Rgb(0.85f * color); },  // lids of boxes
       [](const Rgb& color) { return lit_shade(color); }};
   return kShades;
 }
 
 bool has_color_of_its_own(const Object& object) {
-  static const std::set<std::string> kOthers{"ceiling lamp", "mirror", "passage",   "photo",      "picture",
-                                             "plant",        "plant pot", "shower", "television", "window"};
+  static const std::set<std::string> kOthers{"ceiling lamp", "mirror",    "passage", "photo",      "picture",
+                                             "plant",        "plant pot", "shower",  "television", "window"};
   return !kOthers.contains(object.category);
 }
 
@@ -161,8 +161,8 @@ class Editor {
       if (label.substr(0, label.rfind('.')) == name) alike.push_back(label);
     }
     if (!alike.empty()) refuse(edit, "there are several; expected " + listed(alike));
-    refuse(edit, "apartment " + split_name(draft_.split) + "/" + std::to_string(draft_.seed) + " has no '" + name + "'" +
-                     did_you_mean(name, labels_));
+    refuse(edit, "apartment " + split_name(draft_.split) + "/" + std::to_string(draft_.seed) + " has no '" + name +
+                     "'" + did_you_mean(name, labels_));
   }
 
   void apply(const Edit& edit) {
@@ -270,8 +270,11 @@ class Editor {
     stand_all(floor, room, {});
     const Rect own = is_on_floor(owner) ? area_under(object(owner), object(owner).pose) : kNowhere;
     if (!floor.inside().contains(area)) return "would hit a wall";
-    if (core.min().y() < kHead && !floor.fits_with(area, own)) return "would be in the way";
-    return {};
+    if (core.min().y() > kHead) return {};
+    const bool low = core.min().y() < kCounter;  // a higher one reaches over what stands below
+    if (low && !floor.fits_with(area, own)) return "would be in the way";
+    floor.stand(area, {});
+    return floor.is_walkable() ? "" : "would be in the way";
   }
 
   void set_state(std::size_t index, const std::string& state) {
@@ -368,7 +371,8 @@ class Editor {
 
   /// Whether the object is the other one or stands on it, directly or not.
   bool belongs_to(std::size_t index, std::size_t owner) {
-    for (auto at = static_cast<std::int32_t>(index); at != scene::kNone; at = object(static_cast<std::size_t>(at)).support) {
+    for (auto at = static_cast<std::int32_t>(index); at != scene::kNone;
+         at = object(static_cast<std::size_t>(at)).support) {
       if (static_cast<std::size_t>(at) == owner) return true;
     }
     return false;
@@ -492,8 +496,9 @@ class Editor {
 bool is_used(const Edit& edit, const std::vector<Edit>& applied) {
   return std::any_of(applied.begin(), applied.end(), [&](const Edit& other) {
     const bool swap = other.kind == EditKind::kSwap;
-    return other.kind == edit.kind && (other.name == edit.name || (swap && (other.name == edit.value ||
-                                       other.value == edit.name || other.value == edit.value)));
+    return other.kind == edit.kind &&
+           (other.name == edit.name ||
+            (swap && (other.name == edit.value || other.value == edit.name || other.value == edit.value)));
   });
 }
 

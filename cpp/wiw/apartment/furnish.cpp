@@ -64,8 +64,8 @@ class Furnisher {
     built.object.headroom = below_.headroom;
     draft_.objects.push_back(std::move(built.object));
     for (const Bulb& bulb : built.bulbs) {
-      draft_.lights.push_back({pose * bulb.position, Vec3::Zero(), Vec3::Zero(), Vec3::Zero(),
-                               bulb.strength * lamp_color(), room_, index});
+      draft_.lights.push_back(
+          {pose * bulb.position, Vec3::Zero(), Vec3::Zero(), Vec3::Zero(), bulb.strength * lamp_color(), room_, index});
     }
     for (const Support& support : built.supports) surfaces_.push_back({support, pose, index, {}});
     below_ = {};
@@ -133,8 +133,7 @@ class Furnisher {
 void number_names(std::vector<Object>& objects) {
   std::map<std::string, int> count;
   for (Object& object : objects) {
-    if (object.name == object.category)
-      object.name.append(1, ' ').append(std::to_string(++count[object.category]));
+    if (object.name == object.category) object.name.append(1, ' ').append(std::to_string(++count[object.category]));
   }
 }
 
@@ -150,8 +149,14 @@ BuiltPiece build_piece(const Design& design, const std::string& state, MaterialT
   make.on = state.empty() ? design.on : state == "on";
   make.state = state;
   category.make(make);
-  Object object{category.name, category.name, std::move(make.attributes), design.room, Eigen::Affine3f::Identity(),
-                std::move(make.shape), {}, make.casts_shadow};
+  Object object{category.name,
+                category.name,
+                std::move(make.attributes),
+                design.room,
+                Eigen::Affine3f::Identity(),
+                std::move(make.shape),
+                {},
+                make.casts_shadow};
   object.color = make.main_color;
   object.design = design;
   object.leaves = std::move(make.leaves);

@@ -163,10 +163,7 @@ void add_skirting(Object& object, const Chart& chart, MaterialId material, float
 void add_walls(Draft& draft, std::int32_t room) {
   const PlanRoom& plan = draft.plan.rooms[static_cast<std::size_t>(room)];
   const RoomLook& look = draft.palette.rooms[static_cast<std::size_t>(room)];
-  Object walls{"walls of " + plan.name,
-               "wall",
-               {},
-               room};
+  Object walls{"walls of " + plan.name, "wall", {}, room};
   walls.color = look.walls == WallStyle::kFullTiles ? look.accent : look.wall;
   walls.attributes["color"] = color_name(walls.color);
   walls.shape.set_edge(0.3f);

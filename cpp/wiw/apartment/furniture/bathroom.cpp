@@ -175,11 +175,11 @@ void make_washing_machine(Make& m) {
       before * Eigen::Translation3f(0, 0.42f, hz - 0.022f) * Eigen::AngleAxisf(kTurn / 4, Vec3::UnitX());
   if (open) {  // the dark drum in its ring, and the door beside it
     m.shape.set_frame(port);
-    m.shape.lathe(m.plain("metal", {0.55f, 0.56f, 0.58f}), Vec3::Zero(), {{0.21f, 0}, {0.21f, 0.012f}, {0.175f, 0.012f}},
-                  28);
+    m.shape.lathe(m.plain("metal", {0.55f, 0.56f, 0.58f}), Vec3::Zero(),
+                  {{0.21f, 0}, {0.21f, 0.012f}, {0.175f, 0.012f}}, 28);
     m.shape.lathe(m.plain("metal", {0.07f, 0.07f, 0.08f}), Vec3::Zero(), {{0.178f, 0.006f}, {0, 0.005f}}, 24);
-    m.shape.set_frame(
-        open_leaf(m, {-0.24f, hz + 0.02f}, {-0.22f, 0.2f, hz - 0.022f}, {0.22f, 0.64f, hz + 0.02f}) * port);
+    m.shape.set_frame(open_leaf(m, {-0.24f, hz + 0.02f}, {-0.22f, 0.2f, hz - 0.022f}, {0.22f, 0.64f, hz + 0.02f}) *
+                      port);
   } else {
     m.shape.set_frame(port);
   }

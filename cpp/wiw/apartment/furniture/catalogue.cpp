@@ -477,14 +477,20 @@ std::size_t category_index(const std::string& name) {
 
 const std::vector<std::string>& states_of(const std::string& category) {
   static const std::vector<std::string> kLit{"off", "on"}, kHinged{"closed", "open"};
-  static const std::map<std::string, std::vector<std::string>> kStates{
-      {"candles", kLit},         {"ceiling lamp", kLit},
-      {"floor lamp", kLit},      {"laptop", kLit},
-      {"pendant lamp", kLit},    {"table lamp", kLit},
-      {"television", kLit},      {"curtain", {"closed", "half drawn", "open"}},
-      {"kitchen cabinet", kHinged}, {"refrigerator", kHinged},
-      {"shower", kHinged},       {"toilet", kHinged},
-      {"wardrobe", kHinged},     {"washing machine", {"off", "open"}}};
+  static const std::map<std::string, std::vector<std::string>> kStates{{"candles", kLit},
+                                                                       {"ceiling lamp", kLit},
+                                                                       {"floor lamp", kLit},
+                                                                       {"laptop", kLit},
+                                                                       {"pendant lamp", kLit},
+                                                                       {"table lamp", kLit},
+                                                                       {"television", kLit},
+                                                                       {"curtain", {"closed", "half drawn", "open"}},
+                                                                       {"kitchen cabinet", kHinged},
+                                                                       {"refrigerator", kHinged},
+                                                                       {"shower", kHinged},
+                                                                       {"toilet", kHinged},
+                                                                       {"wardrobe", kHinged},
+                                                                       {"washing machine", {"off", "open"}}};
   static const std::vector<std::string> kNone;
   const auto found = kStates.find(category);
   return found == kStates.end() ? kNone : found->second;

@@ -33,7 +33,7 @@ struct Make {
   Rng& rng;
   MaterialTable& materials;
   const RoomLook& look;
-  bool on = false;    // lamps and screens
+  bool on = false;      // lamps and screens
   std::string state{};  // that an edit asks for, one of states_of(); empty: the design's own
   FurnitureShape shape{};
   std::vector<Support> supports;

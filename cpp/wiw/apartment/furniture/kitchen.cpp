@@ -183,9 +183,10 @@ void make_refrigerator(Make& m) {
   }
   for (const Door& door : doors) {
     m.shape.set_frame(door.open ? turned : before);
-    m.shape.tube(m.chrome(),
-                 {{x, door.handle0, hz}, {x, door.handle0, hz + 0.035f}, {x, door.handle1, hz + 0.035f}, {x, door.handle1, hz}},
-                 0.01f, 8);
+    m.shape.tube(
+        m.chrome(),
+        {{x, door.handle0, hz}, {x, door.handle0, hz + 0.035f}, {x, door.handle1, hz + 0.035f}, {x, door.handle1, hz}},
+        0.01f, 8);
   }
   m.shape.set_frame(before);
   if (open) add_larder(m, body, {-hx, lower ? 0.04f : cut, -hz}, {hx, lower ? cut : h, hz - 0.06f});
@@ -221,7 +222,8 @@ void make_wall_cabinet(Make& m) {
   else
     m.shape.box(style.carcass, {-hx, 0, -hz}, {hx, m.h(), hz - 0.02f});
   add_fronts(m, style.front, m.chrome(), {-hx, 0, hz - 0.02f}, {hx, m.h(), hz}, columns, 1, false, open ? columns : 0);
-  if (open) add_crockery(m, style.carcass, {-hx + 0.018f, 0.018f, -hz + 0.01f}, {hx - 0.018f, m.h() - 0.018f, hz - 0.03f});
+  if (open)
+    add_crockery(m, style.carcass, {-hx + 0.018f, 0.018f, -hz + 0.01f}, {hx - 0.018f, m.h() - 0.018f, hz - 0.03f});
   m.attributes["state"] = open ? "open" : "closed";
 }
 

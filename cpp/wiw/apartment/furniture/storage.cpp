@@ -7,8 +7,8 @@ Eigen::Affine3f open_leaf(Make& m, const Vec2& hinge, const Vec3& low, const Vec
   constexpr float kAngle = 1.48f;  // 85 degrees: a leaf in a corner stays clear of the wall
   const bool left = hinge.x() < 0.5f * (low.x() + high.x());
   const Vec3 pivot(hinge.x(), 0.f, hinge.y());
-  const Eigen::Affine3f turn = Eigen::Translation3f(pivot) *
-                               Eigen::AngleAxisf(left ? -kAngle : kAngle, Vec3::UnitY()) * Eigen::Translation3f(-pivot);
+  const Eigen::Affine3f turn = Eigen::Translation3f(pivot) * Eigen::AngleAxisf(left ? -kAngle : kAngle, Vec3::UnitY()) *
+                               Eigen::Translation3f(-pivot);
   m.leaves.push_back(Eigen::AlignedBox3f(low, high).transformed(turn));
   return turn;
 }
@@ -24,8 +24,7 @@ void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, co
       const Vec3 a = low + Vec3(w * static_cast<float>(c) + 0.004f, h * static_cast<float>(r) + 0.004f, 0.f);
       const Vec3 b(a.x() + w - 0.008f, a.y() + h - 0.008f, high.z());
       const bool hung_left = c % 2 == 0 && columns > 1;
-      if (c < open_columns)
-        m.shape.set_frame(before * open_leaf(m, {hung_left ? a.x() : b.x(), high.z()}, a, b));
+      if (c < open_columns) m.shape.set_frame(before * open_leaf(m, {hung_left ? a.x() : b.x(), high.z()}, a, b));
       m.shape.soft_box(front, a, b, 0.006f, 0.f, 1);
       const float x = drawers ? 0.5f * (a.x() + b.x()) : hung_left ? b.x() - 0.04f : a.x() + 0.04f;
       const float y = drawers ? a.y() + 0.7f * h : (a.y() > 0.9f ? a.y() + 0.12f : std::min(b.y() - 0.14f, 1.05f));
@@ -128,7 +127,8 @@ void make_wardrobe(Make& m) {
     const float w = m.w() / static_cast<float>(doors);
     const Eigen::Affine3f before = m.shape.frame();
     if (open)  // on the second door
-      m.shape.set_frame(before * open_leaf(m, {-hx + 2.f * w - 0.004f, hz}, {-hx + w, split, hz}, {-hx + 2.f * w, h, hz}));
+      m.shape.set_frame(before *
+                        open_leaf(m, {-hx + 2.f * w - 0.004f, hz}, {-hx + w, split, hz}, {-hx + 2.f * w, h, hz}));
     m.shape.box(m.plain("mirror", {0.75f, 0.8f, 0.83f}), {-hx + w * 1.f + 0.05f, split + 0.12f, hz},
                 {-hx + w * 2.f - 0.06f, h - 0.12f, hz + 0.003f});
     m.shape.set_frame(before);

@@ -25,7 +25,7 @@ from wiw.datasets.questions.facts import make_table
 from wiw.datasets.questions.generate import DEFAULT_RULES, Answerable, Backend, EpisodeRules, questions_of
 from wiw.datasets.questions.question import CATEGORIES
 from wiw.datasets.questions.survey import place_key
-from wiw.datasets.questions.twins import Edit, PossibleEdits, find_twin, may_have_twin
+from wiw.datasets.questions.twins import edits_of, find_twin, may_have_twin, outline
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.types import Episode
@@ -51,11 +51,8 @@ def make_episodes(
     *,
     per_scene: int = 8,
     backend: Backend = "auto",
-    possible_edits: PossibleEdits | None = None,
 ) -> list[Episode]:
     """Return the first `count` episodes of scenes that are named by single specs.
-
-    `possible_edits` says what copies of a scene can be made; without it there are no twins.
 
     Raises:
         ArgumentError: the scenes have too few questions, or too few rooms; says how many.
@@ -64,7 +61,7 @@ def make_episodes(
     blocks = 0
     for block in compose_blocks(scenes, rules):
         blocks += 1
-        for pair in pair_questions(block, seed, rules, per_scene, backend, possible_edits):
+        for pair in pair_questions(block, seed, rules, per_scene, backend):
             made += to_episodes(pair, len(made))
             if len(made) >= count:
                 return made[:count]
@@ -79,13 +76,18 @@ def compose_blocks(scenes: Sequence[str], rules: EpisodeRules) -> Iterator[list[
     """Yield blocks of scenes that have enough rooms, in their order; the last may be smaller."""
     block: list[str] = []
     for scene in scenes:
-        if len(scene_specs.open_scene(scene).rooms) >= rules.rooms:
+        if _count_rooms(scene) >= rules.rooms:
             block.append(scene)
         if len(block) == BLOCK:
             yield block
             block = []
     if block:
         yield block
+
+
+def _count_rooms(scene: str) -> int:
+    """Return the number of rooms of a scene, without baking the light of one that has too few."""
+    return len((outline(scene) if scene_specs.is_generated(scene) else scene_specs.open_scene(scene)).rooms)
 
 
 def to_episodes(pair: Pair, first: int) -> list[Episode]:
@@ -114,10 +116,10 @@ class _Tally:
         self.targets.update((_home(each), each.fact.target[0]) for each in pair if each.fact.target)
 
     def excess(self, pair: Pair, rules: EpisodeRules) -> float:
-        """Return what guessing from the text is worth for a pair, 0 where that would not make it worth too much."""
+        """Return what guessing from the text is worth for a pair, 0 where its category can do with such a pair."""
+        worth = [guess_value(each) for each in self.pairs if each[0].category == pair[0].category]
         value = guess_value(pair)
-        total = sum(guess_value(each) for each in self.pairs)
-        return value if total + value > rules.guessing * (len(self.pairs) + 1) else 0.0
+        return value if sum(worth) + value > rules.guessing * (len(worth) + 1) else 0.0
 
     def admits_yes_no(self, rules: EpisodeRules) -> bool:
         """Return whether one more yes-no question keeps them few."""
@@ -131,22 +133,21 @@ def pair_questions(
     rules: EpisodeRules,
     per_scene: int,
     backend: Backend = "auto",
-    possible_edits: PossibleEdits | None = None,
 ) -> list[Pair]:
     """Return the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
 
     Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, and once
-    the most frequent answers of train apartments are worth as much as `rules.guessing`, pairs with others.
+    the most frequent answers of train apartments are worth `rules.guessing` in a category, pairs with other answers.
     """
     pools = {scene: questions_of(scene, seed, rules, backend) for scene in block}
     candidates = _candidates(pools, core.fold_key([seed, *"/".join(block).encode()]))
     shares = _answer_shares(pools)
     tally = _Tally()
     wanted = len(block) * per_scene // 2
-    spacing = round(1 / rules.twins) if possible_edits is not None and rules.twins > 0 else 0
+    spacing = round(1 / rules.twins) if rules.twins > 0 else 0
     while len(tally.pairs) < wanted:
         twins = spacing and len(tally.pairs) % spacing == spacing - 1
-        pair = _next_twins(pools, tally, seed, rules, backend, possible_edits) if twins and possible_edits else None
+        pair = _next_twins(pools, tally, seed, rules, backend) if twins else None
         pair = pair or _next_pair(candidates, tally, shares, rules, per_scene)
         if pair is None:
             break
@@ -218,12 +219,11 @@ def _next_twins(
     seed: int,
     rules: EpisodeRules,
     backend: Backend,
-    possible_edits: PossibleEdits,
 ) -> Pair | None:
     """Return a question and its twin, of the scene that has fewest, if one of a few questions tried has a twin."""
     scene = min(pools, key=lambda each: (tally.counts[each], list(pools).index(each)))
     table = make_table(world(scene, backend).scene, scene)
-    edits = [Edit.parse(text) for text in possible_edits(scene)]
+    edits = edits_of(scene)
     free = [
         each
         for each in pools[scene]
@@ -238,7 +238,7 @@ def _next_twins(
     for i in order:
         if not may_have_twin(free[i], table, edits):
             continue
-        twin = find_twin(free[i], seed, rules, backend, possible_edits)
+        twin = find_twin(free[i], table, edits, seed, rules, backend)
         if twin is not None:
             return free[i], twin
         tried += 1

@@ -6,25 +6,26 @@ Who answers both rightly has looked; no prior of homes, and no memory of the apa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from wiw import scenes
 from wiw._core import core
 from wiw.datasets.questions.answers import differ, find_answer
-from wiw.datasets.questions.facts import SceneTable, Thing, make_table
+from wiw.datasets.questions.facts import SceneTable, make_table
 from wiw.datasets.questions.generate import Answerable, Backend, EpisodeRules, look_around
 from wiw.datasets.questions.survey import choose_places, place_key
-from wiw.datasets.worlds import world
+from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
-
-PossibleEdits = Callable[[str], Sequence[str]]
-"""Returns the edits that the generator can do to a scene, each as it is written behind "?" in a scene's spec."""
+from wiw.nav import Ground, NavMesh
+from wiw.render import Renderer
 
 KINDS = ("color", "state", "remove", "swap")
-TRIES = 3
-"""Edits of a question that are generated, each in seconds, before another question is taken."""
+TRIES = 4
+"""Edits of a question whose copies are looked at before it has no twin."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +33,10 @@ class Edit:
     """One difference between a scene and its copy."""
 
     text: str
-    """As in the copy's spec, such as "state:ceiling+lamp+1=off"."""
+    """As in the copy's spec, such as "state:ceiling_lamp_1=off"."""
     kind: str
     names: tuple[str, ...]
     """Of the instances that it changes."""
-    value: str = ""
-    """What a colour or state becomes."""
 
     @classmethod
     def parse(cls, text: str) -> Edit:
@@ -47,67 +46,68 @@ class Edit:
             ArgumentError: it is none.
         """
         kind, colon, rest = text.partition(":")
-        plain = rest.replace("+", " ").replace("_", " ").replace("%20", " ")
-        name, equals, value = plain.partition("=")
+        name, equals, _ = rest.replace("+", " ").replace("_", " ").partition("=")
         if kind not in KINDS or not colon or bool(equals) != (kind in ("color", "state")):
             raise ArgumentError(
                 f"edit '{text}': expected color:<instance>=<color>, state:<instance>=<state>, remove:<instance> or "
                 "swap:<instance>,<instance>"
             )
-        names = tuple(each.strip() for each in name.split(",")) if kind == "swap" else (name,)
-        return cls(text, kind, names, value)
+        return cls(text, kind, tuple(name.split(",")))
 
-    def preview(self, table: SceneTable) -> SceneTable | None:
-        """Return the table that the edited scene will have, or None where only the scene itself tells it."""
-        if self.kind == "swap":
-            return None
-        things: list[Thing] = []
-        for thing in table.things:
-            if thing.name not in self.names:
-                things.append(thing)
-            elif self.kind == "color":
-                things.append(replace(thing, color=self.value))
-            elif self.kind == "state":
-                things.append(replace(thing, state=self.value))
-        return replace(table, things=tuple(things))
+
+def edits_of(scene: str) -> list[Edit]:
+    """Return the edits that can be made to a scene; none to one from a file."""
+    return [Edit.parse(text) for text in scenes.possible_edits(scene)] if scenes.is_generated(scene) else []
 
 
 def find_twin(
-    question: Answerable, seed: int, rules: EpisodeRules, backend: Backend, possible_edits: PossibleEdits
+    question: Answerable, table: SceneTable, edits: Sequence[Edit], seed: int, rules: EpisodeRules, backend: Backend
 ) -> Answerable | None:
-    """Return the same question from the same start in an edited copy of its scene where the answer differs, if any."""
-    place = world(question.scene, backend)
-    table = make_table(place.scene, place.name)
-    edits = [Edit.parse(text) for text in possible_edits(question.scene)]
+    """Return the same question from the same start in an edited copy of its scene where the answer differs, if any.
+
+    Copies are looked at without their light, which takes seconds to bake, unless the question is about a colour.
+    """
+    key = place_key(seed, question.scene)
     hopeful = list(_hopeful(question, table, edits))
-    draws = core.uniform(
-        core.fold_key([place_key(seed, question.scene), 0x7F1A, *question.text.encode()]), len(hopeful)
-    )
-    points = choose_places(place, rules.places, place_key(seed, question.scene))
+    draws = core.uniform(core.fold_key([key, 0x7F1A, *question.text.encode()]), len(hopeful))
+    points = None
     for i in np.argsort(draws, kind="stable")[:TRIES]:
-        copy = world(f"{question.scene}?{hopeful[i].text}", backend)
-        # Points that the edit has made unreachable stay, at an infinite distance, so that the start keeps its index.
+        spec = f"{question.scene}?{hopeful[i].text}"
+        copy = world(spec, backend) if question.fact.colored else open_unlit(spec, backend)
+        if points is None:
+            points = choose_places(world(question.scene, backend), rules.places, key)
         twin = look_around(copy, seed, rules, points).ask(question.template, question.slots, question.start)
         if twin is not None and differ(question.fact, twin.fact, question.answer_type):
-            return replace(twin, start_yaw=question.start_yaw, start_position=question.start_position)
+            return replace(twin, start_position=question.start_position)
     return None
 
 
+def open_unlit(spec: str, backend: Backend) -> World:
+    """Return the world of an apartment without light: all is where it is, and only colours are not to be trusted."""
+    scene = outline(spec)
+    return World(spec, scene, Renderer(scene, backend=backend), NavMesh.build(scene), Ground(scene), backend)
+
+
+def outline(spec: str) -> scenes.Scene:
+    """Return an apartment's scene without its light."""
+    base, _, edits = spec.partition("?")
+    match = re.fullmatch(scenes.APARTMENTS, base)
+    if match is None or match[4] is None:
+        raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7")
+    return scenes.apartment_table(int(match[4]), match[1], edits=edits.split("&") if edits else ())
+
+
 def may_have_twin(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> bool:
-    """Return whether some edit may change the answer of a question; only the edited scene tells for sure."""
+    """Return whether some edit changes the answer of a question; where it can be seen from is another matter."""
     return next(_hopeful(question, table, edits), None) is not None
 
 
 def _hopeful(question: Answerable, table: SceneTable, edits: Sequence[Edit]) -> Iterator[Edit]:
-    """Yield the edits that change the answer, as far as tables tell, without changing the kind of question."""
+    """Yield the edits of what a question is about that change its answer."""
     names = {thing.name for thing in table.things if thing.id in question.fact.target}
     for edit in edits:
-        if not names & set(edit.names):
+        if not names & set(edit.names) or (edit.kind == "color" and not question.fact.colored):
             continue
-        preview = edit.preview(table)
-        if preview is None:
-            yield edit
-            continue
-        fact = find_answer(preview, question.template, question.slots)
+        fact = find_answer(make_table(outline(f"{question.scene}?{edit.text}")), question.template, question.slots)
         if fact is not None and differ(question.fact, fact, question.answer_type):
             yield edit
