@@ -130,7 +130,13 @@ class InstanceBaker {
   /// Vertex colours hold half the light, since they cannot exceed 1; the full-bright lightmap doubles it.
   std::uint32_t add_part(const Submesh& part) {
     scene::Mesh mesh = to_mesh(part);
-    if (light_ == nullptr) return store(std::move(mesh));
+    if (light_ == nullptr) {
+      std::vector<Bytes4> tints;
+      for (const Rgb& tint : part.tint)
+        tints.emplace_back(to_byte(tint.x()), to_byte(tint.y()), to_byte(tint.z()), std::uint8_t{255});
+      mesh.colors = std::move(tints);
+      return store(std::move(mesh));
+    }
     const bool emissive = draft_.materials.finish(part.material).emissive;
     std::vector<Bytes4> colors;
     for (const Rgb& tint : part.tint) {
