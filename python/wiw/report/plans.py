@@ -34,11 +34,11 @@ class Primitives:
 
     def observation(self, jpeg: bytes, album: Album) -> bytes:
         """Return the observation as WebP bytes for the album."""
-        return cuts.panorama(jpeg, album.panorama_width, album.quality)
+        return cuts.panorama(jpeg, album.panorama_width, album.quality, album.scale)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
         """Return an imagined or true future as WebP bytes for the album."""
-        return cuts.strip(jpeg, frames, album.frame_height, album.quality)
+        return cuts.strip(jpeg, frames, album.frame_height, album.quality, album.scale)
 
 
 class Numbers(Primitives):
@@ -71,11 +71,11 @@ class Poses:
 
     def observation(self, jpeg: bytes, album: Album) -> bytes:
         """Return the camera image as WebP bytes for the album."""
-        return cuts.front(jpeg, album.front_side, album.quality)
+        return cuts.front(jpeg, album.front_side, album.quality, album.scale)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
         """Return an imagined or true future as WebP bytes: every frame without a gap, or the last one."""
-        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole)
+        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole, album.scale)
 
 
 def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:

@@ -15,7 +15,7 @@ from typing import Any
 
 from wiw._core import core
 from wiw.files import whole_folder
-from wiw.report.episodes import outcomes_by_episode, read_story, wording
+from wiw.report.episodes import outcomes_by_episode, read_story, title, wording
 from wiw.report.plots import arm_colors
 from wiw.report.story import Album, Picture, Story, final_answer, place, where
 from wiw.report.templating import environment
@@ -170,7 +170,7 @@ def _episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any
 def _common(run: Run) -> dict[str, Any]:
     task = run.store.config["task"]
     return {
-        "title": f"{task.get('task', 'run')} · {run.path.name}",
+        "title": title(run),
         "arms": run.arms,
         "colors": arm_colors(run.arms),
         "radius": task.get("radius"),

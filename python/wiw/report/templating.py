@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from datetime import datetime, timezone
 from functools import cache
 from importlib.resources import files
 
@@ -27,7 +28,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
-    made.filters["asset"] = _read_asset
+    made.filters |= {"asset": _read_asset, "minute": _minute, "counted": _count_noun}
     made.tests |= {"binding": _binding, "known": _is_known}
     return made
 
@@ -40,6 +41,17 @@ def format_signed(value: float) -> str:
 def _number(value: float) -> str:
     """Return two digits, with a true minus sign."""
     return f"{value:.2f}".replace("-", "\u2212")
+
+
+def _minute(time: str) -> str:
+    """Return e.g. "2026-11-22 18:06 UTC" of a time in ISO format."""
+    return datetime.fromisoformat(time).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _count_noun(nouns: str, count: float) -> str:
+    """Return e.g. "1 consultation" or "3 real frames" of a count named "consultations" or "real_frames"."""
+    noun = nouns.replace("_", " ")
+    return f"{count:g} {noun.removesuffix('s') if count == 1 else noun}"
 
 
 def _how(estimate: Estimate) -> str:

@@ -69,7 +69,7 @@ class Manipulation(ManipulationSpec, Task):
     space = GRIPPER_POSES
     has_guide = True
     sensor_options = ("size", "cameras", "ids", "cloud", "grid")
-    wording = Wording("did what it was told", "done", "not done", "what is left", asked="Told", steps="decisions")
+    wording = Wording("completed the task", "done", "not done", "what is left", asked="Instruction", steps="decisions")
 
     def __init__(
         self,
