@@ -25,6 +25,10 @@ __all__ = [
 ]
 
 
+for _error in (ArgumentError, BackendError, Error, FileError, NavigationError):
+    _error.__module__ = __name__  # tracebacks name the module that users import them from
+
+
 def asks_to_stop(error: BaseException) -> bool:
     """Return whether an exception stops the process itself: Ctrl-C, or one of wiw's own for a signal.
 

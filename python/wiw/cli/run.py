@@ -157,8 +157,8 @@ def resume(
     return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors), run), report)
 
 
-def finish(log: Any, report: bool) -> int:
-    """Print tables and errors, write the report; return 1 if the run is invalid."""
+def finish(log: Any, report: bool, remark: str = "") -> int:
+    """Print tables and errors, write the report, with a remark; return 1 if the run is invalid."""
     from wiw.report.tables import print_fidelity
 
     numbers = log.summary()
@@ -175,7 +175,7 @@ def finish(log: Any, report: bool) -> int:
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
     if report:
-        print(f"report  {log.report()}")
+        print(f"report  {log.report(remark=remark)}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0
 

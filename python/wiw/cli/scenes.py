@@ -40,11 +40,12 @@ def scenes(
     if len(names) > LIMIT:
         print(f"{spec} names {len(names)} scenes; showing the first {LIMIT}")
         names = names[:LIMIT]
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in ("scene", "size m", "triangles", "objects", "kinds", "rooms", "walk m2", "islands"):
-        table.add_column(
-            column, justify="left" if column == "scene" else "right", no_wrap=column in ("scene", "size m")
-        )
+        if column == "scene":
+            table.add_column(column, overflow="fold")
+        else:
+            table.add_column(column, justify="right", no_wrap=True, min_width=len(column))
     rows = []
     for name in names:
         place = _load(name, backend)

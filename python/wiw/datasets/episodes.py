@@ -103,7 +103,8 @@ def read_json(path: str | Path) -> Any:
             )
         return parse_json(raw)
     except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise FileError(f"{path}: {error}") from error
+        cause = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)  # strerror: no path again
+        raise FileError(f"{path}: {cause}") from error
 
 
 def _episode(item: Any, where: str) -> Episode:

@@ -30,7 +30,9 @@ SCALES = (1.0, 0.85, 0.7, 0.6)
 """Sizes of pictures that are tried for a report of limited size; below the last, frames are hard to make out."""
 
 
-def write_report(run: Run, path: Path, *, episodes: int | None = None, max_mb: float | None = None) -> Path:
+def write_report(
+    run: Run, path: Path, *, episodes: int | None = None, max_mb: float | None = None, remark: str = ""
+) -> Path:
     """Write a run's report and return its path.
 
     Args:
@@ -40,19 +42,21 @@ def write_report(run: Run, path: Path, *, episodes: int | None = None, max_mb: f
         max_mb: most megabytes (10^6 bytes) of the file; pictures are made smaller, then episodes left out, until it
             fits.
 
+        remark: sentence that the page shows below the result.
+
     Raises:
         ArgumentError: a number out of range, or less than the tables and plots take.
         FileError: the file cannot be written; what was there before is kept.
     """
     if episodes is not None and episodes < 0:
         raise ArgumentError(f"report: expected episodes of at least 0, got {episodes}")
-    page = render(run, episodes) if max_mb is None else _render_within(run, episodes, max_mb)
+    page = render(run, episodes, remark=remark) if max_mb is None else _render_within(run, episodes, max_mb, remark)
     with whole_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 
 
-def _render_within(run: Run, episodes: int | None, max_mb: float) -> str:
+def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -> str:
     """Return the report with as many episodes, and then as large pictures, as `max_mb` megabytes hold."""
 
     def fits(page: str) -> bool:
@@ -60,10 +64,10 @@ def _render_within(run: Run, episodes: int | None, max_mb: float) -> str:
 
     pictured = len(choose_pictured_episodes(run.store))
     for count in range(pictured if episodes is None else min(episodes, pictured), 0, -1):
-        smallest = render(run, count, SCALES[-1])
+        smallest = render(run, count, SCALES[-1], remark)
         if fits(smallest):
-            return next(filter(fits, (render(run, count, scale) for scale in SCALES[:-1])), smallest)
-    bare = render(run, 0)
+            return next(filter(fits, (render(run, count, scale, remark) for scale in SCALES[:-1])), smallest)
+    bare = render(run, 0, remark=remark)
     if not fits(bare):
         size = len(bare.encode()) / 10**6
         raise ArgumentError(
@@ -72,13 +76,14 @@ def _render_within(run: Run, episodes: int | None, max_mb: float) -> str:
     return bare
 
 
-def render(run: Run, episodes: int | None = None, scale: float = 1.0) -> str:
+def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: str = "") -> str:
     """Return a run's report as self-contained HTML. All text from the run is escaped.
 
     Args:
         run: to be reported.
         episodes: how many to show with pictures; all that kept them if not given.
         scale: of the pictures of decisions.
+        remark: sentence that the page shows below the result.
     """
     summary, config, info = summarise_run(run), run.store.config, run.store.info
     album = Album(scale)
@@ -96,6 +101,7 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0) -> str:
             version=run.store.wiw_version,
             words=wording(run.store),
             whole=Album.whole,
+            remark=remark,
             sentence=sentence(summary, wording(run.store)),
             plots=_plots(run, summary, truths, blamed),
             stories=shown,

@@ -10,7 +10,7 @@ from typing import Any
 from wiw.errors import Error, InfrastructureError, StoreError
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
-from wiw.runs.progress import Tracker, make_board
+from wiw.runs.progress import ArmProgress, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
 from wiw.runs.scene_map import draw_scene_maps
@@ -99,7 +99,7 @@ def run_pending(
         for arm, indices in pending.items():
             store.discard(arm, indices)
         built = task.build()
-        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, built.decisions, board))
+        desk = _Desk(store, Tracker(_count_ended(store, pending), built.decisions, board))
         _run_jobs(plan, episodes, pending, desk, workers)
         drop_spare_pictures(store)
         draw_scene_maps(store, built)
@@ -107,6 +107,17 @@ def run_pending(
     finally:
         board.close()
         store.close()
+
+
+def _count_ended(store: RunStore, pending: Mapping[str, list[int]]) -> dict[str, ArmProgress]:
+    """Return how far each arm is, so that a run that goes on counts from where it was stopped."""
+    found = {arm: ArmProgress(len(indices)) for arm, indices in pending.items()}
+    for row in store.outcomes():
+        if row["arm"] in found:
+            found[row["arm"]].count(row["status"], row["metrics"])
+    for progress in found.values():
+        progress.total += progress.ended
+    return found
 
 
 def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[int]], desk: _Desk, workers: int) -> None:

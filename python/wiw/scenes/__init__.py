@@ -118,7 +118,7 @@ def is_generated(spec: str) -> bool:
 def absolute(spec: str | PathLike[str]) -> str:
     """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
     spec = fspath(spec)
-    return spec if is_generated(spec) else str(Path(spec).expanduser().absolute())
+    return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
@@ -149,6 +149,12 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     if index is not None:
         return [spec]
     return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
+
+
+def _resembles_generated(spec: str) -> bool:
+    """Return whether a spec is no file and looks like a misspelt `apartments:`, to be refused as it was typed."""
+    kind, colon, _ = spec.partition(":")
+    return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
 
 
 def _did_you_mean(spec: str) -> str:
