@@ -40,7 +40,7 @@ class LightSolver {
   void add_texels(const Draft& draft);
   void add_object(const Draft& draft, const Object& object, const std::vector<Rgb>& albedo);
   void add_vertices(const Submesh& part, const Object& object);
-  void prepare_lights(const Draft& draft);
+  void find_reach(const Draft& draft);
   [[nodiscard]] Rgb direct(const Sample& sample) const;
   [[nodiscard]] Rgb from_light(const Sample& sample, const Lit& lit) const;
   [[nodiscard]] Rgb bounced(const Sample& sample, const std::vector<Rgb>& direct_light,

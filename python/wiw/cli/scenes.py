@@ -23,7 +23,8 @@ def scenes(
     $ wiw scenes house.glb --out house.png
 
     Args:
-        spec: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+        spec: apartments:train|val|test[[:FIRST]:END], one with edits (apartments:val/3?state:floor_lamp_1=off), a mesh
+            (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         out: Where to write the sheet, a PNG.
         views: Panoramas of each scene.
         backend: Renderer.

@@ -60,9 +60,12 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
 def _scene(name: str, folder: Path, where: str) -> str:
     """Return the spec of one scene, from its name in a file whose paths are relative to `folder`."""
     try:
-        if is_generated(name) and resolve(name) != [name]:
+        if not is_generated(name):
+            return absolute(folder / name)
+        named = resolve(name)
+        if len(named) != 1 or "/" not in name:
             raise ValueError("expected a single one, such as apartments:val/3")
-        return absolute(name if is_generated(name) else folder / name)
+        return named[0]
     except (ArgumentError, ValueError, RuntimeError) as error:  # RuntimeError: "~" of a user who is not known
         raise FileError(f"{where}: scene '{name}': {error}") from error
 

@@ -55,8 +55,7 @@ void make_toilet(Make& m) {
              {0.18f, 0.235f, 0.395f, z - 0.06f}},
             2.4f);
   m.shape.soft_box(white, {-0.13f, 0.15f, -hz + 0.02f}, {0.13f, 0.39f, -hz + 0.3f}, 0.03f);
-  const bool open = m.rng.chance(0.3);
-  m.attributes["state"] = open ? "open" : "closed";
+  const bool open = m.draw_open(0.3);
   const MaterialId seat = m.plain("plastic", m.rng.chance(0.8) ? Rgb(0.95f, 0.95f, 0.94f) : m.look.wood);
   if (open) {
     add_rings(m, white,
@@ -130,8 +129,7 @@ void make_shower(Make& m) {
   // Curtain on a rail across the open side, drawn halfway.
   m.shape.tube(metal, {{-hx, h, hz - 0.03f}, {hx, h, hz - 0.03f}}, 0.011f, 8);
   for (const float x : {-hx + 0.012f, hx - 0.012f}) m.shape.tube(metal, {{x, h, hz - 0.03f}, {x, h, -hz}}, 0.009f, 6);
-  const bool open = m.rng.chance(0.6);
-  m.attributes["state"] = open ? "open" : "closed";
+  const bool open = m.draw_open(0.6);
   m.shape.drape(m.fabric(m.look.fabrics[1]), {-hx + 0.02f, 0.12f, hz - 0.08f},
                 {open ? -hx + 0.4f * m.w() : hx - 0.02f, h - 0.015f, hz + 0.02f}, open ? 4 : 6);
 }
@@ -172,7 +170,19 @@ void make_washing_machine(Make& m) {
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   m.shape.soft_box(body, {-hx, 0.03f, -hz}, {hx, h, hz - 0.02f}, 0.02f);
   const Eigen::Affine3f before = m.shape.frame();
-  m.shape.set_frame(before * Eigen::Translation3f(0, 0.42f, hz - 0.022f) * Eigen::AngleAxisf(kTurn / 4, Vec3::UnitX()));
+  const bool open = m.state == "open";
+  const Eigen::Affine3f port =
+      before * Eigen::Translation3f(0, 0.42f, hz - 0.022f) * Eigen::AngleAxisf(kTurn / 4, Vec3::UnitX());
+  if (open) {  // the dark drum in its ring, and the door beside it
+    m.shape.set_frame(port);
+    m.shape.lathe(m.plain("metal", {0.55f, 0.56f, 0.58f}), Vec3::Zero(),
+                  {{0.21f, 0}, {0.21f, 0.012f}, {0.175f, 0.012f}}, 28);
+    m.shape.lathe(m.plain("metal", {0.07f, 0.07f, 0.08f}), Vec3::Zero(), {{0.178f, 0.006f}, {0, 0.005f}}, 24);
+    m.shape.set_frame(open_leaf(m, {-0.24f, hz + 0.02f}, {-0.22f, 0.2f, hz - 0.022f}, {0.22f, 0.64f, hz + 0.02f}) *
+                      port);
+  } else {
+    m.shape.set_frame(port);
+  }
   m.shape.lathe(m.chrome(), Vec3::Zero(), {{0.22f, 0}, {0.22f, 0.02f}, {0.2f, 0.035f}, {0.165f, 0.03f}}, 28);
   m.shape.lathe(m.plain("glass", {0.16f, 0.18f, 0.22f}), Vec3::Zero(),
                 {{0.17f, 0.028f}, {0.13f, 0.018f}, {0.06f, 0.008f}, {0, 0.005f}}, 24);
@@ -181,7 +191,7 @@ void make_washing_machine(Make& m) {
               {hx - 0.02f, h - 0.03f, hz - 0.014f});
   m.shape.cylinder(m.chrome(), {0.05f, h - 0.085f, hz - 0.016f}, {0.05f, h - 0.085f, hz + 0.006f}, 0.035f, 0.03f, 14);
   m.shape.box(m.black(), {0.12f, h - 0.11f, hz - 0.016f}, {hx - 0.06f, h - 0.06f, hz - 0.011f});
-  m.attributes["state"] = "off";
+  m.attributes["state"] = open ? "open" : "off";
   m.supports.push_back({{0, h, -0.02f}, {hx - 0.1f, hz - 0.12f}, 0.6f});
 }
 

@@ -33,12 +33,15 @@ struct Make {
   Rng& rng;
   MaterialTable& materials;
   const RoomLook& look;
-  bool on = false;  // lamps and screens
+  bool on = false;      // lamps and screens
+  std::string state{};  // that an edit asks for, one of states_of(); empty: the design's own
   FurnitureShape shape{};
   std::vector<Support> supports;
   std::vector<Bulb> bulbs;
   std::map<std::string, std::string> attributes;
   bool casts_shadow = true;
+  Rgb main_color = Rgb::Ones();               // last one described
+  std::vector<Eigen::AlignedBox3f> leaves{};  // open doors that stand out of the body
 
   [[nodiscard]] float w() const { return size.x(); }
   [[nodiscard]] float h() const { return size.y(); }
@@ -53,9 +56,12 @@ struct Make {
   Rgb case_color();
   /// One of the room's fabrics; sets the attributes.
   Rgb fabric_color();
+  /// Sets the attribute: "open" or "closed", by the design's own chance where no edit says which.
+  bool draw_open(double chance);
   MaterialId case_material(const Rgb& color);
-  void describe(const Rgb& color, const std::string& kind) {
-    attributes["color"] = color_name(color);
+  void describe(const Rgb& main, const std::string& kind) {
+    main_color = main;
+    attributes["color"] = color_name(main);
     attributes["material"] = kind;
   }
 };
@@ -112,5 +118,9 @@ struct Category {
 std::span<const Category> catalogue();
 /// Index by name; throws ArgumentError for an unknown one.
 std::size_t category_index(const std::string& name);
+/// States that a category can be built in; empty for one that has but one.
+const std::vector<std::string>& states_of(const std::string& category);
+/// Whether people move such things about: not what is fixed to walls, pipes or the ceiling.
+bool is_movable(const std::string& category);
 
 }  // namespace wiw::apartment

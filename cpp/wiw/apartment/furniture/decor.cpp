@@ -166,8 +166,11 @@ void make_curtain(Make& m) {
   m.shape.tube(m.chrome(), {{-hx, h, 0}, {hx, h, 0}}, 0.012f, 8);
   for (const float x : {-hx, hx}) m.shape.ellipsoid(m.chrome(), {x, h, 0}, {0.022f, 0.022f, 0.022f}, 8);
   const double draw = m.rng.uniform();
-  const float share = draw < 0.75 ? range(m.rng, 0.12f, 0.18f) : range(m.rng, 0.24f, 0.34f);
-  m.attributes["state"] = draw < 0.75 ? "open" : "half drawn";
+  const std::string state = !m.state.empty() ? m.state : draw < 0.75 ? "open" : "half drawn";
+  const float share = state == "closed" ? 0.485f
+                      : state == "open" ? range(m.rng, 0.12f, 0.18f)
+                                        : range(m.rng, 0.24f, 0.34f);
+  m.attributes["state"] = state;
   const int folds = std::max(3, static_cast<int>(share * m.w() / 0.07f));
   for (const float side : {-1.f, 1.f}) {
     const float a = side * (hx - 0.04f), b = side * (hx - 0.04f - share * m.w());

@@ -81,12 +81,20 @@ void make_pendant(Make& m);
 void make_floor_lamp(Make& m);
 void make_table_lamp(Make& m);
 
+/// Colour in which the cloth of a burning lamp's shade shines.
+Rgb lit_shade(const Rgb& color);
 /// Four legs under a plate from y = 0 to `top`; `style` 0 square, 1 tapered and splayed, 2 turned, 3 steel frame.
 void add_legs(Make& m, MaterialId material, float width, float depth, float top, float thickness, int style,
               const Vec3& center = Vec3::Zero());
-/// Doors or drawers on the front of a case: `columns` x `rows` fields with handles.
+/// Doors or drawers on the front of a case: `columns` x `rows` fields with handles; the doors of the first
+/// `open_columns` columns stand open.
 void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
-                bool drawers);
+                bool drawers, int open_columns = 0);
+/// Frame of a leaf that hangs at `hinge` (x and z) and is turned outwards; it covers `low` to `high` when closed, which
+/// the design's leaves are told.
+Eigen::Affine3f open_leaf(Make& m, const Vec2& hinge, const Vec3& low, const Vec3& high);
+/// Case of boards: sides, top, bottom and back around an open front.
+void add_carcass(Make& m, MaterialId wood, const Vec3& low, const Vec3& high, float board);
 /// A row of books standing from x0 to x1 on y, spines towards +z at `z`.
 void add_books(Make& m, float x0, float x1, float y, float z, float clearance, float depth);
 

@@ -3,14 +3,17 @@
 
 namespace wiw::apartment {
 
+Rgb lit_shade(const Rgb& color) {
+  return to_encoded((to_linear(color) * 1.1f + Rgb(0.35f, 0.28f, 0.18f)).cwiseMin(1.f));
+}
+
 namespace {
 
 MaterialId shade(Make& m, const Rgb& color) {
   m.attributes["state"] = m.on ? "on" : "off";
   m.describe(color, "fabric");
   if (!m.on) return m.fabric(color);
-  const Rgb lit = to_encoded((to_linear(color) * 1.1f + Rgb(0.35f, 0.28f, 0.18f)).cwiseMin(1.f));
-  return m.materials.glow(lit);
+  return m.materials.glow(lit_shade(color));
 }
 
 Rgb shade_color(Make& m) {
