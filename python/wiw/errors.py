@@ -21,11 +21,11 @@ __all__ = [
     "StoreError",
     "VlmError",
     "WeightsError",
-    "asks_to_stop",
+    "is_stop_request",
 ]
 
 
-def asks_to_stop(error: BaseException) -> bool:
+def is_stop_request(error: BaseException) -> bool:
     """Return whether an exception stops the process itself: Ctrl-C, or one of wiw's own for a signal.
 
     Any other is an error of the code that raised it, also `SystemExit`: a plugged-in model ends no run.

@@ -13,7 +13,7 @@ from wiw.errors import FileError
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def atomic_file(path: Path) -> Iterator[Path]:
     """A file beside `path` to write to; it takes the place of `path` only once it is written whole.
 
     Raises:
@@ -29,7 +29,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: False) -> Iterator[Path]:
+def atomic_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: False) -> Iterator[Path]:
     """The same for a folder: an empty one beside `path` that becomes `path` once all is in it.
 
     Args:

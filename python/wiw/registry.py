@@ -25,7 +25,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
+from wiw.errors import ConstructionError, Error, RegistryError, is_stop_request
 from wiw.suggestions import did_you_mean
 
 
@@ -114,7 +114,7 @@ class Registry:
         try:
             return factory(**options)
         except BaseException as error:
-            if isinstance(error, Error) or asks_to_stop(error):
+            if isinstance(error, Error) or is_stop_request(error):
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
@@ -128,7 +128,7 @@ class Registry:
         try:
             found = load()
         except BaseException as error:  # SystemExit too: a module must not end the process that imports it
-            if asks_to_stop(error):
+            if is_stop_request(error):
                 raise
             raise RegistryError(
                 f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"

@@ -15,7 +15,7 @@ from safetensors.torch import save as packed
 from torch import Tensor, nn
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -72,7 +72,7 @@ class WeightFile(Generic[N]):
         header = {**self.sizes(network), "card": dict(card)}
         values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
         metadata = {"format": self.format, "header": json.dumps(header, sort_keys=True), "digest": digest(values)}
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             draft.write_bytes(packed(values, metadata))
 
     def _check(self, values: Mapping[str, Tensor], told: str | None, path: Path) -> None:

@@ -188,21 +188,21 @@ def test_a_guide_knows_what_plans_are_worth() -> None:
     env = Manipulation("stack_cups").environment()
     env.begin(env.task.episode(1))
     guide, bench = env.guide(), env.table.bench
-    still, plan = bench.pose[None], guide.plan(5)
+    still, plan = bench.pose[None], guide.suggest_plan(5)
     before = bench.pose
-    assert len(plan) == 5 and guide.worth(plan) > guide.worth(still) > -20
+    assert len(plan) == 5 and guide.evaluate_plan(plan) > guide.evaluate_plan(still) > -20
     np.testing.assert_array_equal(bench.pose, before)
     while not env.table.is_success():
-        env.run(env.guide().plan(5))
-    assert env.guide().worth(bench.pose[None]) == 0.0
+        env.run(env.guide().suggest_plan(5))
+    assert env.guide().evaluate_plan(bench.pose[None]) == 0.0
 
     env = Manipulation("push_buttons").environment()
     env.begin(env.task.episode(0))
     kind, setup = env.table.kind, env.table.setup
     wrong = kind.plan_expert(env.observation.places, setup.objects[2:])
     assert not env.run(wrong).terminated
-    assert env.guide().worth(env.table.bench.pose[None]) < -100
-    assert len(env.guide().plan(5)) == 1
+    assert env.guide().evaluate_plan(env.table.bench.pose[None]) < -100
+    assert len(env.guide().suggest_plan(5)) == 1
 
 
 class Sinking(Pressing):

@@ -23,7 +23,7 @@ from wiw.errors import RemoteError
 from wiw.types import Conditioning, Control
 from wiw.wire.messages import Ask, Hello, Refusal, Welcome, decode, encode
 from wiw.wire.rows import pack_row, row_id
-from wiw.world_models.base import patience
+from wiw.world_models.base import answer_deadline
 from wiw.world_models.panoramic.served import Served
 from wiw.world_models.status import is_served
 
@@ -72,7 +72,7 @@ def plan(*actions: int, shared: int = 0) -> Control:
 
 def imagine_plans(model: Served, observations: Conditioning, *plans: Control, seed: int = 5) -> np.ndarray:
     seeds = np.arange(seed, seed + len(plans), dtype=np.uint64)
-    with patience(30):
+    with answer_deadline(30):
         return model.rollout(observations, plans, seeds)
 
 

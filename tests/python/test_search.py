@@ -171,7 +171,7 @@ def test_imagining_deeper_leaves_the_real_memory_alone_and_keeps_seeds() -> None
     model = model_of()
     agent = wiw.Agent(Wanderer(), model, candidates=CANDIDATES, horizon=HORIZON, depth=3)
     decision = agent.decide_batch([query(0, 90)])[0]
-    memory = agent.components.memories.recall([query(0, 90)], agent.components.imaginer)[0][0].memory
+    memory = agent.parts.memories.recall([query(0, 90)], agent.parts.imaginer)[0][0].memory
     assert memory.observed == [90]
     assert model.seeds <= {core.fold_key([5, 0, 2, c]) for c in range(CANDIDATES)}
     assert len(decision.proposals) > CANDIDATES and decision.calls["rows"] > len(decision.proposals)

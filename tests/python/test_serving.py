@@ -31,14 +31,14 @@ from wiw.loop import attempts
 from wiw.loop.attempts import Attempted
 from wiw.serving import outbox
 from wiw.serving import server as serving
+from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.background import serve_in_background
-from wiw.serving.known import Known
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
 from wiw.types import Conditioning, Control, History
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
-from wiw.world_models.base import patience
+from wiw.world_models.base import answer_deadline
 from wiw.world_models.remote import link
 from wiw.world_models.remote.limits import check_row
 from wiw.world_models.remote.model import Remote
@@ -257,7 +257,7 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
     model = Plain(lambda observations: gate.wait(20) and None)
     with remote(model) as (client, server):
         begin = time.monotonic()
-        with pytest.raises(RemoteError, match="busy or hung") as caught, patience(0.5):
+        with pytest.raises(RemoteError, match="busy or hung") as caught, answer_deadline(0.5):
             ask(client, 4)
         assert caught.value.kind == "deadline" and time.monotonic() - begin < 5
         with pytest.raises(RolloutError) as caught:
@@ -273,7 +273,7 @@ def test_a_row_that_is_asked_for_again_while_it_is_computed_gets_its_answer_and_
     gate = threading.Event()
     model = Plain(lambda observations: gate.wait(20) and None)
     with remote(model) as (client, _), ThreadPoolExecutor(2) as pool:
-        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+        with pytest.raises(RemoteError, match="busy or hung"), answer_deadline(0.3):
             ask(client, 4)
         again, other = pool.submit(ask, client, 4), pool.submit(ask, client, 2, 90)
         time.sleep(0.3)
@@ -289,7 +289,7 @@ def test_a_row_whose_first_asker_waited_too_short_is_asked_for_again():
     with remote(model) as (client, server), ThreadPoolExecutor(2) as pool:
         busy = pool.submit(ask, client, 4, 90)
         wait_for(lambda: model.rows)
-        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+        with pytest.raises(RemoteError, match="busy or hung"), answer_deadline(0.3):
             ask(client, 2)
         again = pool.submit(ask, client, 2)
         wait_for(lambda: len(server.queue) == 2)
@@ -305,7 +305,7 @@ def test_the_callers_deadline_counts_however_long_it_is(monkeypatch):
         rows = client._link.ask
         monkeypatch.setattr(client._link, "ask", lambda *a: given.append(a[1] - time.monotonic()) or rows(*a))
         ask(client)
-        with patience(1000.0):
+        with answer_deadline(1000.0):
             ask(client)
     assert given == [pytest.approx(300.0, abs=30), pytest.approx(950.0, abs=30)]
 
@@ -416,7 +416,7 @@ def test_nobody_there():
     assert caught.value.kind == "connection" and time.monotonic() - begin < 5
     with serve_in_background(Plain()) as server:
         client = Remote(server.address)
-    with pytest.raises(RemoteError, match="could not be reached in time") as caught, patience(0.5):
+    with pytest.raises(RemoteError, match="could not be reached in time") as caught, answer_deadline(0.5):
         ask(client)
     assert caught.value.kind == "connection"
 
@@ -892,7 +892,7 @@ def test_a_queue_takes_no_more_than_it_may_and_ends():
 
 
 def test_answers_are_kept_up_to_a_size():
-    known = Known(10)
+    known = AnswerCache(10)
     for name in (b"a", b"b", b"c"):
         known.put(name, b"1234")
     assert known.get(b"a") is None and known.get(b"b") == b"1234"

@@ -27,7 +27,7 @@ from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
-from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, terminable
+from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"wiw {wiw.__version__}")
         return 0
     try:
-        with terminable():
+        with raise_on_sigterm():
             return _dispatch(given) or 0
     except Error as error:
         if debug:

@@ -32,7 +32,7 @@ def scenes(
     from rich.console import Console
     from rich.table import Table
 
-    from wiw.files import whole_file
+    from wiw.files import atomic_file
     from wiw.scenes import resolve
     from wiw.viz.contact_sheet import contact_sheet
 
@@ -51,7 +51,7 @@ def scenes(
         table.add_row(*_facts(place))
         rows.append(place)
     Console().print(table)
-    with whole_file(out) as draft:
+    with atomic_file(out) as draft:
         kind = Image.registered_extensions().get(out.suffix.lower(), "PNG")
         contact_sheet(rows, views, backend).save(draft, format=kind)
     print(f"\nsheet  {out}")

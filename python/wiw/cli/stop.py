@@ -42,7 +42,7 @@ def end_process(code: int) -> NoReturn:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
+def raise_on_sigterm() -> Iterator[None]:
     """Raise `Terminated` at the first SIGTERM; end the process where the work does not get to it, as inside a model.
 
     Python runs signal handlers between two of its own instructions, so a thread, told through a pipe, watches over it.

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.visibility import COARSE, measure_sizes, measure_unhidden_sizes
+from wiw.datasets.visibility import COARSE, measure_sizes, measure_unoccluded_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
 from wiw.types import Episode
@@ -251,7 +251,7 @@ def _starts(
     points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
     sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
-    shares = np.minimum(1.0, sizes / np.maximum(measure_unhidden_sizes(world, points, instance), 1e-9))
+    shares = np.minimum(1.0, sizes / np.maximum(measure_unoccluded_sizes(world, points, instance), 1e-9))
     # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
     for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
         yield points[i], float(sizes[i]), float(shares[i])
@@ -279,7 +279,7 @@ def _best_view(
     if not len(largest):
         return None
     sizes = measure_sizes(world, ends[largest])[:, instance]
-    shares = sizes / np.maximum(measure_unhidden_sizes(world, ends[largest], instance), 1e-9)
+    shares = sizes / np.maximum(measure_unoccluded_sizes(world, ends[largest], instance), 1e-9)
     fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
     if not len(fit):
         return None
@@ -307,7 +307,7 @@ def measure_clarity(
     """Return how well an instance is seen, 0 to 1: its visible share, times its size up to `rules.enough`."""
     points = np.asarray(place, np.float64)[None]
     size = float(measure_sizes(world, points)[0, instance])
-    whole = float(measure_unhidden_sizes(world, points, instance)[0]) if size else 0.0
+    whole = float(measure_unoccluded_sizes(world, points, instance)[0]) if size else 0.0
     return min(1.0, size / whole) * min(1.0, size / rules.enough) if whole else 0.0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from wiw.datasets.demonstration import Demonstration
 from wiw.errors import DependencyError, FileError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 FORMAT = 1
 KEY = b"wiw"
@@ -66,7 +66,7 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
     depth = demonstrations[0].encoded_depths is not None
     schema = _schema(depth, facts)
     how = {"use_dictionary": list(REPEATED), "compression": _packing(depth), "write_page_checksum": True}
-    with whole_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
+    with atomic_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
         for each in demonstrations:
             file.write_table(_table(each, schema), row_group_size=len(each))
 

@@ -30,7 +30,7 @@ def measure_sizes(world: World, points: NDArray[np.float64], size: Size = SIZE) 
     return counted
 
 
-def measure_unhidden_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
+def measure_unoccluded_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
     """Return the steradians that an instance would fill if nothing else were there, from N places: float64 [N]."""
     if not len(points):
         return np.zeros(0)
@@ -39,10 +39,10 @@ def measure_unhidden_sizes(world: World, points: NDArray[np.float64], instance: 
     return ((ids == instance) * _weights(SIZE)).sum(axis=(1, 2))
 
 
-def visible_share(world: World, point: NDArray[np.float64], instance: int) -> float:
+def visible_fraction(world: World, point: NDArray[np.float64], instance: int) -> float:
     """Return how much of an instance is seen from a place, 0 to 1 of what it would show if it were alone."""
     places = np.asarray(point, np.float64)[None]
-    whole = float(measure_unhidden_sizes(world, places, instance)[0])
+    whole = float(measure_unoccluded_sizes(world, places, instance)[0])
     return min(1.0, float(measure_sizes(world, places)[0, instance]) / whole) if whole else 0.0
 
 

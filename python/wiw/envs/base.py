@@ -34,18 +34,18 @@ class Segment:
 
 
 class Guide(ABC):
-    """The truth about plans from where an environment stands.
+    """Ground truth about plans from an environment's present state.
 
-    Only the loop hands a guide on, to stages that an experiment tells the truth; no policy and no world model gets one.
+    Only the loop passes guides on, to stages that an experiment gives the ground truth; policies and models get none.
     """
 
     @abstractmethod
-    def worth(self, plan: NDArray[Any]) -> float:
+    def evaluate_plan(self, plan: NDArray[Any]) -> float:
         """Return how good a plan truly is: the best progress after any of its actions, the higher the better."""
 
     @abstractmethod
-    def plan(self, length: int) -> NDArray[Any]:
-        """Return a plan of at most `length` actions that truly leads on."""
+    def suggest_plan(self, length: int) -> NDArray[Any]:
+        """Return a plan of at most `length` actions that makes progress in the real environment."""
 
 
 class Env(ABC):

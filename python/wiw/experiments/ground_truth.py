@@ -68,7 +68,7 @@ class TruePlans(_Guided):
         """Propose the true plan before the policy's own, at most `candidates` in all."""
         proposals = super().propose(situations, candidates, horizon)
         return [
-            _put_first(self._guide(situation.key).plan(horizon), plans, candidates)
+            _put_first(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
             for situation, plans in zip(situations, proposals, strict=True)
         ]
 
@@ -98,7 +98,7 @@ class TrueScores(_Guided):
 
     def _worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
         guide = self._guide(key)
-        return np.array([guide.worth(plan.actions) for plan in plans], np.float64)
+        return np.array([guide.evaluate_plan(plan.actions) for plan in plans], np.float64)
 
 
 def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:

@@ -65,7 +65,7 @@ class ShuffledPlacebo(Placebo):
         return super().imagine(replace(request, plans=plans))
 
 
-class FirstMoments(Protocol):
+class FirstObservations(Protocol):
     """Where a swapped placebo gets the first moment of another episode."""
 
     def of(self, key: Key) -> ModelInput:
@@ -85,7 +85,7 @@ class SwappedPlacebo(Placebo):
 
     kind = "swapped"
 
-    def __init__(self, model: Any, moments: FirstMoments) -> None:
+    def __init__(self, model: Any, moments: FirstObservations) -> None:
         super().__init__(model)
         self._moments = moments
 

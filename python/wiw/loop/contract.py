@@ -35,7 +35,7 @@ def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
         )
 
 
-def check_kind(model: WorldModel, space: str, words: str) -> None:
+def check_plan_space(model: WorldModel, space: str, words: str) -> None:
     """See that a model which follows actions follows those that plans are made of.
 
     Raises:

@@ -79,7 +79,7 @@ class Imagination(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no places at the ends of plans")
 
 
-class NothingImagined(Imagination):
+class NoImagination(Imagination):
     """The answer without a world model."""
 
     def __init__(self, episodes: int) -> None:
@@ -143,7 +143,7 @@ class NoModel(Imaginer):
 
     def imagine(self, request: Request) -> Imagination:
         """Return no rollouts."""
-        return NothingImagined(len(request.keys))
+        return NoImagination(len(request.keys))
 
 
 class ImaginerWrapper(Imaginer, Privileged):

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.loop.clock import time_apart
+from wiw.loop.clock import time_separately
 from wiw.loop.limits import BUDGET_GB
 from wiw.loop.model_wrapper import ModelWrapper
 from wiw.types import Conditioning, Control
@@ -181,7 +181,7 @@ class Cached(ModelWrapper):
         keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
         own = [(1 + control.shared, 1 + control.length) for control in controls]
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, _CHANNELS), np.uint8)
-        with time_apart("cache"):
+        with time_separately("cache"):
             frames[:, 0] = observations.image
             missing = [
                 row
@@ -191,7 +191,7 @@ class Cached(ModelWrapper):
         self._cached_rows += len(controls) - len(missing)
         if missing:
             fresh = self.model.rollout(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
-            with time_apart("cache"):
+            with time_separately("cache"):
                 for answer, row in zip(fresh, missing, strict=True):
                     first, end = own[row]
                     self.cache.put(keys[row], first, answer[first:end])

@@ -16,7 +16,7 @@ from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.report import plots
 from wiw.report.episodes import read_stories, wording
 from wiw.report.story import Album
@@ -32,7 +32,7 @@ def write_report(run: Run, path: Path) -> Path:
         FileError: the file cannot be written; what was there before is kept.
     """
     page = render(run)
-    with whole_file(path) as draft:
+    with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 

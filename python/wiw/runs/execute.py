@@ -12,7 +12,7 @@ from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
 from wiw.runs.scene_map import draw_scene_maps
 from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
@@ -144,7 +144,7 @@ class _Desk:
                 self._store.write_agent(row)
             self._known.add(row.arm)
             return
-        if isinstance(row, AgainRow):
+        if isinstance(row, RestartRow):
             self.discard(row.arm, row.episodes)
             return
         if isinstance(row, LostRow):

@@ -12,12 +12,12 @@ from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
+from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
-from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
@@ -95,7 +95,9 @@ class AgentRecipe(AgentConfig):
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
-        return compose(Parts(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context)
+        return compose(
+            AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
+        )
 
     @property
     def config(self) -> AgentConfig:
@@ -303,8 +305,8 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     if isinstance(agent, AgentRecipe):
         return agent
     if type(agent) is Agent:  # a subclass may decide otherwise, and is taken as it is
-        parts = agent.parts
-        return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
+        spec = agent.spec
+        return AgentRecipe(spec.policy, spec.model, spec.reviser, observers=spec.observers, **spec.config.numbers)
     if isinstance(agent, BaseAgent):
         return AgentInMemory(agent)
     raise ArgumentError(f"expected a wiw.Agent, an AgentRecipe or a BaseAgent, got {type(agent).__name__}")

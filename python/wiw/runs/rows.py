@@ -44,7 +44,7 @@ class OutcomeRow:
 
 
 @dataclass(frozen=True)
-class AgainRow:
+class RestartRow:
     """These episodes of an arm begin anew; their rows so far do not count."""
 
     arm: str

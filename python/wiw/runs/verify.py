@@ -18,7 +18,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.execute import recipes_of, require_own_sources, require_scenes
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, to_json
 from wiw.runs.store import DECISION_JSON, RunStore
 from wiw.runs.workers import Job, Plan, Runner
 
@@ -128,10 +128,10 @@ class _Collected:
         self._agent: Facts = []
         self._episodes: dict[int, Facts] = {}
 
-    def __call__(self, row: AgentRow | AgainRow | DecisionRow | LostRow | OutcomeRow) -> None:
+    def __call__(self, row: AgentRow | RestartRow | DecisionRow | LostRow | OutcomeRow) -> None:
         if isinstance(row, AgentRow):
             self._agent = [("agent", json.loads(to_json(row.agent)))]
-        elif isinstance(row, AgainRow):
+        elif isinstance(row, RestartRow):
             for index in row.episodes:
                 self._episodes.pop(index, None)
         elif isinstance(row, DecisionRow):

@@ -23,14 +23,14 @@ from typing import Any, Protocol
 from wiw.errors import Error, InfrastructureError
 from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
-Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
+Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
-class Desk(Protocol):
+class ReportReceiver(Protocol):
     """The receiver of the workers' reports."""
 
     def write(self, row: Row) -> None:
@@ -86,7 +86,7 @@ class RowSink:
 
     def again(self, episodes: Sequence[int]) -> None:
         """Note that these episodes begin anew."""
-        self._send(AgainRow(self._job.arm, tuple(episodes)))
+        self._send(RestartRow(self._job.arm, tuple(episodes)))
 
     def record_lost(self, spent: Mapping[str, float]) -> None:
         """Record that a decision has failed."""
@@ -125,21 +125,21 @@ class Runner:
         )
 
 
-def run_here(plan: Plan, jobs: Iterable[Job], desk: Desk) -> None:
+def run_here(plan: Plan, jobs: Iterable[Job], desk: ReportReceiver) -> None:
     """Run all jobs in this process."""
     runner = Runner(plan)
     for job in jobs:
         runner.run(job, desk.write)
 
 
-def run_in_workers(plan: Plan, jobs: Iterable[Job], desk: Desk, workers: int) -> None:
+def run_in_workers(plan: Plan, jobs: Iterable[Job], desk: ReportReceiver, workers: int) -> None:
     """Run all jobs in `workers` processes.
 
     Raises:
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
-    crew = _Crew(_pickle_plan(plan), deque(jobs), desk, workers)
+    crew = _WorkerPool(_pickle_plan(plan), deque(jobs), desk, workers)
     try:
         crew.run()
     finally:
@@ -165,10 +165,10 @@ class _Worker:
     unfinished: dict[int, Episode] = field(default_factory=dict)
 
 
-class _Crew:
+class _WorkerPool:
     """The parent's side: hands out jobs, receives rows, replaces the dead."""
 
-    def __init__(self, plan: bytes, jobs: deque[Job], desk: Desk, size: int) -> None:
+    def __init__(self, plan: bytes, jobs: deque[Job], desk: ReportReceiver, size: int) -> None:
         self._plan, self._jobs, self._desk = plan, jobs, desk
         self._size = min(size, len(jobs))
         self._workers: list[_Worker] = []
@@ -197,7 +197,7 @@ class _Crew:
         try:
             message = worker.pipe.recv()
         except (EOFError, OSError):
-            self._bury(worker)
+            self._replace_dead_worker(worker)
             return
         if isinstance(message, BaseException):
             raise message
@@ -216,9 +216,9 @@ class _Crew:
         try:
             worker.pipe.send(worker.job)
         except OSError:
-            self._bury(worker)
+            self._replace_dead_worker(worker)
 
-    def _bury(self, worker: _Worker) -> None:
+    def _replace_dead_worker(self, worker: _Worker) -> None:
         """Run again what a dead worker left, or record it as failed.
 
         Raises:
@@ -227,7 +227,7 @@ class _Crew:
         self._workers.remove(worker)
         worker.pipe.close()
         worker.process.join()
-        cause = _cause_of_death(worker.process.exitcode)
+        cause = _describe_exit(worker.process.exitcode)
         if not worker.ready:
             raise InfrastructureError(
                 f"a worker process could not start ({cause}): the task could not be built there; a script that "
@@ -245,7 +245,7 @@ class _Crew:
                 self._desk.write(OutcomeRow(worker.job.arm, result))
 
 
-def _cause_of_death(exit_code: int) -> str:
+def _describe_exit(exit_code: int) -> str:
     if exit_code >= 0:
         return f"exit code {exit_code}"
     name = signal.Signals(-exit_code).name

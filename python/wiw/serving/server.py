@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
 from wiw.runs.sources import source_digests
-from wiw.serving.known import Known
+from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.outbox import Outbox
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
@@ -144,7 +144,7 @@ class Server:
         """Messages and connections that were not as agreed."""
         self._welcome = _welcome(model, AHEAD * batch)
         self._jobs: dict[bytes, Job] = {}
-        self._known = Known(KNOWN_BYTES)
+        self._known = AnswerCache(KNOWN_BYTES)
         self._owed: Counter[ServerConnection] = Counter()
         """Rows of each client that wait, are computed, or whose answers have not left."""
         self._outboxes: dict[ServerConnection, Outbox] = {}

@@ -24,7 +24,7 @@ from wiw.loop.history import Frame, stack_histories
 from wiw.loop.plan_space import plan_space
 from wiw.studies.frame_faults import describe_alteration, exchange_turns, mean_correlation, share_of_jumps
 from wiw.studies.model_networks import place_of_computation, training_networks
-from wiw.studies.questions import Frames, Questions, Row
+from wiw.studies.model_queries import Frames, ModelQueries, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
 from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
@@ -195,7 +195,7 @@ class _Check:
     def __init__(self, model: WorldModel, scenes: str, deadline: float) -> None:
         self.model, self.accepts, self.deadline = model, model.accepts, deadline
         self.plans = PLANS[self.accepts.space]
-        self.asking = Questions(model, scenes, deadline)
+        self.asking = ModelQueries(model, scenes, deadline)
         self.steps = min(LENGTH, self.accepts.frames - 1 if self.accepts.frames else LENGTH)
         self.rows: list[Row] = []
         self.frames: Frames = np.empty(0, np.uint8)

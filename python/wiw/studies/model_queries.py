@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Questions to a world model as the loop asks them, row by row, to be asked in other company."""
+"""ModelQueries to a world model as the loop asks them, row by row, to be asked in other company."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Row:
     """Its actions, without padding."""
 
 
-class Questions:
+class ModelQueries:
     """The requests that the loop would make of a model in the first moments of some episodes.
 
     Args:

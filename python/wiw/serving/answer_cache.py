@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import OrderedDict
 
 
-class Known:
+class AnswerCache:
     """Encoded answers by the id of their row; those that were not asked for longest go first.
 
     Args:

@@ -18,7 +18,7 @@ from wiw.errors import PromptError
 from wiw.policies.vlm.prompts import worker
 
 
-class Filling:
+class TemplateFiller:
     """Fills templates in a process that starts with the first and, where one takes too much, again with the next."""
 
     def __init__(self) -> None:
