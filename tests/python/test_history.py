@@ -185,7 +185,7 @@ class Recorder:
     def episode(self, result):
         self.results[result.episode] = result
 
-    def again(self, episodes):
+    def record_restart(self, episodes):
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
     def record_lost(self, spent):

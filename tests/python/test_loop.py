@@ -33,7 +33,7 @@ class Recorder:
     def episode(self, result) -> None:
         self.results[result.episode] = result
 
-    def again(self, episodes) -> None:
+    def record_restart(self, episodes) -> None:
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
     def record_lost(self, spent) -> None:

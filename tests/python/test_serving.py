@@ -367,7 +367,7 @@ def test_a_lost_connection_is_mended_and_no_row_is_computed_twice():
         answer = pool.submit(ask, client, 8)
         for lost in range(3):
             wait_for(lambda lost=lost: len(model.rows) > min(lost, 1) and server.clients == 1)
-            for connection in list(server._owed):
+            for connection in list(server._unanswered):
                 server._loop.call_soon_threadsafe(connection.transport.abort)
             time.sleep(0.05)
         np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
@@ -930,7 +930,7 @@ def unread(server):
 
 def unsent(server):
     """Bytes in the buffers of the server's connections, and those that wait to get there."""
-    return sum(client.transport.get_write_buffer_size() for client in list(server._owed)) + server.unsent_bytes
+    return sum(client.transport.get_write_buffer_size() for client in list(server._unanswered)) + server.unsent_bytes
 
 
 @pytest.mark.parametrize("known", [False, True])

@@ -222,7 +222,7 @@ def list_failures(run: RunStore, arm: str) -> list[int]:
 
 
 def list_reruns(run: RunStore, arm: str) -> list[str]:
-    """Return the reruns that change something of an arm: the oracle's futures are the ground truth already."""
+    """Return the reruns that make a difference for an arm: the oracle's rollouts are the ground truth already."""
     agent = next(one["agent"] for one in run.config["arms"] if one["name"] == arm)
     exact = agent.get("model") == "oracle" and "placebo" not in agent
     return [rerun for rerun in RERUNS if not (exact and rerun == "imagination")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the command line to a command, and from what goes wrong to one clean message and an exit code."""
+"""Dispatch the command line to a command, and turn errors into one clean message and an exit code."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def _make_absolute(value: str) -> str | None:
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """Return what `--world-model-option` gives a world model.
+    """Return the options of a world model from `--world-model-option`.
 
     Raises:
         ArgumentError: options without a model to take them.
@@ -91,7 +91,7 @@ def policy_options(
 
 
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """Return what `--semantics-option` gives a source of semantics.
+    """Return the options of a source of semantics from `--semantics-option`.
 
     Raises:
         ArgumentError: options without a source to take them.

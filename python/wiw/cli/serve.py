@@ -67,7 +67,7 @@ def serve(
 
 
 async def _live(server: Any, name: str) -> None:
-    """Serve until a signal comes, and say how it goes."""
+    """Serve until a signal arrives, and print status lines."""
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
     serving = asyncio.ensure_future(server.run(ready.set))

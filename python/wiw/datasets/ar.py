@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Active Recognition episodes: things hardly seen at the start, and clearly from somewhere within the budget.
+"""Active Recognition episodes: targets hardly visible at the start, and clearly visible from within the budget.
 
 A thing is hardly seen when most of it is hidden, or when it is so far away or so foreshortened that little is to be
 seen, a small part of what a good view shows; both are measured in rendered instance ids (`wiw.datasets.visibility`).
@@ -110,7 +110,7 @@ class EpisodeRules:
 
 @dataclass(frozen=True)
 class Survey:
-    """How large each instance looks from each place of one scene."""
+    """The apparent size of each instance from each sampled place of one scene."""
 
     points: NDArray[np.float64]
     """float64 [N, 3], on the floor."""

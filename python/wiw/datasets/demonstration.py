@@ -20,7 +20,7 @@ DEPTH_UNITS = 5000
 
 @dataclass(frozen=True)
 class Demonstration:
-    """How an expert did what it was told, in T frames evenly spread over time; frame 0 is before anything was done.
+    """An expert's execution of an instruction, in T frames evenly spaced in time; frame 0 precedes all actions.
 
     Pictures are decoded when they are first asked for.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of a thing is seen from a place, measured by rendering instance ids: as seen, and with all else away."""
+"""Visibility of objects from a place, by rendering instance ids with and without occluders."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def measure_sizes(world: World, points: NDArray[np.float64], size: Size = SIZE) 
 
 
 def measure_unoccluded_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
-    """Return the steradians that an instance would fill if nothing else were there, from N places: float64 [N]."""
+    """Return the steradians that an instance would fill without occluders, from N places: float64 [N]."""
     if not len(points):
         return np.zeros(0)
     with _lift(world, instance):
@@ -40,7 +40,7 @@ def measure_unoccluded_sizes(world: World, points: NDArray[np.float64], instance
 
 
 def visible_fraction(world: World, point: NDArray[np.float64], instance: int) -> float:
-    """Return how much of an instance is seen from a place, 0 to 1 of what it would show if it were alone."""
+    """Return the visible fraction of an instance from a place: 1 without occlusion."""
     places = np.asarray(point, np.float64)[None]
     whole = float(measure_unoccluded_sizes(world, places, instance)[0])
     return min(1.0, float(measure_sizes(world, places)[0, instance]) / whole) if whole else 0.0
@@ -59,7 +59,7 @@ def _weights(size: Size) -> NDArray[np.float64]:
 
 @contextmanager
 def _lift(world: World, instance: int) -> Iterator[None]:
-    """Hold the instance high above the scene, where nothing hides it."""
+    """Move the instance high above the scene, where nothing occludes it."""
     home = np.asarray(world.scene.instances[instance - 1]["T_world_instance"], np.float64)
     away = home.copy()
     away[1, 3] += LIFT

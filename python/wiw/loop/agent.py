@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop's inside: propose, imagine, revise (paper, "Unified Strategy for Closed-Loop Online Planning")."""
+"""The inner loop: propose, imagine, revise (paper, "Unified Strategy for Closed-Loop Online Planning")."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop's outside: keeps many episodes live so that every model call carries a whole batch."""
+"""The outer loop: keeps many episodes live, so that every model call carries a whole batch."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Sink(Protocol):
     def episode(self, result: EpisodeResult) -> None:
         """Record that an episode has ended, or its infrastructure has failed."""
 
-    def again(self, episodes: Sequence[int]) -> None:
-        """Note that these episodes begin anew; what was reported of them does not count."""
+    def record_restart(self, episodes: Sequence[int]) -> None:
+        """Discard what was reported of these episodes: they start again."""
 
     def record_lost(self, spent: Mapping[str, float]) -> None:
         """Record that a decision has failed; what was asked for it, and its "seconds"."""
@@ -138,7 +138,7 @@ def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple
         for each in running:
             each.done = True
         if len(running) > 1:
-            sink.again([each.index for each in running])
+            sink.record_restart([each.index for each in running])
             return [(each.index, each.episode) for each in running]
         sink.episode(_build_error_result(running[0].index, running[0].episode, running[0].begin, kind, error))
         return []

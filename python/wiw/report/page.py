@@ -135,7 +135,7 @@ def _common(summary: Summary) -> dict[str, Any]:
 
 
 def _utility_ends(summary: Summary) -> tuple[float, float]:
-    """Return the ends of the utility scale: 0 to 1, or as far as any arm; intervals are cut at -1 and 2."""
+    """Return the ends of the utility scale: at least [0, 1], and wide enough for all arms within [-1, 2]."""
     shown = [found for found in summary.utilities if found.is_defined]
     low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
     return low, max([1.0, *(min(2.0, found.high) for found in shown), *(found.value for found in shown)])

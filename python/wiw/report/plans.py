@@ -42,10 +42,10 @@ class Primitives:
 
 
 class Numbers(Primitives):
-    """Plans of a space of the user's own, shown as the numbers that they are."""
+    """Plans of a custom plan space, shown as numbers."""
 
     def text(self, plan: Sequence[Any]) -> str:
-        """A plan as numbers."""
+        """Return a plan as numbers."""
         return numbers(plan)
 
 

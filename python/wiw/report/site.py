@@ -24,7 +24,7 @@ from wiw.types import Episode, Wording
 
 
 class PictureFolder(Album):
-    """Pictures as files in a folder, each written once, made by the threads of a pool."""
+    """An album whose pictures are files in a folder, each written once, by a pool of threads."""
 
     panorama_width, frame_height, quality = 1024, 132, 60
     front_side, end_side, goal_side, map_side, whole = 480, 160, 480, 1100, True

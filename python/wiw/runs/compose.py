@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Composes an agent: what experiments and limits a run puts around a policy and a world model."""
+"""Compose an agent: wrap a policy and a world model in a run's experiments and limits."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContex
 
 
 class NextEpisodes:
-    """First moments of the run's next episode, counted round, for swapped placebos.
+    """First observations of the run's next episode (cyclic), for swapped placebos.
 
     Raises:
         ArgumentError: the run has a single episode.
@@ -139,14 +139,14 @@ class NextEpisodes:
         self._moments: dict[tuple[int, int], ModelInput] = {}
 
     def of(self, key: Key) -> ModelInput:
-        """Return the first moment of the next episode."""
+        """Return the first observation of the next episode."""
         name = key.seed, key.episode
         if name not in self._moments:
             self._moments[name] = self._begin((key.episode + 1) % len(self._context.episodes))
         return self._moments[name]
 
     def forget(self, key: Key) -> None:
-        """Drop the moment that is kept for an episode."""
+        """Drop the observation stored for an episode."""
         self._moments.pop((key.seed, key.episode), None)
 
     def _begin(self, index: int) -> ModelInput:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tasks and agents are made again: in worker processes, and when a run is resumed."""
+"""Recipes that rebuild tasks and agents: in worker processes, and when a run is resumed."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ class AgentRecipe(AgentConfig):
         return replace(self, model=None if none else model, model_options={})
 
     def as_placebo(self, kind: str, model: Any = None) -> AgentRecipe:
-        """Return the same agent, whose world model (or another one) imagines something else than the plans."""
+        """Return the same agent with a placebo of its world model (or of another one)."""
         own = PLACEBO_MODEL if self.model is None else self.model
         return replace(self.with_model(own if model is None else model), placebo=kind)
 
@@ -181,7 +181,7 @@ class AgentRecipe(AgentConfig):
                 found.require(task)
 
     def replaying(self, run: Path) -> AgentRecipe:
-        """Return the same agent with the answers that a run has recorded in the place of its language model."""
+        """Return the same agent with a run's recorded answers in place of its language model."""
         replay = {"vlm": f"replay:{run}", "cache": "off"}
         named: dict[str, Mapping[str, Any]] = {name: {} for name in (self.policy, self.reviser) if name == "vlm"}
         options = {
@@ -218,7 +218,7 @@ def _unwrap(part: Any) -> Any:
 
 
 def _describe(part: Any) -> Any:
-    """Return a part's name, or what an object says of itself."""
+    """Return a part's name, or an object's own description."""
     if isinstance(part, Policy | WorldModel | Imaginer):
         return part.describe()
     return part.__name__ if isinstance(part, type) else part
@@ -253,7 +253,7 @@ class AgentInMemory:
         return self.agent
 
     def describe(self) -> dict[str, Any]:
-        """Return what the agent says of itself."""
+        """Return the agent's own description."""
         return dict(self.agent.describe())
 
     def require(self, task: Mapping[str, Any]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What still has to be sent to one client, so that one that does not read fills no memory."""
+"""The send queue of one client, bounded so that a client that does not read cannot fill the memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ UNSENT_BYTES = 256 * 2**20
 
 
 class Outbox:
-    """Sends a client's messages one after another: the next is handed over once the one before has left.
+    """Sends a client's messages one after another: each is handed over after the one before has been sent.
 
     Args:
         client: a `websockets` connection.

@@ -450,7 +450,7 @@ def derive_seed(key: Key, number: int) -> int:
 
 
 def _caption_strips(proposals: Sequence[Proposal], strips: Sequence[prompt_images.Image]) -> list[Part]:
-    """Put each plan in words before its strip."""
+    """Put each plan's description before its strip."""
     parts: list[Part] = []
     for number, (plan, strip) in enumerate(zip(proposals, strips, strict=True), 1):
         parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", strip]
