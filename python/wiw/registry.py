@@ -391,5 +391,5 @@ def task_class(name: str) -> Any:
 
 
 def task_name(task_id: str) -> str:
-    """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths are unchanged."""
+    """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths stay."""
     return task_id if ":" in task_id or task_id in TASKS.names() else task_id.removesuffix("-v0").lower()

@@ -52,7 +52,7 @@ PLAN = np.array(
 )
 
 
-def untrained(seed: int = 0) -> ArmNet:
+def make_untrained(seed: int = 0) -> ArmNet:
     torch.manual_seed(seed)
     return ArmNet.of(Network(SMALL))
 
@@ -205,7 +205,7 @@ def front(table: Workbench) -> Any:
 
 
 def test_rows_do_not_depend_on_each_other(table: Workbench, front: Any) -> None:
-    model, here = untrained(), table.pose
+    model, here = make_untrained(), table.pose
     plans = [np.stack([here, *PLAN]), np.stack([here, *PLAN[::-1]])]
     controls = [control(plans[0]), control(plans[1]), control(plans[0], length=2, shared=1)]
     together = rollout(model, np.stack([front] * 3), controls)
@@ -217,8 +217,8 @@ def test_rows_do_not_depend_on_each_other(table: Workbench, front: Any) -> None:
 
 
 def test_it_says_what_it_is(tmp_path: Path, table: Workbench, front: Any) -> None:
-    one, other = untrained(0), untrained(1)
-    assert one.fingerprint() == untrained(0).fingerprint() != other.fingerprint()
+    one, other = make_untrained(0), make_untrained(1)
+    assert one.fingerprint() == make_untrained(0).fingerprint() != other.fingerprint()
     assert (one.accepts.space, one.accepts.view, one.accepts.frames) == ("pose7", "perspective", 0)
     assert one.accepts.causal and not one.accepts.needs and json.dumps(one.describe())
     save(tmp_path / "w.safetensors", one._network, {})

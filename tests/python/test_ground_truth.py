@@ -31,7 +31,7 @@ from wiw.tasks.imagenav import ImageNav
 from wiw.types import Answer, Goal, Key, Observation
 
 
-def started(task: Any, index: int = 0) -> Any:
+def begin_env(task: Any, index: int = 0) -> Any:
     env = task.environment(depth=False)
     env.begin(task.episode(index))
     return env
@@ -55,7 +55,7 @@ def with_true_scores(policy: Policy, model: Any = None, **numbers: Any) -> wiw.A
 
 @pytest.mark.parametrize("index", range(4))
 def test_true_plans_lead_to_the_goal_almost_as_fast_as_can_be(two_rooms: str, index: int) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"), index)
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"), index)
     steps = 0
     while not env.state.ended:
         segment = env.run(env.guide().suggest_plan(5)[:3])
@@ -65,7 +65,7 @@ def test_true_plans_lead_to_the_goal_almost_as_fast_as_can_be(two_rooms: str, in
 
 
 def test_asking_a_guide_moves_nothing(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     before, guide = env.truth(), env.guide()
     first = guide.evaluate_plan(AHEAD), guide.suggest_plan(9).tolist()
     assert (guide.evaluate_plan(AHEAD), guide.suggest_plan(9).tolist()) == first and len(first[1]) == 9
@@ -74,7 +74,7 @@ def test_asking_a_guide_moves_nothing(two_rooms: str) -> None:
 
 
 def test_worth_is_primitives_to_go_and_best_within_reach(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     guide, start = env.guide(), env.state.geodesic_to_goal()
     plan = guide.suggest_plan(20)
     worths = [guide.evaluate_plan(plan[:k]) for k in range(1, 21)]
@@ -88,7 +88,7 @@ def test_worth_is_primitives_to_go_and_best_within_reach(two_rooms: str) -> None
 
 
 def test_a_goal_that_cannot_be_walked_to_is_judged_in_a_straight_line(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     env.state.goal_position = np.array([40.0, 0.0, 0.0])
     worths = [env.guide().evaluate_plan(plan) for plan in FAN]
     assert np.isfinite(worths).all() and len(env.guide().suggest_plan(5)) == 5
@@ -96,7 +96,7 @@ def test_a_goal_that_cannot_be_walked_to_is_judged_in_a_straight_line(two_rooms:
 
 def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path) -> None:
     task = AR(episode_file=a_file(tmp_path, two_rooms, start=(-1.2, 0.0, 1.2), yaw=np.pi / 2), backend="cpu")
-    env = started(task)
+    env = begin_env(task)
     state, target = env.state, int(env.state.episode.info["target"])
     place = env.fork().position
     size, share = measure_sizes(state.world, place[None])[0, target], visible_fraction(state.world, place, target)
@@ -111,7 +111,7 @@ def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path
 
 
 def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     worths = [env.guide().evaluate_plan(plan) for plan in FAN[:3]]
     for policy, model in ((Noise(), None), (Noise(), "copy")):
         decision = decide(with_true_scores(policy, model), env)
@@ -126,7 +126,7 @@ def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None
 
 
 def test_deeper_beams_are_scored_by_the_truth(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     decision = decide(with_true_scores(Noise(), "copy", depth=2), env)
     assert max(len(plan.actions) for plan in decision.proposals) == 10
     np.testing.assert_array_equal(
@@ -135,7 +135,7 @@ def test_deeper_beams_are_scored_by_the_truth(two_rooms: str) -> None:
 
 
 def test_a_true_plan_leads_and_the_last_one_gives_way(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     env.run(env.guide().suggest_plan(9))
     true = env.guide().suggest_plan(5)
     assert FORWARD in true
@@ -152,7 +152,7 @@ def test_a_true_plan_leads_and_the_last_one_gives_way(two_rooms: str) -> None:
 
 
 def test_a_pool_keeps_the_true_plan_first(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     env.run(env.guide().suggest_plan(9))
     agent = wiw.Agent(TruePlans(Spinner()), candidates=2, pool=3)
     plans = [plan.actions.tolist() for plan in decide(agent, env).proposals]
@@ -195,7 +195,7 @@ class Rememberer(Noise):
     ],
 )
 def test_proposer_and_reviser_of_one_policy_share_its_memory(two_rooms: str, make: Any) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     policy = Rememberer()
     decision = decide(make(policy), env)
     assert (policy.begun, policy.observed, len(policy.memories)) == (1, 1, 2)
@@ -203,7 +203,7 @@ def test_proposer_and_reviser_of_one_policy_share_its_memory(two_rooms: str, mak
 
 
 def test_another_reviser_keeps_a_memory_of_its_own(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     proposer, reviser = Rememberer(), Rememberer()
     decide(wiw.Agent(TruePlans(proposer), "copy", reviser=TrueScores(reviser)), env)
     assert proposer.begun == reviser.begun == proposer.observed == reviser.observed == 1
@@ -211,7 +211,7 @@ def test_another_reviser_keeps_a_memory_of_its_own(two_rooms: str) -> None:
 
 
 def test_true_plans_and_true_scores_compose_with_each_other_and_with_a_changed_model(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     model = Gated(ShuffledPlacebo(wiw.world_model("oracle")), 1.0)
     found = [
         decide(agent, env)
@@ -233,7 +233,7 @@ def test_a_wrapper_that_scores_by_itself_is_asked(two_rooms: str) -> None:
         def score(self, situations: Any, proposals: Any, rollouts: Any) -> Any:
             return [-scores for scores in super().score(situations, proposals, rollouts)]
 
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     plain, other = (decide(wiw.Agent(policy, "copy"), env) for policy in (Noise(), TruePlans(Reversed(Noise()))))
     np.testing.assert_array_equal(other.scores, -plain.scores)
 
@@ -265,7 +265,7 @@ def test_nobody_is_given_the_truth_unasked(two_rooms: str) -> None:
         def __getattr__(self, name: str) -> Any:
             raise AssertionError(f"somebody asks for {name}")
 
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     environments = LiveEnvironments()
     environments.add(Key(0, 0), Guarded())
     agent = wiw.Agent(Noise(), "copy")

@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def told(path: Path) -> dict[Any, Any]:
+def collect_outcomes(path: Path) -> dict[Any, Any]:
     """What was decided and what came of it, by arm and episode."""
     log = load_run(path)
     ends = {(e["arm"], e["episode"]): (e["status"], e["metrics"]) for e in log.episodes}
@@ -88,8 +88,8 @@ def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
         fidelity=True,
         keep_images=0,
     )
-    one = {key: value for key, value in told(run).items() if key[0] == "oracle"}
-    assert told(tmp_path / "two") == one and len(one) == 8
+    one = {key: value for key, value in collect_outcomes(run).items() if key[0] == "oracle"}
+    assert collect_outcomes(tmp_path / "two") == one and len(one) == 8
 
 
 def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,9 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
     with RunStore.read(tmp_path) as store:
         assert 0 < len(store.outcomes()) < 4
     resume_run(tmp_path, progress=False)
-    assert told(tmp_path) == {key: value for key, value in told(run).items() if key[0] == "oracle"}
+    assert collect_outcomes(tmp_path) == {
+        key: value for key, value in collect_outcomes(run).items() if key[0] == "oracle"
+    }
 
 
 @pytest.mark.parametrize(

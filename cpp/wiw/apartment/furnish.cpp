@@ -49,19 +49,19 @@ class Furnisher {
   void build(const PlacedPiece& piece) {
     const Category& category = catalogue()[piece.category];
     Rng rng(stream_key({piece.key, 1}));
-    Make make{piece.size, rng, draft_.materials, draft_.palette.rooms[static_cast<std::size_t>(room_)]};
-    make.on = is_on(category);
-    category.make(make);
+    FurnitureBuilder builder{piece.size, rng, draft_.materials, draft_.palette.rooms[static_cast<std::size_t>(room_)]};
+    builder.on = is_on(category);
+    category.make(builder);
     Eigen::Affine3f pose = Eigen::Affine3f::Identity();
     pose.translate(piece.position).rotate(Eigen::AngleAxisf(piece.yaw, Vec3::UnitY()));
-    Object object{category.name,    category.name, make.attributes, room_, pose, std::move(make.shape), {},
-                  make.casts_shadow};
+    Object object{category.name,       category.name, builder.attributes, room_, pose, std::move(builder.shape), {},
+                  builder.casts_shadow};
     draft_.objects.push_back(std::move(object));
-    for (const Bulb& bulb : make.bulbs) {
+    for (const Bulb& bulb : builder.bulbs) {
       draft_.lights.push_back({pose * bulb.position, Vec3::Zero(), Vec3::Zero(), Vec3::Zero(),
                                bulb.strength * to_linear({1.f, 0.95f, 0.88f}), room_});
     }
-    for (const Support& support : make.supports) surfaces_.push_back({support, pose, {}});
+    for (const Support& support : builder.supports) surfaces_.push_back({support, pose, {}});
   }
 
   /// Finds a free place on one of the surfaces and moves the piece there.

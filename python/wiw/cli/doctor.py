@@ -24,7 +24,7 @@ class Finding:
 
 
 def doctor() -> int:
-    """Say what this machine can do, line by line, with a remedy where something is missing.
+    """Report what this machine can do, line by line, with a remedy where something is missing.
 
     $ wiw doctor
     """

@@ -24,7 +24,7 @@ def list_names(what: Positional[What] = "all", /) -> int:
     that is shown beside a heading.
 
     Args:
-        what: one kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
+        what: Kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
             machine.
     """
     from rich.console import Console

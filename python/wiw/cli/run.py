@@ -66,7 +66,7 @@ def run(
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
     Args:
         task: See `wiw list`.
@@ -84,7 +84,7 @@ def run(
             apartments:val if not given.
         per_scene: Episodes generated in a scene before the next one's turn; the task's own number if not given.
         episode_file: Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World.
-        scene_folder: What scene paths in that file are relative to; its own folder if not given and from wiw.
+        scene_folder: Folder of the scene paths in that file; if not given, for files of wiw the file's own folder.
         motion: What happens to a blocked move; the preset's rule if not given.
         robot: For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given.
         preset: Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not
@@ -96,9 +96,9 @@ def run(
             http://localhost:8000/v1 if not given.
         vlm_model: Its name at the server, or a preset of `wiw list`; not needed where the server has one model.
         vlm_prices: YAML file of `model: [read, written]`, dollars per million tokens, for the costs.
-        semantics: Tells world models that need it what each pixel is: simulator, rednet, or path.py:Class.
+        semantics: Source of semantic labels for world models that need them: simulator, rednet, or path.py:Class.
         semantics_option: An option of --semantics, such as weights=FILE; may be given again.
-        prompts: Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts.
+        prompts: Folder of templates that replace the shipped ones; laid out as wiw/policies/vlm/prompts.
         report: Whether to write report.html at the end.
         search: Numbers of the search.
         config: How the run goes.

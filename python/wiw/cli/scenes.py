@@ -17,7 +17,7 @@ def scenes(
     views: Annotated[int, arg(metavar="N")] = 2,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
 ) -> int:
-    """Load scenes, say how large they are, and draw a sheet: each from above, and panoramas from inside.
+    """Load scenes, print their sizes, and draw a contact sheet: each scene from above, and panoramas from inside.
 
     $ wiw scenes apartments:val:4
     $ wiw scenes house.glb --out house.png
@@ -25,7 +25,7 @@ def scenes(
     Args:
         spec: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         out: Where to write the sheet, a PNG.
-        views: Panoramas of each scene.
+        views: Panoramas per scene.
         backend: Renderer.
     """
     from PIL import Image

@@ -147,7 +147,7 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
 
 
 def _features(types: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the library `datasets` is told of columns, so that it decodes pictures by itself."""
+    """Return column metadata for the library `datasets`, so that it decodes pictures by itself."""
     import pyarrow as pa
 
     def feature(kind: Any) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rerun some episodes of a run and compare every decision and measurement with the record.
 
-What a language model said then, it is taken to say again. Timings are left out, and so is a rollout cache, which would
+Recorded answers of a language model are replayed. Timings are left out, and so is a rollout cache, which would
 answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
 """
 

@@ -61,14 +61,14 @@ class Settings:
     """Where and how a model is served.
 
     Args:
-        host: address to listen at.
-        port: 0 takes a free one.
-        token: what clients must show; needed where others than this machine can reach `host`.
+        host: address to listen on.
+        port: port to listen on; 0 picks a free one.
+        token: secret that clients must send; required unless `host` is a loopback address.
         queue: rows that may wait; None means eight full batches, and at least 64 rows.
-        window: share of a batch's time for which one that is not full waits for clients that are idle.
+        window: how long a batch that is not full waits for idle clients, as a share of a batch's time.
         certificate: PEM file, for wss.
         key: PEM file of its key, where that is not in `certificate`.
-        grace: seconds for finishing what was taken when the server is told to end.
+        grace: seconds for finishing the accepted rows once the server is to end.
 
     Raises:
         ArgumentError: a number out of range, a host beyond this machine without a token, a key without a certificate.

@@ -38,11 +38,11 @@ class Conversation:
         except StopIteration as end:
             reply: Reply = end.value
             latest = len(self._said) - len(answers)
-            said = tuple(
+            records = tuple(
                 CompletionRecord(name, completion, reply.problem is None and (bool(reply.by) or place >= latest))
                 for place, (name, completion) in enumerate(self._said)
             )
-            self.calls, self.reply = [], replace(reply, said=said)
+            self.calls, self.reply = [], replace(reply, completions=records)
 
 
 def _ask_for_text(request: Request) -> Talk:

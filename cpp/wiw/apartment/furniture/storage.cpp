@@ -3,8 +3,8 @@
 
 namespace wiw::apartment {
 
-void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
-                bool drawers) {
+void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns,
+                int rows, bool drawers) {
   const int handle = static_cast<int>(m.rng.below(3));
   const float w = (high.x() - low.x()) / static_cast<float>(columns),
               h = (high.y() - low.y()) / static_cast<float>(rows);
@@ -28,7 +28,7 @@ void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, co
   }
 }
 
-void add_books(Make& m, float x0, float x1, float y, float z, float clearance, float depth) {
+void add_books(FurnitureBuilder& m, float x0, float x1, float y, float z, float clearance, float depth) {
   const MaterialId paper = m.plain("paper", Rgb::Ones());
   const float tall = std::min(clearance - 0.03f, 0.3f);
   float x = x0;
@@ -47,7 +47,7 @@ void add_books(Make& m, float x0, float x1, float y, float z, float clearance, f
 namespace {
 
 /// Case of boards: sides, top, bottom and back around an open front.
-void add_carcass(Make& m, MaterialId wood, const Vec3& low, const Vec3& high, float board) {
+void add_carcass(FurnitureBuilder& m, MaterialId wood, const Vec3& low, const Vec3& high, float board) {
   m.shape.box(wood, low, {low.x() + board, high.y(), high.z()});
   m.shape.box(wood, {high.x() - board, low.y(), low.z()}, high);
   m.shape.box(wood, {low.x() + board, low.y(), low.z()}, {high.x() - board, low.y() + board, high.z()});
@@ -57,7 +57,7 @@ void add_carcass(Make& m, MaterialId wood, const Vec3& low, const Vec3& high, fl
 }
 
 /// Fills a shelf board with books, a gap and perhaps an ornament's place.
-void fill_shelf(Make& m, float x0, float x1, float y, float z, float clearance, float depth) {
+void fill_shelf(FurnitureBuilder& m, float x0, float x1, float y, float z, float clearance, float depth) {
   const double kind = m.rng.uniform();
   const float middle = x0 + (x1 - x0) * range(m.rng, 0.35f, 0.75f);
   if (kind < 0.55)
@@ -71,7 +71,7 @@ void fill_shelf(Make& m, float x0, float x1, float y, float z, float clearance, 
 
 }  // namespace
 
-void make_wardrobe(Make& m) {
+void make_wardrobe(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId wood = m.case_material(color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -93,7 +93,7 @@ void make_wardrobe(Make& m) {
   m.attributes["state"] = "closed";
 }
 
-void make_bookshelf(Make& m) {
+void make_bookshelf(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId wood = m.case_material(color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), board = 0.022f;
@@ -112,7 +112,7 @@ void make_bookshelf(Make& m) {
   if (columns == 2) m.shape.box(wood, {-0.5f * board, board, -hz + 0.008f}, {0.5f * board, m.h() - board, hz - 0.005f});
 }
 
-void make_dresser(Make& m) {
+void make_dresser(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.1f;
   m.shape.soft_box(wood, {-hx, m.h() - 0.03f, -hz}, {hx, m.h(), hz + 0.01f}, 0.008f, 0.f, 1);
@@ -123,7 +123,7 @@ void make_dresser(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.08f}, 0.8f});
 }
 
-void make_sideboard(Make& m) {
+void make_sideboard(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.15f;
   m.shape.soft_box(wood, {-hx, base, -hz}, {hx, m.h(), hz - 0.02f}, 0.008f, 0.f, 1);
@@ -138,7 +138,7 @@ void make_sideboard(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.08f}, 0.8f});
 }
 
-void make_tv_stand(Make& m) {
+void make_tv_stand(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.1f, board = 0.025f;
   add_carcass(m, wood, {-hx, base, -hz}, {hx, m.h(), hz}, board);
@@ -151,7 +151,7 @@ void make_tv_stand(Make& m) {
   m.supports.push_back({{0, m.h(), 0.03f}, {hx - 0.06f, hz - 0.08f}, 0.9f});
 }
 
-void make_shoe_rack(Make& m) {
+void make_shoe_rack(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   for (const float x : {-hx, hx - 0.025f}) m.shape.box(wood, {x, 0, -hz}, {x + 0.025f, m.h(), hz});
@@ -174,7 +174,7 @@ void make_shoe_rack(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.06f}, 0.5f});
 }
 
-void make_coat_rack(Make& m) {
+void make_coat_rack(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w();
   m.shape.soft_box(wood, {-hx, m.h() - 0.1f, -0.5f * m.d()}, {hx, m.h(), -0.5f * m.d() + 0.025f}, 0.008f, 0.f, 1);
@@ -191,7 +191,7 @@ void make_coat_rack(Make& m) {
   }
 }
 
-void make_wall_shelf(Make& m) {
+void make_wall_shelf(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   const int boards = m.h() > 0.4f ? 2 : 1;

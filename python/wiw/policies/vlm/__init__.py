@@ -431,7 +431,7 @@ class VLM(Policy):
         exchange = Exchange(
             purpose,
             self.client.model,
-            tuple({"call": said.call, **said.completion.to_json()} for said in reply.said),
+            tuple({"call": each.call, **each.completion.to_json()} for each in reply.completions),
             {name: value for name, value in self._describe_reading(reply).items() if value},
             "" if reply.problem is None else str(reply.problem),
             "" if reply.problem is None else instead,

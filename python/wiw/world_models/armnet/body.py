@@ -29,7 +29,7 @@ class ArmView:
     arm: NDArray[np.bool_]
     """[H, W]: where it hides the table."""
     pose: NDArray[np.float64]
-    """float64 [7] of the gripper, which may not have come to the pose that it was told to go to."""
+    """float64 [7]: the gripper's actual pose, which may differ from the commanded one."""
 
 
 @cache
@@ -52,7 +52,7 @@ def _depth(size: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def render_arm(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[ArmView]:
-    """Yield the arm after it has gone to each of the poses [N, 7] in turn, from where it waits."""
+    """Yield the view of the arm after it has moved to each of the poses [N, 7] in turn, from its start pose."""
     bench = _bare().fork()
     for pose in poses:
         bench.move_to(np.clip(pose, *_RANGE))
