@@ -214,7 +214,7 @@ def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplo
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/replies.sqlite").write_bytes(b"no database" * 100)
     broken = ReplyCache(tmp_path / "broken")
-    assert broken.get("a") is None and "not kept any more" in caplog.text
+    assert broken.get("a") is None and "no longer cached" in caplog.text
     broken.put({"a": Completion("x")})
     with pytest.raises(ArgumentError, match="above 0"):
         ReplyCache(tmp_path, 0)

@@ -101,5 +101,5 @@ def announce_resume() -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, Terminated):
-        print("\nstopped. The same command goes on with what is kept", file=sys.stderr)
+        print("\nstopped. Repeat the command to resume; finished parts are kept", file=sys.stderr)
         raise

@@ -360,7 +360,7 @@ def load(
         if episode.info["category"] not in named:
             raise FileError(
                 f"{path}: episode {i}: info.category '{episode.info['category']}' is none of the categories "
-                f"{', '.join(named)}; mend the file, or name it too (categories=[...])"
+                f"{', '.join(named)}; correct the file, or name it too (categories=[...])"
             )
     return found, tuple(named)
 

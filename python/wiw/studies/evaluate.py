@@ -107,7 +107,7 @@ def resume_run(
     try:
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
-            raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
+            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
         task, agents = recipes_of(store)
         require_own_sources(store, task, agents)
         built = task.build()

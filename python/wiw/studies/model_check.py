@@ -241,8 +241,8 @@ class _ModelExaminer:
         except LateError:
             finding = Finding(
                 "deadline",
-                f"No answer in {self.deadline:g} s, so it was asked no more. In a run such a call is made three times, "
-                "then its episode has failed. Does it wait for a download, a lock, a server or a prompt? If it is only "
+                f"No answer in {self.deadline:g} s, so the check stopped. In a run such a call is made three times, "
+                "then its episode ends with an error. Does it wait for a download, a lock, a server or a prompt? If it is only "
                 "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
         except ExitError as error:
@@ -288,7 +288,7 @@ class _ModelExaminer:
             yield Finding(
                 "frame 0",
                 f"Frame 0 is the observation only nearly: {difference}, as of a picture that was encoded and decoded. "
-                "That costs next to nothing; frames[:, 0] = observations.image mends it.",
+                "That costs next to nothing; frames[:, 0] = observations.image corrects it.",
                 serious=False,
             )
         else:
