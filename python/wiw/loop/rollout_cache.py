@@ -102,7 +102,7 @@ class RolloutCache:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
             self._writing = False
-            _log.warning("rollouts are no longer cached: %s; free disk space or name another folder with --cache", error)
+            _log.warning("rollouts are no longer cached: %s; free disk space or set another folder by --cache", error)
             return
         self._written += size
         if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:

@@ -242,8 +242,8 @@ class _ModelExaminer:
             finding = Finding(
                 "deadline",
                 f"No answer in {self.deadline:g} s, so the check stopped. In a run such a call is made three times, "
-                "then its episode ends with an error. Does it wait for a download, a lock, a server or a prompt? If it is only "
-                "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
+                "then its episode ends with an error. Does it wait for a download, a lock, a server or a prompt? If it "
+                "is only slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
         except ExitError as error:
             text = f"`rollout` raised {_locate(error.__cause__ or error)}. Raise an Exception to report a failure."
