@@ -44,7 +44,7 @@ def run(
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
     Args:
         task: See `wiw list`.

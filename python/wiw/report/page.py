@@ -16,7 +16,7 @@ from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.report import plots
 from wiw.report.episodes import read_stories, wording
 from wiw.report.story import Album
@@ -32,7 +32,7 @@ def write_report(run: Run, path: Path) -> Path:
         FileError: the file cannot be written; what was there before is kept.
     """
     page = render(run)
-    with whole_file(path) as draft:
+    with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 
@@ -135,7 +135,7 @@ def _common(summary: Summary) -> dict[str, Any]:
 
 
 def _utility_ends(summary: Summary) -> tuple[float, float]:
-    """Return the ends of the utility scale: 0 to 1, or as far as any arm; intervals are cut at -1 and 2."""
+    """Return the ends of the utility scale: at least [0, 1], and wide enough for all arms within [-1, 2]."""
     shown = [found for found in summary.utilities if found.is_defined]
     low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
     return low, max([1.0, *(min(2.0, found.high) for found in shown), *(found.value for found in shown)])
