@@ -2,19 +2,59 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
+#include <string>
+#include <vector>
+
 #include "wiw/apartment/apartment.hpp"
+#include "wiw/apartment/edits.hpp"
 
 namespace py = pybind11;
+namespace apartment = wiw::apartment;
+
+using Texts = std::vector<std::string>;
 
 void bind_apartment(py::module_& module) {
   module.def(
       "apartment",
-      [](std::uint64_t seed, const std::string& split) {
-        const wiw::apartment::Split part = wiw::apartment::split_from_name(split);
+      [](std::uint64_t seed, const std::string& split, const Texts& edits) {
+        const apartment::Split part = apartment::split_from_name(split);
         const py::gil_scoped_release release;
-        return std::make_shared<wiw::scene::Scene>(wiw::apartment::make_apartment(seed, part));
+        return std::make_shared<wiw::scene::Scene>(
+            apartment::make_apartment(seed, part, apartment::parse_edits(edits)));
       },
-      py::arg("seed"), py::arg("split"), "Furnished apartment with baked light, a function of seed and split.");
+      py::arg("seed"), py::arg("split"), py::arg("edits") = Texts{},
+      "Furnished apartment with baked light, a function of seed, split and edits.");
+  module.def(
+      "apartment_outline",
+      [](std::uint64_t seed, const std::string& split, const Texts& edits) {
+        const apartment::Split part = apartment::split_from_name(split);
+        const py::gil_scoped_release release;
+        return std::make_shared<wiw::scene::Scene>(
+            apartment::outline_apartment(seed, part, apartment::parse_edits(edits)));
+      },
+      py::arg("seed"), py::arg("split"), py::arg("edits") = Texts{},
+      "The same rooms and instances without textures and light.");
+  module.def(
+      "possible_edits",
+      [](std::uint64_t seed, const std::string& split, const Texts& edits) {
+        const apartment::Split part = apartment::split_from_name(split);
+        const py::gil_scoped_release release;
+        Texts texts;
+        for (const apartment::Edit& edit : apartment::possible_edits(seed, part, apartment::parse_edits(edits)))
+          texts.push_back(apartment::to_text(edit));
+        return texts;
+      },
+      py::arg("seed"), py::arg("split"), py::arg("edits") = Texts{},
+      "Edits that the apartment with `edits` can have as well.");
+  module.def(
+      "canonical_edits",
+      [](const Texts& edits) {
+        Texts texts;
+        for (const apartment::Edit& edit : apartment::parse_edits(edits)) texts.push_back(apartment::to_text(edit));
+        return texts;
+      },
+      py::arg("edits"), "The same edits in one order and spelling. Raises ArgumentError where one is none.");
+  module.def("color_names", [] { return apartment::color_names(); }, "Names of colours, sorted.");
   module.def(
       "apartment_identity",
       [](std::uint64_t seed, const std::string& split) {

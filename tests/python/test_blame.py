@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import re
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -255,6 +257,42 @@ def test_another_run_in_the_same_folder_and_resume(run: Path) -> None:
     assert wiw.load_run(run).blame() == []
     with pytest.raises(StoreError, match="attributes"):
         wiw.blame(run, "spinner")
+
+
+@pytest.fixture
+def old_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run with schema version 7, of whose two failures one was rerun; recipes said `revision` and `swaps` then."""
+    folder = tmp_path / "old"
+    for name, place in (("blamed_run_schema_7", folder), ("blame_schema_7", folder / "blame")):
+        dump = gzip.decompress((Path(__file__).parents[1] / "data" / f"{name}.sql.gz").read_bytes()).decode()
+        place.mkdir()
+        with closing(sqlite3.connect(store_path(place))) as connection:
+            connection.executescript(dump)
+            ((version,),) = connection.execute("SELECT wiw_version FROM run")
+    monkeypatch.setattr(wiw, "__version__", version)
+    return folder
+
+
+def test_reruns_begun_by_an_earlier_version_are_continued(old_run: Path) -> None:
+    before = again(old_run)
+    assert {arm for arm, _ in before} == {"copy/imagination", "copy/scoring", "copy/proposals", "copy/all"}
+    with RunStore.read(old_run / "blame") as store:
+        agents = [arm["agent"] for arm in store.config["arms"]]
+        assert [agent["ground_truth"] for agent in agents] == [list(stages) for stages in RERUNS.values()]
+        assert {agent["reviser"] for agent in agents} == {"climber"}
+        built = store.info["built"]
+    assert built["copy/scoring"]["revision"]["ground_truth"] == "scoring" and "swaps" not in built["copy/scoring"]
+    found = wiw.blame(old_run, progress=False)["copy"]
+    assert len(found.episodes) == 2 and not found.rerun_errors
+    assert before.items() < again(old_run).items()
+    assert wiw.verify(old_run / "blame", episodes=1).same
+
+
+def test_a_run_begun_by_an_earlier_version_is_resumed_by_the_same_call(old_run: Path) -> None:
+    task = TaskRecipe("imagenav", {"scenes": "apartments:val:1", "backend": "cpu", "decisions": 1})
+    agent = AgentRecipe("heuristic", "copy", "climber")
+    change(old_run, "DELETE FROM outcome WHERE episode = 1")
+    assert evaluate(task, agent, 2, arms=["copy"], out=old_run, resume=True, progress=False).complete
 
 
 def test_an_agent_that_has_changed_is_refused(run: Path) -> None:

@@ -113,3 +113,39 @@ def test_the_command(two_rooms, tmp_path, capsys) -> None:
         assert said in capsys.readouterr().err
     with pytest.raises(ArgumentError, match="with a world model"):
         wiw.scale("imagenav", wiw.Agent("heuristic"))
+
+
+def test_the_command_line_takes_the_flags_of_runs(two_rooms, tmp_path, capsys) -> None:
+    flags = [
+        "--scenes",
+        two_rooms,
+        "--per-scene",
+        "2",
+        "--motion",
+        "slide",
+        "--backend",
+        "cpu",
+        "--policy",
+        "heuristic",
+    ]
+    search = [
+        "--policy",
+        "heuristic",
+        "--revision",
+        "matcher",
+        "--horizon",
+        "4",
+        "--execute",
+        "1",
+        "--candidates",
+        "1,2",
+    ]
+    options = ["--task-option", "decisions=1", "--episodes", "1", "--no-progress", "--out", str(tmp_path / "run")]
+    assert main(["scale", "imagenav", "--world-model", "copy", *flags, *search, *options]) == 0
+    config = wiw.load_run(tmp_path / "run").store.config
+    task, arms = config["task"], config["arms"]
+    assert (task["per_scene"], task["motion"]) == (2, "slide")
+    assert [(arm["agent"]["candidates"], arm["agent"]["execute"]) for arm in arms] == [(1, 1), (2, 1)]
+    assert main(["scale", "imagenav", "--width", "2"]) == 2 and "--depth 2" in capsys.readouterr().err
+    assert main(["scale", "imagenav", "--prompts", str(tmp_path)]) == 2
+    assert "are for policy vlm" in capsys.readouterr().err

@@ -5,6 +5,7 @@
 #include <array>
 
 #include "wiw/apartment/draft.hpp"
+#include "wiw/apartment/edits.hpp"
 #include "wiw/core/error.hpp"
 
 namespace wiw::apartment {
@@ -24,7 +25,9 @@ Split split_from_name(const std::string& name) {
 
 std::string split_name(Split split) { return kSplitNames[static_cast<std::size_t>(split)]; }
 
-scene::Scene make_apartment(std::uint64_t seed, Split split, ThreadPool& pool) {
+namespace {
+
+Draft make_draft(std::uint64_t seed, Split split, const std::vector<Edit>& edits) {
   Draft draft;
   draft.seed = seed;
   draft.split = split;
@@ -34,7 +37,27 @@ scene::Scene make_apartment(std::uint64_t seed, Split split, ThreadPool& pool) {
   build_walls(draft);
   build_openings(draft);
   furnish(draft);
-  return bake(draft, pool);
+  balance_lights(draft);
+  apply_edits(draft, edits);
+  return draft;
+}
+
+}  // namespace
+
+scene::Scene make_apartment(std::uint64_t seed, Split split, ThreadPool& pool) {
+  return make_apartment(seed, split, {}, pool);
+}
+
+scene::Scene make_apartment(std::uint64_t seed, Split split, const std::vector<Edit>& edits, ThreadPool& pool) {
+  return bake(make_draft(seed, split, edits), pool);
+}
+
+scene::Scene outline_apartment(std::uint64_t seed, Split split, const std::vector<Edit>& edits) {
+  return outline(make_draft(seed, split, edits));
+}
+
+std::vector<Edit> possible_edits(std::uint64_t seed, Split split, const std::vector<Edit>& edits) {
+  return possible_edits(make_draft(seed, split, edits), edits);
 }
 
 ApartmentIdentity apartment_identity(std::uint64_t seed, Split split) {

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 // From a draft to the finished scene: light to bytes, objects to instances.
 #include <cmath>
-#include <map>
 
 #include "wiw/apartment/draft.hpp"
 #include "wiw/apartment/lighting.hpp"
@@ -80,15 +79,15 @@ std::vector<Vec2> texture_uv(const Submesh& part, const Finish& finish) {
 /// Builds the scene's meshes and instances; vertex-lit parts take their light in the order of the solver's samples.
 class InstanceBaker {
  public:
-  InstanceBaker(const Draft& draft, const Atlas& atlas, scene::Scene& scene, const std::vector<Rgb>& light)
-      : draft_(draft), atlas_(atlas), scene_(scene), light_(light), next_(atlas.texels) {}
+  InstanceBaker(const Draft& draft, scene::Scene& scene) : draft_(draft), scene_(scene) {}
+  InstanceBaker(const Draft& draft, scene::Scene& scene, const Atlas& atlas, const std::vector<Rgb>& light)
+      : draft_(draft), scene_(scene), atlas_(&atlas), light_(&light), next_(atlas.texels) {}
 
   void add(const Object& object) {
     scene::Instance instance;
     instance.id = static_cast<std::uint32_t>(scene_.instances.size() + 1);
     instance.category = category(object.category);
-    instance.name =
-        object.name == object.category ? object.name + " " + std::to_string(++count_[object.name]) : object.name;
+    instance.name = object.name;
     instance.T_world_instance = object.pose;
     instance.attributes = object.attributes;
     if (object.room != kOutside)
@@ -110,7 +109,7 @@ class InstanceBaker {
     scene::Mesh mesh;
     mesh.positions = part.positions;
     mesh.normals = part.normals;
-    mesh.uv = texture_uv(part, draft_.materials.finish(part.material));
+    if (light_ != nullptr) mesh.uv = texture_uv(part, draft_.materials.finish(part.material));
     mesh.triangles = part.triangles;
     mesh.material = static_cast<std::int32_t>(part.material);
     return mesh;
@@ -118,10 +117,11 @@ class InstanceBaker {
 
   std::uint32_t add_panel(const Panel& panel) {
     scene::Mesh mesh = to_mesh(panel.part);
+    if (light_ == nullptr) return store(std::move(mesh));
     std::vector<Vec2> uv;
     uv.reserve(panel.part.positions.size());
     for (const Vec3& position : panel.part.positions)
-      uv.push_back(atlas_.uv(draft_.charts[panel.chart], atlas_.places[panel.chart], position));
+      uv.push_back(atlas_->uv(draft_.charts[panel.chart], atlas_->places[panel.chart], position));
     mesh.lightmap_uv = std::move(uv);
     mesh.lightmap = static_cast<std::int32_t>(scene_.textures.size()) - 2;
     return store(std::move(mesh));
@@ -130,10 +130,17 @@ class InstanceBaker {
   /// Vertex colours hold half the light, since they cannot exceed 1; the full-bright lightmap doubles it.
   std::uint32_t add_part(const Submesh& part) {
     scene::Mesh mesh = to_mesh(part);
+    if (light_ == nullptr) {
+      std::vector<Bytes4> tints;
+      for (const Rgb& tint : part.tint)
+        tints.emplace_back(to_byte(tint.x()), to_byte(tint.y()), to_byte(tint.z()), std::uint8_t{255});
+      mesh.colors = std::move(tints);
+      return store(std::move(mesh));
+    }
     const bool emissive = draft_.materials.finish(part.material).emissive;
     std::vector<Bytes4> colors;
     for (const Rgb& tint : part.tint) {
-      const Rgb light = to_display(light_[next_++]);
+      const Rgb light = to_display((*light_)[next_++]);
       const Rgb shown = emissive ? tint : Rgb(tint.cwiseProduct(light));
       colors.emplace_back(to_byte(shown.x()), to_byte(shown.y()), to_byte(shown.z()), std::uint8_t{255});
     }
@@ -151,11 +158,10 @@ class InstanceBaker {
   }
 
   const Draft& draft_;
-  const Atlas& atlas_;
   scene::Scene& scene_;
-  const std::vector<Rgb>& light_;
-  std::size_t next_;
-  std::map<std::string, int> count_;
+  const Atlas* atlas_ = nullptr;  // neither atlas nor light: an outline
+  const std::vector<Rgb>* light_ = nullptr;
+  std::size_t next_ = 0;
 };
 
 void describe(scene::Scene& scene, const Draft& draft) {
@@ -164,6 +170,11 @@ void describe(scene::Scene& scene, const Draft& draft) {
                       {"seed", std::to_string(draft.seed)},
                       {"layout", draft.plan.signature},
                       {"area_m2", std::to_string(static_cast<int>(std::lround(draft.plan.area())))}};
+  for (const std::string& edit : draft.edits) {
+    scene.name += (scene.attributes.contains("edits") ? "&" : "?") + edit;
+    std::string& edits = scene.attributes["edits"];
+    edits += (edits.empty() ? "" : "&") + edit;
+  }
   for (const PlanRoom& room : draft.plan.rooms) {
     const Rect r = room.inside();
     scene.rooms.push_back({room.name, room_name(room.type),
@@ -183,7 +194,17 @@ scene::Scene bake(const Draft& draft, ThreadPool& pool) {
   const std::vector<Rgb> light = solver.solve(pool);
   scene.textures.push_back(make_lightmap(atlas, light, pool));
   scene.textures.push_back({"full light", {4, 4}, std::vector<std::uint8_t>(64, 255)});
-  InstanceBaker assembler(draft, atlas, scene, light);
+  InstanceBaker assembler(draft, scene, atlas, light);
+  for (const Object& object : draft.objects) assembler.add(object);
+  return scene;
+}
+
+scene::Scene outline(const Draft& draft) {
+  scene::Scene scene;
+  describe(scene, draft);
+  scene.materials = draft.materials.to_materials();
+  for (scene::Material& material : scene.materials) material.texture = scene::kNone;
+  InstanceBaker assembler(draft, scene);
   for (const Object& object : draft.objects) assembler.add(object);
   return scene;
 }

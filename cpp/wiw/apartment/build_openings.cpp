@@ -84,8 +84,9 @@ void add_leaf(FurnitureShape& shape, MaterialId material, MaterialId panel, Mate
   add_handle(shape, metal, direction * (width - 0.06f), 0.f, direction);
 }
 
-void describe(Object& object, const std::string& color, const std::string& material, const std::string& state) {
-  object.attributes["color"] = color;
+void describe(Object& object, const Rgb& color, const std::string& material, const std::string& state) {
+  object.color = color;
+  object.attributes["color"] = color_name(color);
   object.attributes["material"] = material;
   object.attributes["state"] = state;
 }
@@ -113,7 +114,7 @@ void add_door(Draft& draft, const Opening& o) {
   const MaterialId sill = draft.materials.tinted(Pattern::kGrain, draft.palette.door);
   Object lining{"door frame of " + room, "door frame", {}, o.room_a, frame};
   add_lining(lining.shape, style.frame, sill, o, entrance ? kInnerFace - kOuterWall : -kInnerFace, kInnerFace, true);
-  describe(lining, color_name(draft.materials.finish(style.frame).color), "wood", "fixed");
+  describe(lining, draft.materials.finish(style.frame).color, "wood", "fixed");
   draft.objects.push_back(std::move(lining));
 
   Object leaf{entrance ? "entrance door" : "door of " + room, "door", {}, o.room_a, frame};
@@ -126,7 +127,7 @@ void add_door(Draft& draft, const Opening& o) {
       entrance ? draft.materials.tinted(Pattern::kGrain, draft.palette.rooms[static_cast<std::size_t>(o.room_a)].accent)
                : style.leaf;
   add_leaf(leaf.shape, face, face, style.metal, width, o.top - kLining - 0.005f, -hinge, style.style);
-  describe(leaf, color_name(draft.materials.finish(face).color), "wood", entrance ? "closed" : "open");
+  describe(leaf, draft.materials.finish(face).color, "wood", entrance ? "closed" : "open");
   draft.objects.push_back(std::move(leaf));
 }
 
@@ -139,7 +140,7 @@ void add_arch(Draft& draft, const Opening& o) {
       "passage of " + draft.plan.rooms[static_cast<std::size_t>(o.room_a)].name, "passage", {}, o.room_a, frame_of(o)};
   add_lining(arch.shape, side, draft.materials.tinted(Pattern::kGrain, draft.palette.door), o, -kInnerFace, kInnerFace,
              !plain);
-  describe(arch, color_name(draft.materials.finish(side).color), draft.materials.finish(side).kind, "open");
+  describe(arch, draft.materials.finish(side).color, draft.materials.finish(side).kind, "open");
   draft.objects.push_back(std::move(arch));
 }
 
@@ -188,13 +189,13 @@ void add_window(Draft& draft, const Opening& o) {
              : o.width() > 0.95f ? 2
                                  : 1,
              rng.chance(0.5));
-  describe(window, color_name(draft.materials.finish(frame).color), wooden ? "wood" : "plastic", "closed");
+  describe(window, draft.materials.finish(frame).color, wooden ? "wood" : "plastic", "closed");
   const Eigen::Affine3f pose = window.pose;
   const float half_height = 0.5f * (o.top - o.bottom);
   draft.lights.push_back({pose * Vec3(0, o.bottom + half_height, kInnerFace - 0.03f),
                           pose.linear() * Vec3(0.46f * o.width(), 0, 0), Vec3(0, 0.94f * half_height, 0),
                           pose.linear() * Vec3::UnitZ(), Rgb::Constant(4.f * 0.25f * o.width() * 2.f * half_height),
-                          o.room_a});
+                          o.room_a, draft.objects.size()});
   draft.objects.push_back(std::move(window));
 }
 

@@ -13,7 +13,14 @@ namespace {
 struct SupportSurface {
   Support support;
   Eigen::Affine3f pose;
+  std::size_t object;
   std::vector<Eigen::AlignedBox2f> taken;
+};
+
+/// What a piece was set down on.
+struct Below {
+  std::int32_t object = scene::kNone;
+  float headroom = 0.f;
 };
 
 class Furnisher {
@@ -47,21 +54,21 @@ class Furnisher {
   }
 
   void build(const PlacedPiece& piece) {
-    const Category& category = catalogue()[piece.category];
-    Rng rng(stream_key({piece.key, 1}));
-    Make make{piece.size, rng, draft_.materials, draft_.palette.rooms[static_cast<std::size_t>(room_)]};
-    make.on = is_on(category);
-    category.make(make);
+    const Design design{piece.category, piece.size, piece.key, room_, is_on(catalogue()[piece.category])};
+    BuiltPiece built = build_piece(design, "", draft_.materials, draft_.palette);
     Eigen::Affine3f pose = Eigen::Affine3f::Identity();
     pose.translate(piece.position).rotate(Eigen::AngleAxisf(piece.yaw, Vec3::UnitY()));
-    Object object{category.name,    category.name, make.attributes, room_, pose, std::move(make.shape), {},
-                  make.casts_shadow};
-    draft_.objects.push_back(std::move(object));
-    for (const Bulb& bulb : make.bulbs) {
-      draft_.lights.push_back({pose * bulb.position, Vec3::Zero(), Vec3::Zero(), Vec3::Zero(),
-                               bulb.strength * to_linear({1.f, 0.95f, 0.88f}), room_});
+    const std::size_t index = draft_.objects.size();
+    built.object.pose = pose;
+    built.object.support = below_.object;
+    built.object.headroom = below_.headroom;
+    draft_.objects.push_back(std::move(built.object));
+    for (const Bulb& bulb : built.bulbs) {
+      draft_.lights.push_back(
+          {pose * bulb.position, Vec3::Zero(), Vec3::Zero(), Vec3::Zero(), bulb.strength * lamp_color(), room_, index});
     }
-    for (const Support& support : make.supports) surfaces_.push_back({support, pose, {}});
+    for (const Support& support : built.supports) surfaces_.push_back({support, pose, index, {}});
+    below_ = {};
   }
 
   /// Finds a free place on one of the surfaces and moves the piece there.
@@ -80,6 +87,7 @@ class Furnisher {
                         [&](const auto& other) { return other.intersects(area); }))
           continue;
         surface.taken.push_back(area);
+        below_ = {static_cast<std::int32_t>(surface.object), surface.support.clearance};
         piece.position = surface.pose * Vec3(surface.support.center + Vec3(at.x(), 0, at.y()));
         const Vec3 front = surface.pose.linear() * Vec3::UnitZ();
         piece.yaw = std::atan2(front.x(), front.z()) + (piece.parent >= 0 ? 0.f : range(rng_, -0.4f, 0.4f));
@@ -119,13 +127,46 @@ class Furnisher {
   Rng rng_;
   bool lamps_on_ = true;
   std::vector<SupportSurface> surfaces_;
+  Below below_;
 };
 
+void number_names(std::vector<Object>& objects) {
+  std::map<std::string, int> count;
+  for (Object& object : objects) {
+    if (object.name == object.category) object.name.append(1, ' ').append(std::to_string(++count[object.category]));
+  }
+}
+
 }  // namespace
+
+Rgb lamp_color() { return to_linear({1.f, 0.95f, 0.88f}); }
+
+BuiltPiece build_piece(const Design& design, const std::string& state, MaterialTable& materials,
+                       const Palette& palette) {
+  const Category& category = catalogue()[design.category];
+  Rng rng(stream_key({design.key, 1}));
+  FurnitureBuilder make{design.size, rng, materials, palette.rooms[static_cast<std::size_t>(design.room)]};
+  make.on = state.empty() ? design.on : state == "on";
+  make.state = state;
+  category.make(make);
+  Object object{category.name,
+                category.name,
+                std::move(make.attributes),
+                design.room,
+                Eigen::Affine3f::Identity(),
+                std::move(make.shape),
+                {},
+                make.casts_shadow};
+  object.color = make.main_color;
+  object.design = design;
+  object.leaves = std::move(make.leaves);
+  return {std::move(object), std::move(make.bulbs), std::move(make.supports)};
+}
 
 void furnish(Draft& draft) {
   for (std::int32_t room = 0; room < static_cast<std::int32_t>(draft.plan.rooms.size()); ++room)
     Furnisher(draft, room).run();
+  number_names(draft.objects);
 }
 
 }  // namespace wiw::apartment

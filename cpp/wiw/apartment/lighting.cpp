@@ -68,7 +68,7 @@ LightSolver::LightSolver(const Draft& draft, const Atlas& atlas, const std::vect
   }
   add_texels(draft);
   for (const Object& object : draft.objects) add_object(draft, object, albedo);
-  prepare_lights(draft);
+  find_reach(draft);
   tracer_ = std::make_unique<RayTracer>(std::move(vertices_), std::move(triangles_));
 }
 
@@ -136,27 +136,37 @@ void LightSolver::add_object(const Draft& draft, const Object& object, const std
   }
 }
 
-/// Scales the lights so that each room gets its share of light for its size, and finds which rooms each one reaches.
-void LightSolver::prepare_lights(const Draft& draft) {
-  lights_ = draft.lights;
+void balance_lights(Draft& draft) {
   const auto rooms = static_cast<std::int32_t>(draft.plan.rooms.size());
-  lit_.resize(static_cast<std::size_t>(rooms));
+  draft.lamp_light.resize(static_cast<std::size_t>(rooms));
   for (std::int32_t room = 0; room < rooms; ++room) {
     Rng rng = stream(draft.seed, Stream::kLight, static_cast<std::uint64_t>(room));
     float lamps = 0.f, windows = 0.f;
-    for (const Light& light : lights_) {
+    for (const Light& light : draft.lights) {
       if (light.room == room) (light.one_sided() ? windows : lamps) += light.strength.y();
     }
     const float level = range(rng, 0.44f, 0.54f), area = surface_area(draft.plan, room);
-    const float day = windows <= 0.f ? 0.f : lamps <= 0.f ? 1.f : range(rng, 0.4f, 0.6f);
+    const float mixed = windows <= 0.f ? 0.f : range(rng, 0.4f, 0.6f);
+    const float day = windows > 0.f && lamps <= 0.f ? 1.f : mixed;
     const Rgb sky(0.9f, 0.98f, 1.1f);
-    for (Light& light : lights_) {
+    for (Light& light : draft.lights) {
       if (light.room != room) continue;
       if (light.one_sided())
         light.strength = sky * (light.strength.y() / windows * day * level * area * 2.f / kTurn);
       else
         light.strength = light.strength * ((1.f - day) * level * area / (lamps * 2.f * kTurn));
     }
+    draft.lamp_light[static_cast<std::size_t>(room)] = {(1.f - mixed) * level * area / (2.f * kTurn),
+                                                        lamps / lamp_color().y()};
+  }
+}
+
+/// Finds which rooms each light reaches.
+void LightSolver::find_reach(const Draft& draft) {
+  lights_ = draft.lights;
+  const auto rooms = static_cast<std::int32_t>(draft.plan.rooms.size());
+  lit_.resize(static_cast<std::size_t>(rooms));
+  for (std::int32_t room = 0; room < rooms; ++room) {
     for (std::size_t i = 0; i < lights_.size(); ++i) {
       if (lights_[i].room == room) lit_[static_cast<std::size_t>(room)].push_back({i});
     }
@@ -170,7 +180,7 @@ void LightSolver::prepare_lights(const Draft& draft) {
   }
 }
 
-Rgb LightSolver::from_light(const Sample& sample, const Lit& lit) const {
+Rgb LightSolver::from_light(const Sample& sample, const VisibleLight& lit) const {
   const Light& light = lights_[lit.light];
   RayTracer::Directions to;
   std::array<bool, RayTracer::kWidth> active{};
@@ -203,7 +213,7 @@ Rgb LightSolver::from_light(const Sample& sample, const Lit& lit) const {
 Rgb LightSolver::direct(const Sample& sample) const {
   Rgb sum = Rgb::Zero();
   if (sample.room == kOutside) return sum;
-  for (const Lit& lit : lit_[static_cast<std::size_t>(sample.room)]) sum += from_light(sample, lit);
+  for (const VisibleLight& lit : lit_[static_cast<std::size_t>(sample.room)]) sum += from_light(sample, lit);
   return sum;
 }
 

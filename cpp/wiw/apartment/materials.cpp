@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/apartment/materials.hpp"
 
+#include <algorithm>
+
 #include "wiw/apartment/random.hpp"
 
 namespace wiw::apartment {
@@ -66,6 +68,25 @@ MaterialId MaterialTable::covering(Pattern pattern, std::vector<Rgb> colors, con
 MaterialId MaterialTable::image(Pattern pattern, std::vector<Rgb> colors, std::uint32_t variant, Size size,
                                 const std::string& kind, bool emissive) {
   return add({kind, Rgb::Ones(), request({pattern, std::move(colors), variant, size}), Vec2::Ones(), emissive});
+}
+
+bool MaterialTable::shows(MaterialId id, const Rgb& color) const {
+  const Finish& finish = finishes_[id];
+  if (finish.color == color) return true;
+  if (finish.texture == scene::kNone) return false;
+  const std::vector<Rgb>& colors = requests_[static_cast<std::size_t>(finish.texture)].colors;
+  return std::find(colors.begin(), colors.end(), color) != colors.end();
+}
+
+MaterialId MaterialTable::repaint(MaterialId id, const Rgb& from, const Rgb& to) {
+  Finish finish = finishes_[id];
+  if (finish.color == from) finish.color = to;
+  if (finish.texture != scene::kNone) {
+    TextureRequest drawn = requests_[static_cast<std::size_t>(finish.texture)];
+    std::replace(drawn.colors.begin(), drawn.colors.end(), from, to);
+    finish.texture = request(std::move(drawn));
+  }
+  return add(std::move(finish));
 }
 
 std::vector<scene::Texture> MaterialTable::draw_textures(ThreadPool& pool) const {

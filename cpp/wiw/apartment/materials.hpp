@@ -34,6 +34,11 @@ class MaterialTable {
   MaterialId image(Pattern pattern, std::vector<Rgb> colors, std::uint32_t variant, Size size, const std::string& kind,
                    bool emissive = false);
 
+  /// Whether the finish has the colour, itself or in its texture.
+  [[nodiscard]] bool shows(MaterialId id, const Rgb& color) const;
+  /// The same finish with one colour instead of another.
+  MaterialId repaint(MaterialId id, const Rgb& from, const Rgb& to);
+
   [[nodiscard]] const Finish& finish(MaterialId id) const { return finishes_[id]; }
   [[nodiscard]] std::size_t size() const { return finishes_.size(); }
   /// Draws the textures requested so far.

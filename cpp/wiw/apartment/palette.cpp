@@ -5,6 +5,7 @@
 #include <set>
 
 #include "wiw/apartment/random.hpp"
+#include "wiw/core/error.hpp"
 
 namespace wiw::apartment {
 
@@ -130,6 +131,55 @@ Palette make_palette(std::uint64_t seed, Split split, const FloorPlan& plan) {
     palette.rooms.back().trim = trim;
   }
   return palette;
+}
+
+namespace {
+
+/// Middle of a colour's name: lightness, chroma and hue.
+struct NamedColor {
+  std::string name;
+  Eigen::Vector2f lightness, chroma, hue;
+};
+
+const std::vector<NamedColor>& named_colors() {
+  static const std::vector<NamedColor> kColors{{"beige", {0.8f, 0.87f}, {0.045f, 0.06f}, {75.f, 95.f}},
+                                               {"black", {0.2f, 0.26f}, {0.005f, 0.012f}, {0.f, 360.f}},
+                                               {"blue", {0.45f, 0.6f}, {0.1f, 0.15f}, {240.f, 270.f}},
+                                               {"brown", {0.4f, 0.5f}, {0.06f, 0.09f}, {48.f, 72.f}},
+                                               {"green", {0.5f, 0.66f}, {0.1f, 0.15f}, {130.f, 155.f}},
+                                               {"grey", {0.55f, 0.68f}, {0.004f, 0.012f}, {0.f, 360.f}},
+                                               {"orange", {0.7f, 0.76f}, {0.14f, 0.17f}, {52.f, 68.f}},
+                                               {"pink", {0.72f, 0.82f}, {0.09f, 0.13f}, {345.f, 363.f}},
+                                               {"purple", {0.45f, 0.6f}, {0.1f, 0.15f}, {295.f, 317.f}},
+                                               {"red", {0.48f, 0.56f}, {0.15f, 0.19f}, {17.f, 29.f}},
+                                               {"turquoise", {0.64f, 0.78f}, {0.08f, 0.11f}, {180.f, 205.f}},
+                                               {"white", {0.94f, 0.97f}, {0.004f, 0.012f}, {60.f, 110.f}},
+                                               {"yellow", {0.83f, 0.89f}, {0.13f, 0.16f}, {90.f, 106.f}}};
+  return kColors;
+}
+
+}  // namespace
+
+const std::vector<std::string>& color_names() {
+  static const std::vector<std::string> kNames = [] {
+    std::vector<std::string> names;
+    for (const NamedColor& color : named_colors()) names.push_back(color.name);
+    return names;
+  }();
+  return kNames;
+}
+
+Rgb draw_color(const std::string& name, Split split, Rng& rng) {
+  for (const NamedColor& color : named_colors()) {
+    for (int attempt = 0; color.name == name && attempt < 1000; ++attempt) {
+      const float lightness = range(rng, color.lightness.x(), color.lightness.y()),
+                  chroma = range(rng, color.chroma.x(), color.chroma.y());
+      // The raster may move a colour over the border to another name.
+      const Rgb drawn = swatch(split, lightness, chroma, range(rng, color.hue.x(), color.hue.y()));
+      if (color_name(drawn) == name) return drawn;
+    }
+  }
+  throw ArgumentError("'" + name + "' is no colour's name");
 }
 
 std::vector<Rgb> Palette::colors() const {

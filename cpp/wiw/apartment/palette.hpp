@@ -3,18 +3,25 @@
 
 #include <array>
 #include <cstdint>
+#include <string>
 #include <vector>
 
 #include "wiw/apartment/apartment.hpp"
 #include "wiw/apartment/color.hpp"
 #include "wiw/apartment/floor_plan.hpp"
 #include "wiw/apartment/textures.hpp"
+#include "wiw/core/rng.hpp"
 
 namespace wiw::apartment {
 
 /// Colour near (lightness, chroma, hue) on the raster of one split: hues 15 degrees and lightnesses 0.018 apart,
 /// interleaved with the rasters of the other splits, so that no two splits have a colour in common.
 Rgb swatch(Split split, float lightness, float chroma, float hue);
+
+/// Names that color_name gives.
+const std::vector<std::string>& color_names();
+/// A colour of that name on the split's raster; ArgumentError for an unknown name.
+Rgb draw_color(const std::string& name, Split split, Rng& rng);
 
 enum class WallStyle {
   kPaint,

@@ -57,6 +57,8 @@ class FurnitureShape {
   void drape(MaterialId material, const Vec3& low, const Vec3& high, int folds);
 
   [[nodiscard]] const std::vector<Submesh>& parts() const { return parts_; }
+  /// For changes of what surfaces are made of, not of where they are.
+  [[nodiscard]] std::vector<Submesh>& parts() { return parts_; }
   [[nodiscard]] Eigen::AlignedBox3f bounds() const;
 
  private:

@@ -163,10 +163,9 @@ void add_skirting(Object& object, const Chart& chart, MaterialId material, float
 void add_walls(Draft& draft, std::int32_t room) {
   const PlanRoom& plan = draft.plan.rooms[static_cast<std::size_t>(room)];
   const RoomLook& look = draft.palette.rooms[static_cast<std::size_t>(room)];
-  Object walls{"walls of " + plan.name,
-               "wall",
-               {{"color", color_name(look.walls == WallStyle::kFullTiles ? look.accent : look.wall)}},
-               room};
+  Object walls{"walls of " + plan.name, "wall", {}, room};
+  walls.color = look.walls == WallStyle::kFullTiles ? look.accent : look.wall;
+  walls.attributes["color"] = color_name(walls.color);
   walls.shape.set_edge(0.3f);
   const MaterialId board = draft.materials.plain("wood", look.trim);
   for (const Side side : {Side::kWest, Side::kEast, Side::kNorth, Side::kSouth}) {
@@ -218,6 +217,7 @@ void add_floor_and_ceiling(Draft& draft, std::int32_t room) {
                "floor",
                {{"color", color_name(look.floor_color)}, {"material", draft.materials.finish(ground).kind}},
                room};
+  floor.color = look.floor_color;
   const bool along_x = r.width() >= r.depth();  // boards run the long way
   Chart chart = along_x
                     ? Chart{{r.x0, 0, r.z1}, Vec3::UnitX(), -Vec3::UnitZ(), {r.width(), r.depth()}, kFloorTexel, {}}
@@ -228,6 +228,7 @@ void add_floor_and_ceiling(Draft& draft, std::int32_t room) {
 
   Object ceiling{
       "ceiling of " + plan.name, "ceiling", {{"color", color_name(look.ceiling)}, {"material", "plaster"}}, room};
+  ceiling.color = look.ceiling;
   chart = {{r.x0, draft.plan.ceiling, r.z0}, Vec3::UnitX(), Vec3::UnitZ(), {r.width(), r.depth()}, kCeilingTexel, {}};
   index = add_chart(draft, chart);
   ceiling.panels.push_back(

@@ -42,7 +42,7 @@ def _item(episode: Episode, folder: Path) -> dict[str, Any]:
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
-    """Read an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
+    """Read an episode file: one written by `save`, or habitat-lab's or World-in-World's.
 
     `scenes` is the folder that scene paths are relative to; if not given, the folder of a file that `save` wrote, and
     the present one for the other formats. Lengths that a file does not give are NaN until the task has measured them.
@@ -60,9 +60,12 @@ def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
 def _scene(name: str, folder: Path, where: str) -> str:
     """Return the spec of one scene, from its name in a file whose paths are relative to `folder`."""
     try:
-        if is_generated(name) and resolve(name) != [name]:
+        if not is_generated(name):
+            return absolute(folder / name)
+        named = resolve(name)
+        if len(named) != 1 or "/" not in name:
             raise ValueError("expected a single one, such as apartments:val/3")
-        return absolute(name if is_generated(name) else folder / name)
+        return named[0]
     except (ArgumentError, ValueError, RuntimeError) as error:  # RuntimeError: "~" of a user who is not known
         raise FileError(f"{where}: scene '{name}': {error}") from error
 

@@ -15,15 +15,9 @@ DESCRIBED = ("candidates", "horizon", "execute", "depth", "width")
 
 
 @dataclass(frozen=True, kw_only=True)
-class AgentConfig:
-    """Numbers of the search; None leaves one to the task, and without a task to the paper's ImageNav.
+class PlanConfig:
+    """Numbers of the search but for how many plans it considers, which `wiw scale` varies."""
 
-    Raises:
-        ArgumentError: a number out of range.
-    """
-
-    candidates: Annotated[int | None, arg(metavar="M")] = None
-    """M, plans imagined at each decision; the task's own number if not given, 3 without a task."""
     horizon: Annotated[int | None, arg(metavar="L")] = None
     """L, primitives or poses per plan; the task's own number if not given, 5 without a task."""
     execute: Annotated[int | None, arg(metavar="N")] = None
@@ -34,11 +28,23 @@ class AgentConfig:
     `horizon` actions, as `Policy.extend` proposes from their imagined ends."""
     width: Annotated[int | None, arg(metavar="N")] = None
     """Plans of an episode that are kept and extended at each level; None means `candidates`."""
+    space: Annotated[str | None, Suppress] = None
+    """What plans are made of (`wiw.loop.plan_space`); None means the task's, else the policy's."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentConfig(PlanConfig):
+    """Numbers of the search; None leaves one to the task, and without a task to the paper's ImageNav.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    candidates: Annotated[int | None, arg(metavar="M")] = None
+    """M, plans imagined at each decision; the task's own number if not given, 3 without a task."""
     pool: Annotated[int | None, arg(metavar="N")] = None
     """Plans that are proposed, of which the first `candidates` are kept, so that the sets of agents that differ in
     `candidates` alone are nested; None proposes as many as are kept."""
-    space: Annotated[str | None, Suppress] = None
-    """What plans are made of (`wiw.loop.plan_space`); None means the task's, else the policy's."""
 
     def __post_init__(self) -> None:
         for name in ("candidates", "horizon", "depth", "width", "pool"):

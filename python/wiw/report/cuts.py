@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored pictures, cropped, scaled and compressed for a page; `scale` makes them smaller still."""
+"""Crop, scale and compress stored images for pages; `scale` makes them smaller still."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from wiw.report.maps import (
     start_and_goal,
     trail,
 )
-from wiw.report.plans import of_poses, plan_views
+from wiw.report.plans import is_pose_row, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Picture, Step, Story
@@ -67,7 +67,7 @@ def read_story(
     """Return one episode; add its scene's map to `maps`."""
     decisions = {arm: store.decisions(arm, index) for arm in outcomes}
     rows = [row for own in decisions.values() for row in own]
-    poses = any(of_poses(row) for row in rows)
+    poses = any(is_pose_row(row) for row in rows)
     frame, picture = (None, None) if poses else _map(store, episode, rows, maps, album)
     shots = dict[str, Picture]()
     attempts = tuple(

@@ -17,7 +17,7 @@ from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
 from wiw.errors import ArgumentError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.report import plots
 from wiw.report.episodes import read_stories, title, wording
 from wiw.report.story import Album
@@ -41,7 +41,6 @@ def write_report(
         episodes: how many to show with pictures; all that kept them if not given.
         max_mb: most megabytes (10^6 bytes) of the file; pictures are made smaller, then episodes left out, until it
             fits.
-
         remark: sentence that the page shows below the result.
 
     Raises:
@@ -51,7 +50,7 @@ def write_report(
     if episodes is not None and episodes < 0:
         raise ArgumentError(f"report: expected episodes of at least 0, got {episodes}")
     page = render(run, episodes, remark=remark) if max_mb is None else _render_within(run, episodes, max_mb, remark)
-    with whole_file(path) as draft:
+    with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 
@@ -182,7 +181,7 @@ def _common(summary: Summary) -> dict[str, Any]:
 
 
 def _utility_ends(summary: Summary) -> tuple[float, float]:
-    """Return the ends of the utility scale: 0 to 1, or as far as any arm; intervals are cut at -1 and 2."""
+    """Return the ends of the utility scale: at least [0, 1], and wide enough for all arms within [-1, 2]."""
     shown = [found for found in summary.utilities if found.is_defined]
     low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
     return low, max([1.0, *(min(2.0, found.high) for found in shown), *(found.value for found in shown)])

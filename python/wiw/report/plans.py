@@ -42,10 +42,10 @@ class Primitives:
 
 
 class Numbers(Primitives):
-    """Plans of a space of the user's own, shown as the numbers that they are."""
+    """Plans of a custom plan space, shown as numbers."""
 
     def text(self, plan: Sequence[Any]) -> str:
-        """A plan as numbers."""
+        """Return a plan as numbers."""
         return numbers(plan)
 
 
@@ -83,21 +83,21 @@ def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> l
     found: list[Primitives | Poses] = []
     shut = False
     for row in decisions:
-        if not of_poses(row):
-            found.append(Primitives() if of_primitives(row["actions"]) else Numbers())
+        if not is_pose_row(row):
+            found.append(Primitives() if is_primitive_plan(row["actions"]) else Numbers())
             continue
         found.append(Poses(stage, (row["before_x"], row["before_y"], row["before_z"]), shut))
         shut = row["executed"][-1][6] < SHUT if row["executed"] else shut
     return found
 
 
-def of_poses(row: Mapping[str, Any]) -> bool:
+def is_pose_row(row: Mapping[str, Any]) -> bool:
     """Return whether a decision plans poses of a gripper, vectors of 7 numbers."""
     first = row["actions"][0]
     return isinstance(first, list) and len(first) == 7
 
 
-def of_primitives(plan: Sequence[Any]) -> bool:
+def is_primitive_plan(plan: Sequence[Any]) -> bool:
     """Return whether a plan is made of primitives, whole numbers."""
     return isinstance(plan[0], int)
 

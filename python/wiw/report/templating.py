@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How templates of pages are filled: everything is escaped, and a name that is missing is an error."""
+"""Fill the pages' templates: everything is escaped, and a missing name is an error."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def environment() -> Environment:
 
 
 def format_signed(value: float) -> str:
-    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
+    """Return, e.g., "+21.3" or "\u22124.0", with a true minus sign."""
     return f"{value:+.1f}".replace("-", "\u2212")
 
 

@@ -25,21 +25,21 @@ class RunConfig(Limits):
     """
 
     episodes: Annotated[int | None, arg(metavar="N")] = None
-    """How many; if not given, as many as the task says: all of an episode file, else 20; for manipulation 50 of each of
+    """Number of episodes; the task's own if not given: all of an episode file, else 20; for manipulation 50 of each of
     its tasks."""
     seed: Annotated[int | None, arg(metavar="N")] = None
-    """All randomness is a function of it; the task's own, 0, if not given."""
+    """Seed of all randomness; the task's own, 0, if not given."""
     out: Annotated[Path | str | None, arg(metavar="DIR")] = None
     """Folder of the run; runs/TASK-TIME if not given."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Processes; results do not depend on it. More than one needs a task and an agent that can be pickled, or names."""
+    """Processes; results do not depend on it. More than one needs names, or a task and agent that can be pickled."""
     live: Annotated[int, arg(metavar="N")] = 4
     """Episodes kept live at a time in a process, so that model calls are batched."""
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
     """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
     0.2 MB per decision."""
     resume: bool = False
-    """Whether to go on with the run in `out` where it was stopped."""
+    """Whether to resume the run in `out`."""
     progress: bool = True
     """Whether to show progress bars."""
 
@@ -57,10 +57,55 @@ class RunConfig(Limits):
         return episodes if isinstance(self.keep_images, str) else self.keep_images
 
 
+@dataclass(frozen=True, kw_only=True)
+class ResumeConfig:
+    """Settings of `RunConfig` that a run may be resumed with in place of its own, from then on; None keeps its own.
+
+    No score depends on them. What scores or measurements depend on stays as the run was begun.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    live: Annotated[int | None, arg(metavar="N")] = None
+    """Episodes kept live at a time in a process, as in `wiw run`; the run's own number if not given."""
+    deadline: Annotated[float | None, arg(metavar="SECONDS")] = None
+    """Most seconds for a call of the world model; the run's own if not given."""
+    cache: Annotated[str | Path | None, arg(metavar="auto|off|DIR")] = None
+    """Where rollouts are cached, as in `wiw run`; where the run caches them if not given."""
+    cache_gb: Annotated[float | None, arg(metavar="N")] = None
+    """Most gigabytes of that folder; the run's own if not given."""
+
+    def __post_init__(self) -> None:
+        self.to_json()  # RunConfig checks the numbers
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the settings that are given, as the run store keeps them."""
+        changes = {name: value for name, value in vars(self).items() if value is not None}
+        config = RunConfig(**changes)
+        recorded = {**config.to_json(), "live": config.live}
+        return {name: recorded[name] for name in changes}
+
+
+def read_resume_settings(settings: Mapping[str, Any]) -> ResumeConfig:
+    """Return settings by name as a `ResumeConfig`.
+
+    Raises:
+        ArgumentError: one that is fixed once a run is begun.
+    """
+    names = [field.name for field in fields(ResumeConfig)]
+    if fixed := [name for name in settings if name not in names]:
+        raise ArgumentError(
+            f"resume: '{fixed[0]}' stays as the run was begun; expected settings among workers, {', '.join(names)}, on "
+            "which no score depends. For another value start a new run"
+        )
+    return ResumeConfig(**settings)
+
+
 def take_settings(
     config: RunConfig | None, settings: Mapping[str, Any], episodes: int | None = None
 ) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the config with the settings that are its own in place of its values, and the other settings."""
+    """Split settings into those of `RunConfig`, which replace the config's values, and the others."""
     names = {field.name for field in fields(RunConfig)}
     own = {name: value for name, value in settings.items() if name in names}
     own |= {} if episodes is None else {"episodes": episodes}

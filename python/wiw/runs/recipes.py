@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tasks and agents are made again: in worker processes, and when a run is resumed."""
+"""Recipes that rebuild tasks and agents: in worker processes, and when a run is resumed."""
 
 from __future__ import annotations
 
@@ -12,15 +12,17 @@ from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
+from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
-from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
+from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
 from wiw.types import PRIMITIVES
@@ -28,6 +30,8 @@ from wiw.world_models.base import WorldModel
 
 PLACEBO, PLACEBO_MODEL = "placebo-", "warp"
 """What arms of placebos begin with, and the model that they are of where nobody names one."""
+REFERENCES = ("none", "copy", "oracle")
+"""Arms that reports know by name: no world model, floor and ceiling."""
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
 """Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS = Limits()
@@ -95,7 +99,9 @@ class AgentRecipe(AgentConfig):
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
-        return compose(Parts(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context)
+        return compose(
+            AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
+        )
 
     @property
     def config(self) -> AgentConfig:
@@ -110,7 +116,7 @@ class AgentRecipe(AgentConfig):
         return replace(self, model=None if none else model, model_options={})
 
     def as_placebo(self, kind: str, model: Any = None) -> AgentRecipe:
-        """Return the same agent, whose world model (or another one) imagines something else than the plans."""
+        """Return the same agent with a placebo of its world model (or of another one)."""
         own = PLACEBO_MODEL if self.model is None else self.model
         return replace(self.with_model(own if model is None else model), placebo=kind)
 
@@ -126,9 +132,8 @@ class AgentRecipe(AgentConfig):
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> AgentRecipe:
-        """Return the recipe that a run store keeps; earlier versions called some of its parts otherwise."""
-        known = {_RENAMED.get(name, name): value for name, value in data.items()}
-        return cls(**{name: value for name, value in known.items() if value is not None})
+        """Return the recipe that a run store keeps."""
+        return cls(**{name: value for name, value in data.items() if value is not None})
 
     def describe(self) -> dict[str, Any]:
         """Return the identity of the agent before it is built: a model is made once, when its turn comes.
@@ -179,7 +184,7 @@ class AgentRecipe(AgentConfig):
                 found.require(task)
 
     def replaying(self, run: Path) -> AgentRecipe:
-        """Return the same agent with the answers that a run has recorded in the place of its language model."""
+        """Return the same agent with a run's recorded answers in place of its language model."""
         replay = {"vlm": f"replay:{run}", "cache": "off"}
         named: dict[str, Mapping[str, Any]] = {name: {} for name in (self.policy, self.reviser) if name == "vlm"}
         options = {
@@ -206,7 +211,6 @@ class AgentRecipe(AgentConfig):
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")
-_RENAMED = {"revision": "reviser", "swaps": "ground_truth"}
 
 
 def _unwrap(part: Any) -> Any:
@@ -216,7 +220,7 @@ def _unwrap(part: Any) -> Any:
 
 
 def _describe(part: Any) -> Any:
-    """Return a part's name, or what an object says of itself."""
+    """Return a part's name, or an object's own description."""
     if isinstance(part, Policy | WorldModel | Imaginer):
         return part.describe()
     return part.__name__ if isinstance(part, type) else part
@@ -251,7 +255,7 @@ class AgentInMemory:
         return self.agent
 
     def describe(self) -> dict[str, Any]:
-        """Return what the agent says of itself."""
+        """Return the agent's own description."""
         return dict(self.agent.describe())
 
     def require(self, task: Mapping[str, Any]) -> None:
@@ -303,8 +307,8 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     if isinstance(agent, AgentRecipe):
         return agent
     if type(agent) is Agent:  # a subclass may decide otherwise, and is taken as it is
-        parts = agent.parts
-        return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
+        spec = agent.spec
+        return AgentRecipe(spec.policy, spec.model, spec.reviser, observers=spec.observers, **spec.config.numbers)
     if isinstance(agent, BaseAgent):
         return AgentInMemory(agent)
     raise ArgumentError(f"expected a wiw.Agent, an AgentRecipe or a BaseAgent, got {type(agent).__name__}")
@@ -313,10 +317,12 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
 def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]:
     """Return the same agent with each of several world models, by arm name; with its own where `arms` is None.
 
-    `arms` are names and world models (classes or instances), or a mapping of the arms' own names to these.
+    `arms` are texts (see `wiw.runs.arm_text`) and world models (classes or instances), or a mapping of the arms' own
+    names to these.
 
     Raises:
-        ArgumentError: an arm is named twice, or none is; an agent of another method, which has no world model.
+        ArgumentError: an arm is named twice, or none is; a name that is empty, has forbidden characters or is a
+            reference's; options that are no KEY=VALUE; an agent of another method, which has no world model.
     """
     recipe = agent_recipe(agent)
     if arms is None:
@@ -326,7 +332,10 @@ def arm_recipes(agent: Any, arms: Any) -> dict[str, AgentRecipe | AgentInMemory]
     pairs = arms.items() if isinstance(arms, Mapping) else [(None, model) for model in arms]
     made = [_make_arm(recipe, name, model) for name, model in pairs]
     if len(dict(made)) < max(1, len(made)):
-        raise ArgumentError(f"arms: expected different world models, got {[name for name, _ in made]}")
+        raise ArgumentError(
+            f"arms: expected different world models, got {[name for name, _ in made]}; one model may be several arms "
+            f"with names of their own: {EXAMPLE}"
+        )
     return dict(made)
 
 
@@ -339,14 +348,46 @@ def _name_own_arm(agent: Any, recipe: AgentRecipe | AgentInMemory) -> str:
 
 def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, AgentRecipe]:
     """Return name and recipe of an arm."""
+    if name is not None:
+        check_arm_name(name)
     if model is not None and not isinstance(model, str):
         changed = agent.with_model(model)
-        return name or changed.arm, changed
-    policy, of_model = _split_policy(model or "none")
+        return changed.arm if name is None else name, changed
+    arm = parse_arm(model or "none")
+    if name is not None and arm.name is not None:
+        raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
+    policy, of_model = _split_policy(arm.model)
     kind, named = placebo_of(of_model)
     own = agent if policy is None else replace(agent, policy=policy)
     changed = own.with_model(of_model) if kind is None else own.as_placebo(kind, named)
-    return name or _name_arm(policy, of_model), changed
+    changed = _with_options(changed, arm)
+    given = arm.name if name is None else name
+    if given in REFERENCES and (changed.arm != given or kind is not None):
+        raise ArgumentError(
+            f"arms: reports take the arm '{given}' for the reference '{given}', got {arm.model}; choose another name"
+        )
+    return given or _name_arm(policy, of_model), changed
+
+
+def _with_options(agent: AgentRecipe, arm: ArmText) -> AgentRecipe:
+    """Return the agent whose world model takes an arm's options besides those that it has.
+
+    Raises:
+        ArgumentError: there is no world model that could take them.
+    """
+    if not arm.options:
+        return agent
+    if not isinstance(agent.model, str):
+        raise ArgumentError(f"arms: '{arm}' has options and no world model to take them; expected one by name")
+    options = parse_options(arm.options, WORLD_MODELS.find(agent.model), f"arms: '{arm}'")
+    return replace(agent, model_options={**agent.model_options, **options})
+
+
+def make_arm_absolute(text: str) -> str:
+    """Return an arm's text with the path of its model made absolute."""
+    arm = parse_arm(text)
+    policy, model = _split_policy(arm.model)
+    return str(replace(arm, model=f"{f'{policy}+' if policy else ''}{absolute(model)}"))
 
 
 def _split_policy(name: str) -> tuple[str | None, str]:

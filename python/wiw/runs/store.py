@@ -11,7 +11,7 @@ import fcntl
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -26,7 +26,7 @@ from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
-SCHEMA_VERSION = 8
+SCHEMA_VERSION = 9
 DECISION_JSON = (
     "actions",
     "executed",
@@ -362,6 +362,20 @@ class RunStore:
             _require_same(self.path, built[row.arm], agent)
             return
         built[row.arm] = agent
+        with self._writing() as connection:
+            connection.execute("UPDATE run SET info = ?", (to_json(info),))
+
+    def change_settings(self, changes: Mapping[str, Any]) -> None:
+        """Store settings that the run goes on with; `info["resumed_with"]` lists what was changed, and when."""
+        info = self.info
+        own = {**info["limits"], "live": info["live"]}
+        changed = {name: value for name, value in changes.items() if name not in own or own[name] != value}
+        if not changed:
+            return
+        info["live"] = changed.get("live", info["live"])
+        info["limits"] |= {name: value for name, value in changed.items() if name != "live"}
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        info["resumed_with"] = [*info.get("resumed_with", []), {"time": now, **changed}]
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
 

@@ -22,7 +22,17 @@ from wiw.suggestions import did_you_mean
 
 Scene = _core.scene.Scene
 
-__all__ = ["Scene", "absolute", "apartment", "is_generated", "load", "open_scene", "resolve"]
+__all__ = [
+    "Scene",
+    "absolute",
+    "apartment",
+    "apartment_table",
+    "is_generated",
+    "load",
+    "open_scene",
+    "possible_edits",
+    "resolve",
+]
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -88,26 +98,56 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
     return store.temporary(build)
 
 
-def apartment(seed: int, split: str = "val", cache: bool = True) -> Scene:
+def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Sequence[str] = ()) -> Scene:
     """Generate a furnished apartment, the same for the same seed and split; splits share neither layouts nor palettes.
 
-    `split` is "train", "val" or "test"; ArgumentError is raised for any other. With `cache` it is made once, in
-    seconds, and then mapped from disk like imported scenes, until the compiled core changes.
+    With `cache` it is made once, in seconds, and then mapped from disk like imported scenes, until the compiled core
+    changes. An edit changes one thing and leaves all else as it is, with light baked for the edited apartment:
+    "color:sofa_1=blue", "state:floor_lamp_1=off", "remove:vase_1" or "swap:plant_1,floor_lamp_2". Names are those of
+    instances, with "_" or "+" for a space; where several doors or windows have one name, ".2" is the second.
+
+    Raises:
+        ArgumentError: `split` is not "train", "val" or "test"; or an edit cannot be done, with what is possible.
     """
+    edits = _core.scene.canonical_edits(list(edits))
 
     def make() -> Scene:
         started = time.perf_counter()
-        scene = _core.scene.apartment(seed, split)
-        _log.info("apartment %s/%s made in %.1f s", split, seed, time.perf_counter() - started)
+        scene = _core.scene.apartment(seed, split, edits)
+        _log.info("%s made in %.1f s", scene.name, time.perf_counter() - started)
         return scene
 
-    return store.load_generated(["apartment", store.build_digest(), split, int(seed)], make) if cache else make()
+    identity = ["apartment", store.build_digest(), split, int(seed), *edits]
+    return store.load_generated(identity, make) if cache else make()
+
+
+def apartment_table(seed: int, split: str = "val", *, edits: Sequence[str] = ()) -> Scene:
+    """Return rooms and instances of an apartment without its textures and light, in a small part of the time.
+
+    `instances`, `rooms`, `attributes` and all triangles are those of `apartment`, so that it serves for questions and
+    for navigation meshes; pictures of it show plain colours.
+    """
+    return _core.scene.apartment_outline(seed, split, _core.scene.canonical_edits(list(edits)))
+
+
+def possible_edits(spec: str) -> list[str]:
+    """Return the edits that can be added to a single apartment's spec, without baking it.
+
+    Raises:
+        ArgumentError: the spec does not name a single apartment.
+    """
+    seed, split, edits = _parse_single(spec)
+    return _core.scene.possible_edits(seed, split, edits)
 
 
 SPLIT_SIZE = 1000
 """Apartments that a spec without a number stands for."""
 APARTMENTS = r"apartments:(train|val|test)(?:(?::([0-9]+))?:([1-9][0-9]*)|/([0-9]+))?"
-"""Split, first, end, and number of a single one."""
+"""Split, first, end, and number of a single one. A single one may be followed by "?" and edits, joined by "&"."""
+_FORMS = (
+    "apartments:{train,val,test}, apartments:val:40, apartments:val:40:60, apartments:val/7 or "
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue"
+)
 
 
 def is_generated(spec: str) -> bool:
@@ -125,10 +165,12 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     """Return the single scenes that a scene spec names, in order, none of them loaded.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
-    numbers 40 to 59, each named "apartments:val/7"; anything else is the path of a mesh or a Gazebo world.
+    numbers 40 to 59, each named "apartments:val/7"; anything else is the path of a mesh or a Gazebo world. The edits of
+    "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" come in one order and spelling, so that equal scenes
+    have equal names; whether the apartment can have them is found when it is opened.
 
     Raises:
-        ArgumentError: the split or the count is not one.
+        ArgumentError: the split or the count is not one, or an edit is not one.
         FileError: there is no such file.
     """
     spec = fspath(spec)
@@ -139,15 +181,15 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
                 f"{_did_you_mean(spec)}"
             )
         return [spec]
-    match = re.fullmatch(APARTMENTS, spec)
+    base, mark, edits = spec.partition("?")
+    match = re.fullmatch(APARTMENTS, base)
     if match is None or int(match[2] or 0) >= int(match[3] or SPLIT_SIZE):
-        raise ArgumentError(
-            f"scene spec '{spec}': expected apartments:{{train,val,test}}, apartments:val:40, apartments:val:40:60 or "
-            f"apartments:val/7.{_did_you_mean(spec)}"
-        )
+        raise ArgumentError(f"scene spec '{spec}': expected {_FORMS}.{_did_you_mean(base)}")
     split, first, end, index = match.groups()
     if index is not None:
-        return [spec]
+        return [base + mark + "&".join(_parse_edits(spec, edits))] if mark else [spec]
+    if mark:
+        raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
     return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
 
 
@@ -155,6 +197,23 @@ def _resembles_generated(spec: str) -> bool:
     """Return whether a spec is no file and looks like a misspelt `apartments:`, to be refused as it was typed."""
     kind, colon, _ = spec.partition(":")
     return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
+
+
+def _parse_edits(spec: str, edits: str) -> list[str]:
+    """Return the edits of a spec in their canonical order."""
+    try:
+        return _core.scene.canonical_edits(edits.split("&"))
+    except ArgumentError as error:
+        raise ArgumentError(f"scene spec '{spec}': {error}") from None
+
+
+def _parse_single(spec: str) -> tuple[int, str, list[str]]:
+    """Return seed, split and edits of a single apartment's spec."""
+    base, mark, edits = spec.partition("?")
+    match = re.fullmatch(APARTMENTS, base)
+    if match is None or match[4] is None:
+        raise ArgumentError(f"scene spec '{spec}': expected a single apartment, such as apartments:val/7.")
+    return int(match[4]), match[1], _parse_edits(spec, edits) if mark else []
 
 
 def _did_you_mean(spec: str) -> str:
@@ -174,6 +233,6 @@ def _did_you_mean(spec: str) -> str:
 def open_scene(name: str) -> Scene:
     """Load one scene of `resolve`."""
     if is_generated(name):
-        split, _, index = name.removeprefix("apartments:").partition("/")
-        return apartment(int(index), split)
+        seed, split, edits = _parse_single(name)
+        return apartment(seed, split, edits=edits)
     return load(name)

@@ -137,7 +137,8 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
     folder = base.path.parent / FOLDER
     if RunStore.exists(folder):
         return RunStore.resume(folder, config)
-    info = {name: value for name, value in base.info.items() if name != "keep_images"}  # the run chooses for both
+    own = ("keep_images", "resumed_with")  # the run chooses pictures for both
+    info = {name: value for name, value in base.info.items() if name not in own}
     info |= {
         "platform": describe_platform(),
         "agents": {name: recipe.to_json() for name, recipe in agents.items()},

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs an agent, or several that differ in one thing, on the same episodes and records everything."""
+"""Run an agent, or several variants of it, on the same episodes and record everything."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from wiw.errors import Error, StoreError
+from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
-from wiw.runs.config import RunConfig, take_settings
+from wiw.runs.config import ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
@@ -44,7 +45,8 @@ def evaluate(
         episodes: how many; None means as many as the task says.
         arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
-            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another. A
+            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another.
+            "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
             mapping gives the arms names of their own. None means the agent's own model.
         config: how the run goes.
         settings: any of `RunConfig`'s in place of the config's, such as seed, out, workers, keep_images, resume,
@@ -84,7 +86,7 @@ def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -
 
 
 def resume_run(
-    run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False
+    run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False, **settings: Any
 ) -> RunLog:
     """Go on with a run of named parts: only episodes that have not ended are run.
 
@@ -93,9 +95,10 @@ def resume_run(
         workers: processes; None means as many as it was begun with.
         progress: whether to show bars.
         retry_errors: whether to rerun episodes that ended with an infrastructure error.
+        settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
 
     Raises:
-        ArgumentError: fewer than one worker.
+        ArgumentError: a number out of range, or a setting that is fixed once a run is begun.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
             its preset's file or the source file of a model, policy or task of the user's own has changed, or the
             navigation mesh beside a scene has come or gone.
@@ -103,11 +106,12 @@ def resume_run(
     """
     if workers is not None:
         RunConfig(workers=workers)  # its numbers are checked there
+    changes = read_resume_settings(settings).to_json()
     store = RunStore.resume(run)
     try:
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
-            raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
+            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
         task, agents = recipes_of(store)
         require_own_sources(store, task, agents)
         built = task.build()
@@ -116,12 +120,13 @@ def resume_run(
         store.close()
         raise
     require_left(built, store, agents, retry_errors)
+    store.change_settings(changes)
     return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
 
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     if settings.lpips is not None:
-        Lpips(settings.lpips)  # what is missing is told before anything is run
+        Lpips(settings.lpips)  # report missing weights before anything is run
     built = task.build()
     seed = built.seed if settings.seed is None else settings.seed
     count = built.default_episodes if settings.episodes is None else settings.episodes
@@ -137,6 +142,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         store = RunStore.resume(settings.out, config)
         require_left(built, store, agents)
         require_own_sources(store, task, agents)
+        _take_over(store, settings)
     else:
         started = time.perf_counter()
         episodes = built.episodes(count)
@@ -162,6 +168,22 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         with remove_if_empty(store.path):
             return _finish(store, task, agents, settings.workers, settings.progress)
     return _finish(store, task, agents, settings.workers, settings.progress)
+
+
+def _take_over(store: RunStore, settings: RunConfig) -> None:
+    """Let a resumed run go on with these settings; closes the store where other things would be measured.
+
+    Raises:
+        StoreError: fidelity was measured otherwise so far.
+    """
+    begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
+    try:
+        store.require_same(*({name: each[name] for name in ("fidelity", "lpips")} for each in (begun_with, now)))
+    except StoreError:
+        store.close()
+        raise
+    changeable = [field.name for field in fields(ResumeConfig)]
+    store.change_settings(ResumeConfig(**{name: getattr(settings, name) for name in changeable}).to_json())
 
 
 def _finish(

@@ -12,7 +12,8 @@ struct Ring {
   float hx, hz, y, z;
 };
 
-void add_rings(Make& m, MaterialId material, const std::vector<Ring>& rings, float power, int segments = 24) {
+void add_rings(FurnitureBuilder& m, MaterialId material, const std::vector<Ring>& rings, float power,
+               int segments = 24) {
   for (std::size_t i = 0; i + 1 < rings.size(); ++i) {
     // Each band is its own strip of quads, so that edges between bands stay crisp.
     for (int s = 0; s < segments; ++s) {
@@ -26,7 +27,7 @@ void add_rings(Make& m, MaterialId material, const std::vector<Ring>& rings, flo
   }
 }
 
-void add_tap(Make& m, const Vec3& base, float height, float reach) {
+void add_tap(FurnitureBuilder& m, const Vec3& base, float height, float reach) {
   m.shape.cylinder(m.chrome(), base, base + Vec3(0, 0.02f, 0), 0.024f, 0.022f, 12);
   m.shape.tube(m.chrome(),
                {base, base + Vec3(0, height, 0), base + Vec3(0, height + 0.02f, 0.3f * reach),
@@ -40,7 +41,7 @@ void add_tap(Make& m, const Vec3& base, float height, float reach) {
 
 }  // namespace
 
-void make_toilet(Make& m) {
+void make_toilet(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   m.describe({0.94f, 0.94f, 0.93f}, "ceramic");
   const float hz = 0.5f * m.d(), z = 0.1f;
@@ -55,8 +56,7 @@ void make_toilet(Make& m) {
              {0.18f, 0.235f, 0.395f, z - 0.06f}},
             2.4f);
   m.shape.soft_box(white, {-0.13f, 0.15f, -hz + 0.02f}, {0.13f, 0.39f, -hz + 0.3f}, 0.03f);
-  const bool open = m.rng.chance(0.3);
-  m.attributes["state"] = open ? "open" : "closed";
+  const bool open = m.draw_open(0.3);
   const MaterialId seat = m.plain("plastic", m.rng.chance(0.8) ? Rgb(0.95f, 0.95f, 0.94f) : m.look.wood);
   if (open) {
     add_rings(m, white,
@@ -83,7 +83,7 @@ void make_toilet(Make& m) {
   }
 }
 
-void make_bathtub(Make& m) {
+void make_bathtub(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   m.describe({0.94f, 0.94f, 0.93f}, "enamel");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -111,7 +111,7 @@ void make_bathtub(Make& m) {
   m.shape.cylinder(m.chrome(), {-0.5f * hx, 0.152f, 0}, {-0.5f * hx, 0.158f, 0}, 0.03f, 0.03f, 12);
 }
 
-void make_shower(Make& m) {
+void make_shower(FurnitureBuilder& m) {
   const MaterialId white = m.white(), metal = m.chrome();
   m.describe({0.94f, 0.94f, 0.93f}, "ceramic");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -130,13 +130,12 @@ void make_shower(Make& m) {
   // Curtain on a rail across the open side, drawn halfway.
   m.shape.tube(metal, {{-hx, h, hz - 0.03f}, {hx, h, hz - 0.03f}}, 0.011f, 8);
   for (const float x : {-hx + 0.012f, hx - 0.012f}) m.shape.tube(metal, {{x, h, hz - 0.03f}, {x, h, -hz}}, 0.009f, 6);
-  const bool open = m.rng.chance(0.6);
-  m.attributes["state"] = open ? "open" : "closed";
+  const bool open = m.draw_open(0.6);
   m.shape.drape(m.fabric(m.look.fabrics[1]), {-hx + 0.02f, 0.12f, hz - 0.08f},
                 {open ? -hx + 0.4f * m.w() : hx - 0.02f, h - 0.015f, hz + 0.02f}, open ? 4 : 6);
 }
 
-void make_washbasin(Make& m) {
+void make_washbasin(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   const bool vanity = m.rng.chance(0.65);
@@ -165,14 +164,26 @@ void make_washbasin(Make& m) {
   if (vanity && m.w() > 0.65f) m.supports.push_back({{hx - 0.1f, h, -hz + 0.07f}, {0.04f, 0.02f}, 0.3f});
 }
 
-void make_washing_machine(Make& m) {
+void make_washing_machine(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.75) ? Rgb(0.94f, 0.94f, 0.94f) : Rgb(0.35f, 0.36f, 0.38f);
   m.describe(color, "metal");
   const MaterialId body = m.plain("metal", color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   m.shape.soft_box(body, {-hx, 0.03f, -hz}, {hx, h, hz - 0.02f}, 0.02f);
   const Eigen::Affine3f before = m.shape.frame();
-  m.shape.set_frame(before * Eigen::Translation3f(0, 0.42f, hz - 0.022f) * Eigen::AngleAxisf(kTurn / 4, Vec3::UnitX()));
+  const bool open = m.state == "open";
+  const Eigen::Affine3f port =
+      before * Eigen::Translation3f(0, 0.42f, hz - 0.022f) * Eigen::AngleAxisf(kTurn / 4, Vec3::UnitX());
+  if (open) {  // the dark drum in its ring, and the door beside it
+    m.shape.set_frame(port);
+    m.shape.lathe(m.plain("metal", {0.55f, 0.56f, 0.58f}), Vec3::Zero(),
+                  {{0.21f, 0}, {0.21f, 0.012f}, {0.175f, 0.012f}}, 28);
+    m.shape.lathe(m.plain("metal", {0.07f, 0.07f, 0.08f}), Vec3::Zero(), {{0.178f, 0.006f}, {0, 0.005f}}, 24);
+    m.shape.set_frame(open_leaf(m, {-0.24f, hz + 0.02f}, {-0.22f, 0.2f, hz - 0.022f}, {0.22f, 0.64f, hz + 0.02f}) *
+                      port);
+  } else {
+    m.shape.set_frame(port);
+  }
   m.shape.lathe(m.chrome(), Vec3::Zero(), {{0.22f, 0}, {0.22f, 0.02f}, {0.2f, 0.035f}, {0.165f, 0.03f}}, 28);
   m.shape.lathe(m.plain("glass", {0.16f, 0.18f, 0.22f}), Vec3::Zero(),
                 {{0.17f, 0.028f}, {0.13f, 0.018f}, {0.06f, 0.008f}, {0, 0.005f}}, 24);
@@ -181,11 +192,11 @@ void make_washing_machine(Make& m) {
               {hx - 0.02f, h - 0.03f, hz - 0.014f});
   m.shape.cylinder(m.chrome(), {0.05f, h - 0.085f, hz - 0.016f}, {0.05f, h - 0.085f, hz + 0.006f}, 0.035f, 0.03f, 14);
   m.shape.box(m.black(), {0.12f, h - 0.11f, hz - 0.016f}, {hx - 0.06f, h - 0.06f, hz - 0.011f});
-  m.attributes["state"] = "off";
+  m.attributes["state"] = open ? "open" : "off";
   m.supports.push_back({{0, h, -0.02f}, {hx - 0.1f, hz - 0.12f}, 0.6f});
 }
 
-void make_towel_rail(Make& m) {
+void make_towel_rail(FurnitureBuilder& m) {
   const float hx = 0.5f * m.w(), z = -0.5f * m.d();
   for (const float y : {0.f, 0.28f}) {
     m.shape.tube(m.chrome(), {{-hx, y, z}, {-hx, y, z + 0.07f}, {hx, y, z + 0.07f}, {hx, y, z}}, 0.009f, 8);
@@ -197,7 +208,7 @@ void make_towel_rail(Make& m) {
                    {0.8f * hx, 0.292f, z + 0.09f}, 0.015f);
 }
 
-void make_laundry_basket(Make& m) {
+void make_laundry_basket(FurnitureBuilder& m) {
   m.describe(m.look.wood, "wicker");
   const float r = 0.5f * m.w(), h = m.h();
   m.shape.lathe(m.materials.tinted(Pattern::kWicker, m.look.wood), Vec3::Zero(),

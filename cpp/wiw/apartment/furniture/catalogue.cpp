@@ -1,25 +1,34 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "wiw/apartment/furniture/catalogue.hpp"
 
+#include <map>
+#include <set>
+
 #include "wiw/apartment/furniture/furniture.hpp"
 #include "wiw/core/error.hpp"
 
 namespace wiw::apartment {
 
-Rgb Make::case_color() {
+Rgb FurnitureBuilder::case_color() {
   const double kind = rng.uniform();
   const Rgb color = kind < 0.68 ? look.wood : kind < 0.8 ? look.trim : look.fabrics[rng.below(2)];
   describe(color, color == look.wood ? "wood" : "lacquer");
   return color;
 }
 
-Rgb Make::fabric_color() {
+Rgb FurnitureBuilder::fabric_color() {
   const Rgb color = look.fabrics[rng.chance(0.6) ? 0 : rng.chance(0.75) ? 1 : 2];
   describe(color, "fabric");
   return color;
 }
 
-MaterialId Make::case_material(const Rgb& color) { return color == look.wood ? wood(color) : plain("lacquer", color); }
+bool FurnitureBuilder::draw_open(double chance) {
+  const bool drawn = rng.chance(chance), open = state.empty() ? drawn : state == "open";
+  attributes["state"] = open ? "open" : "closed";
+  return open;
+}
+
+MaterialId FurnitureBuilder::case_material(const Rgb& color) { return color == look.wood ? wood(color) : plain("lacquer", color); }
 
 namespace {
 
@@ -464,6 +473,34 @@ std::size_t category_index(const std::string& name) {
     if (name == rows()[i].name) return i;
   }
   throw ArgumentError("furniture category '" + name + "' is not in the catalogue");
+}
+
+const std::vector<std::string>& states_of(const std::string& category) {
+  static const std::vector<std::string> kLit{"off", "on"}, kHinged{"closed", "open"};
+  static const std::map<std::string, std::vector<std::string>> kStates{{"candles", kLit},
+                                                                       {"ceiling lamp", kLit},
+                                                                       {"floor lamp", kLit},
+                                                                       {"laptop", kLit},
+                                                                       {"pendant lamp", kLit},
+                                                                       {"table lamp", kLit},
+                                                                       {"television", kLit},
+                                                                       {"curtain", {"closed", "half drawn", "open"}},
+                                                                       {"kitchen cabinet", kHinged},
+                                                                       {"refrigerator", kHinged},
+                                                                       {"shower", kHinged},
+                                                                       {"toilet", kHinged},
+                                                                       {"wardrobe", kHinged},
+                                                                       {"washing machine", {"off", "open"}}};
+  static const std::vector<std::string> kNone;
+  const auto found = kStates.find(category);
+  return found == kStates.end() ? kNone : found->second;
+}
+
+bool is_movable(const std::string& category) {
+  static const std::set<std::string> kFixed{"bathtub",      "ceiling lamp", "kitchen cabinet", "kitchen counter",
+                                            "kitchen sink", "pendant lamp", "radiator",        "range hood",
+                                            "shower",       "sink",         "stove",           "toilet"};
+  return !kFixed.contains(category);
 }
 
 }  // namespace wiw::apartment

@@ -27,18 +27,22 @@ struct Bulb {
   float strength = 1.f;  // of a room's main lamp
 };
 
-/// What a furniture function is given, and what it fills in. Frame: see Shape; back at z = -size.z / 2.
-struct Make {
+/// Inputs of a furniture function, and the shape and attributes that it fills in. Frame: see Shape; back at z = -size.z
+/// / 2.
+struct FurnitureBuilder {
   Vec3 size;  // width, height, depth
   Rng& rng;
   MaterialTable& materials;
   const RoomLook& look;
-  bool on = false;  // lamps and screens
+  bool on = false;      // lamps and screens
+  std::string state{};  // that an edit asks for, one of states_of(); empty: the design's own
   FurnitureShape shape{};
   std::vector<Support> supports;
   std::vector<Bulb> bulbs;
   std::map<std::string, std::string> attributes;
   bool casts_shadow = true;
+  Rgb main_color = Rgb::Ones();               // last one described
+  std::vector<Eigen::AlignedBox3f> leaves{};  // open doors that stand out of the body
 
   [[nodiscard]] float w() const { return size.x(); }
   [[nodiscard]] float h() const { return size.y(); }
@@ -53,13 +57,16 @@ struct Make {
   Rgb case_color();
   /// One of the room's fabrics; sets the attributes.
   Rgb fabric_color();
+  /// Sets the attribute: "open" or "closed", by the design's own chance where no edit says which.
+  bool draw_open(double chance);
   MaterialId case_material(const Rgb& color);
-  void describe(const Rgb& color, const std::string& kind) {
-    attributes["color"] = color_name(color);
+  void describe(const Rgb& main, const std::string& kind) {
+    main_color = main;
+    attributes["color"] = color_name(main);
     attributes["material"] = kind;
   }
 };
-using MakeFn = void (*)(Make&);
+using FurnitureFn = void (*)(FurnitureBuilder&);
 
 enum class Mount {
   kWall,     // on the floor, back to a wall
@@ -99,7 +106,7 @@ struct Companion {
 /// One kind of furniture: a function and a row of the catalogue.
 struct Category {
   const char* name;
-  MakeFn make;
+  FurnitureFn make;
   Vec3 smallest, largest;  // width, height, depth
   Mount mount;
   float front = 0.f;   // free floor it needs in front
@@ -112,5 +119,9 @@ struct Category {
 std::span<const Category> catalogue();
 /// Index by name; throws ArgumentError for an unknown one.
 std::size_t category_index(const std::string& name);
+/// States that a category can be built in; empty for one that has but one.
+const std::vector<std::string>& states_of(const std::string& category);
+/// Whether people move such things about: not what is fixed to walls, pipes or the ceiling.
+bool is_movable(const std::string& category);
 
 }  // namespace wiw::apartment

@@ -19,7 +19,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm.prompts import worker
-from wiw.policies.vlm.prompts.filling import Filling
+from wiw.policies.vlm.prompts.template_filler import TemplateFiller
 
 FOLDER = Path(__file__).parent
 SLOTS: dict[str, Any] = {
@@ -66,7 +66,7 @@ class Prompts:
         self._templates = {
             path.relative_to(FOLDER).as_posix(): (path, _read_source(path)) for path in _list_templates(FOLDER)
         }
-        self._filling = Filling()
+        self._filling = TemplateFiller()
         if self.folder is not None:
             self._templates |= self._load_own(self.folder)
 

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flags that choose a task and an agent, declared once for all commands that run agents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
+from wiw.errors import ArgumentError
+from wiw.loop.config import PlanConfig
+
+if TYPE_CHECKING:
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe
+
+Name = Annotated[str, arg(metavar="NAME")]
+MaybeName = Annotated[str | None, arg(metavar="NAME")]
+Folder = Annotated[Path | None, arg(metavar="DIR")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TaskFlags:
+    """A task's episodes and rules."""
+
+    tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None
+    """For manipulation: which of its tasks, taken in turn; all of them if not given."""
+    scenes: Annotated[str | None, arg(metavar="SPEC")] = None
+    """apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world; apartments:val if
+    not given."""
+    per_scene: Annotated[int | None, arg(metavar="N")] = None
+    """Episodes generated in a scene before the next one's turn; the task's own number if not given."""
+    episode_file: Annotated[Path | None, arg(metavar="FILE")] = None
+    """Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World."""
+    scene_folder: Folder = None
+    """What scene paths in that file are relative to; its own folder if not given and from wiw."""
+    motion: Literal["refuse", "slide"] | None = None
+    """What happens to a blocked move; the preset's rule if not given."""
+    robot: Annotated[Path | None, arg(metavar="URDF")] = None
+    """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
+    preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
+    """Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not given. See `wiw
+    list`."""
+    task_option: Options = ()
+    """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
+    given again."""
+    backend: Literal["auto", "cpu", "gpu"] | None = None
+    """Renderer; auto if not given."""
+
+    def make_recipe(self, task: str, seed: int) -> TaskRecipe:
+        """Return the recipe of a task.
+
+        Raises:
+            ArgumentError: a task option that has a flag of its own, or that cannot be read.
+        """
+        from wiw.runs.recipes import TaskRecipe
+
+        flags = {name: value for name, value in vars(self).items() if name != "task_option"}
+        return TaskRecipe(task, task_options(task, self.task_option, {**flags, "seed": seed}))
+
+
+@dataclass(frozen=True, kw_only=True)
+class AgentFlags:
+    """An agent's parts and what they are made with."""
+
+    world_model: Name = "none"
+    """Name, path.py:Class or package.module:Class. See `wiw list`."""
+    world_model_option: Options = ()
+    """An option of --world-model, such as weights=FOLDER or steps=30; may be given again."""
+    policy: MaybeName = None
+    """Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser, for manipulation
+    scripted."""
+    policy_option: Options = ()
+    """An option of --policy, such as weights=FILE; may be given again."""
+    revision: MaybeName = None
+    """Scores imagined futures; the policy's own choice if not given."""
+    vlm: Annotated[str | None, arg(metavar="URL")] = None
+    """For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock; http://localhost:8000/v1 if
+    not given."""
+    vlm_model: MaybeName = None
+    """Its name at the server, or a preset of `wiw list`; not needed where the server has one model."""
+    vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None
+    """YAML file of `model: [read, written]`, dollars per million tokens, for the costs."""
+    prompts: Folder = None
+    """Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts."""
+    semantics: MaybeName = None
+    """Tells world models that need it what each pixel is: simulator, rednet, or path.py:Class."""
+    semantics_option: Options = ()
+    """An option of --semantics, such as weights=FILE; may be given again."""
+
+    def make_recipe(self, task: str, search: PlanConfig, policies: Sequence[str] = ()) -> AgentRecipe:
+        """Return the recipe of an agent for a task; `policies` are further ones that arms name.
+
+        Raises:
+            ArgumentError: options without the part that takes them; a width without depth.
+        """
+        from wiw.runs.recipes import AgentRecipe, absolute
+
+        if search.width is not None and search.depth == 1:
+            raise ArgumentError(
+                "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
+            )
+        policy = absolute(self.policy or default_policy(task))
+        model = None if self.world_model == "none" else absolute(self.world_model)
+        return AgentRecipe(
+            policy, model, self.revision and absolute(self.revision), **vars(search),
+            model_options=model_options(model, self.world_model_option),
+            semantics=self.semantics and absolute(self.semantics),
+            semantics_options=semantics_options(self.semantics, self.semantics_option),
+            policy_options=policy_options(
+                policy, self.policy_option, self._vlm_options([policy, self.revision or "", *policies])
+            ),
+        )  # fmt: skip
+
+    def _vlm_options(self, policies: Sequence[str]) -> dict[str, Any]:
+        """Return options of policy vlm; its own address, so that the record says where it asked."""
+        flags = {"vlm": self.vlm, "model": self.vlm_model, "prices": self.vlm_prices, "prompts": self.prompts}
+        options = {name: value for name, value in flags.items() if value is not None}
+        if "vlm" not in policies:
+            if options:
+                raise ArgumentError(
+                    "--vlm, --vlm-model, --vlm-prices and --prompts are for policy vlm: give --policy vlm"
+                )
+            return {}
+        paths = {name: str(value.expanduser().resolve()) for name, value in options.items() if isinstance(value, Path)}
+        return {"vlm": {"vlm": "http://localhost:8000/v1", **options, **paths}}
