@@ -117,7 +117,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
         _log.info("%s made in %.1f s", scene.name, time.perf_counter() - started)
         return scene
 
-    identity = ["apartment", store.build_digest(), split, int(seed), *edits]
+    identity: list[str | int] = ["apartment", store.build_digest(), split, int(seed), *edits]
     return store.load_generated(identity, make) if cache else make()
 
 
