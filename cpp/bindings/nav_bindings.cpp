@@ -171,7 +171,7 @@ py::object shortest_path(const NavMesh& mesh, const Array<float>& a, const Array
     const py::gil_scoped_release release;
     path = mesh.shortest_path(start.values[0], end.values[0], metric);
   }
-  if (path.reason != Reason::kNone) {
+  if (path.reason != NoPathReason::kNone) {
     throw NavigationError(std::string("no way from start to end: ") + reason_text(path.reason));
   }
   py::array_t<float> points = point_array(path.points, {static_cast<py::ssize_t>(path.points.size()), 3});

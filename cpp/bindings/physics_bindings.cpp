@@ -278,7 +278,8 @@ They close with contact; when both touch the same dynamic body, a constraint hol
            "Lets go and opens to `amount` of the way, in [0, 1].")
       .def_property_readonly("opening", &Gripper::opening, "Of the way from closed to open, in [0, 1].")
       .def_property_readonly("held", &Gripper::held, "Index of the body that is held, or None.")
-      .def("between", &Gripper::between, "Index of the dynamic body that both fingers touch, or None.");
+      .def("find_body_between_fingers", &Gripper::find_body_between_fingers,
+           "Index of the dynamic body that both fingers touch, or None.");
 }
 
 }  // namespace

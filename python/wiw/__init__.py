@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from wiw.gymnasium_ids import register_environments
 
@@ -106,6 +106,9 @@ def __dir__() -> list[str]:
 register_environments()
 
 if TYPE_CHECKING:
+    import gymnasium
+    from gymnasium.vector import VectorEnv
+
     from wiw import (
         action,
         annotate,
@@ -126,7 +129,6 @@ if TYPE_CHECKING:
     from wiw.loop.agent import Agent
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
-    from wiw.registry import make, make_vec, policy, world_model
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare
@@ -138,3 +140,15 @@ if TYPE_CHECKING:
     from wiw.training.collect import collect
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts
+
+    # The registry lies below what it makes and names no types of it; these are the types for editors and checkers.
+    class GymnasiumEnv(gymnasium.Env[Any, Any], Env): ...
+
+    def make(task_id: str, depth: bool = True, **options: Any) -> GymnasiumEnv: ...
+    def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) -> VectorEnv[Any, Any, Any]: ...
+    def policy(name: Any, **options: Any) -> Policy: ...
+    @overload
+    def world_model(name: Literal["none"], **options: Any) -> None: ...
+    @overload
+    def world_model(name: Any, **options: Any) -> WorldModel: ...
+    def world_model(name: Any, **options: Any) -> WorldModel | None: ...

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every error `wiw` raises on purpose. Messages say what was expected, what came, and what to do."""
+"""Every error that `wiw` raises on purpose. Messages say what was expected, what was received, and what to do."""
 
 from wiw._core import ArgumentError, BackendError, Error, FileError, NavigationError
 
@@ -22,11 +22,15 @@ __all__ = [
     "StoreError",
     "VlmError",
     "WeightsError",
-    "asks_to_stop",
+    "is_stop_request",
 ]
 
 
-def asks_to_stop(error: BaseException) -> bool:
+for _error in (ArgumentError, BackendError, Error, FileError, NavigationError):
+    _error.__module__ = __name__  # tracebacks name the module that users import them from
+
+
+def is_stop_request(error: BaseException) -> bool:
     """Return whether an exception stops the process itself: Ctrl-C, or one of wiw's own for a signal.
 
     Any other is an error of the code that raised it, also `SystemExit`: a plugged-in model ends no run.
@@ -87,7 +91,7 @@ class DeviceMemoryError(InfrastructureError):
 
 
 class RolloutError(InfrastructureError):
-    """A world model gave no usable answer, however often it was asked.
+    """A world model gave no valid rollout after all retries.
 
     `kind` is "raised", "deadline", or the kind of the `ContractError` that its answer was.
     """
@@ -98,7 +102,7 @@ class RolloutError(InfrastructureError):
 
 
 class RemoteError(RolloutError):
-    """A served model gave no answer, or a message between it and its client is not as agreed.
+    """A served model gave no answer, or a message violates the protocol.
 
     `kind` is "connection" (nobody is there), "deadline", "token", "version", "model" (the server has come back with
     another one), "message" (malformed, or too large), "row" (not what the model accepts), or "raised".
@@ -110,7 +114,7 @@ class PromptError(Error):
 
 
 class VlmError(InfrastructureError):
-    """A vision-language model could not be asked, however often it was tried.
+    """A vision-language model could not be queried after all retries.
 
     `kind` is "unreachable", "timeout", "status" (the server failed or was busy), "refused" (it never will), "protocol"
     (a reply that is no completion) or "missing" (an answer that was not recorded).

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files and folders that are there whole or not at all, whenever their writer is killed."""
+"""Atomic writes of files and folders: complete or absent, even if the writer is killed."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from wiw.errors import FileError
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A file beside `path` to write to; it takes the place of `path` only once it is written whole.
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary file beside `path`, which replaces `path` once it is complete.
 
     Raises:
         FileError: it cannot be written, for instance because the disk is full; `path` is as it was.
@@ -22,19 +22,19 @@ def whole_file(path: Path) -> Iterator[Path]:
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
-        sweep(path.parent, path.name)
+        remove_abandoned_drafts(path.parent, path.name)
         yield draft
         _sync(draft)
         draft.replace(path)
 
 
 @contextmanager
-def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: False) -> Iterator[Path]:
-    """The same for a folder: an empty one beside `path` that becomes `path` once all is in it.
+def atomic_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: False) -> Iterator[Path]:
+    """Yield an empty temporary folder beside `path`, which replaces `path` once it is complete.
 
     Args:
         path: a folder that is not there yet, is empty, or that `replace` says may be replaced.
-        replace: told what `path` holds.
+        replace: called with `path`; whether its content may be replaced.
 
     Raises:
         FileError: `path` holds something already, or cannot be written.
@@ -44,7 +44,7 @@ def whole_folder(path: Path, replace: Callable[[Path], bool] = lambda folder: Fa
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     with _write_draft(path, draft):
         path.parent.mkdir(parents=True, exist_ok=True)
-        sweep(path.parent, path.name)
+        remove_abandoned_drafts(path.parent, path.name)
         draft.mkdir()
         yield draft
         if path.is_dir() and any(path.iterdir()):
@@ -67,19 +67,19 @@ def _write_draft(path: Path, draft: Path) -> Iterator[None]:
 
 
 def _old(path: Path) -> Path:
-    """Where a folder that is replaced stays until the new one is in its place."""
+    """Return where a replaced folder stays until the new one is in place."""
     return path.with_name(f".{path.name}.old.{os.getpid()}.part")
 
 
-def sweep(folder: Path, name: str = "*") -> None:
-    """Takes away what writers of files of such a name in a folder have left if they were killed."""
+def remove_abandoned_drafts(folder: Path, name: str = "*") -> None:
+    """Remove the temporary files that killed writers of files of such a name have left in a folder."""
     for draft in folder.glob(f".{name}.*.part"):
         if not _runs(draft.name.removesuffix(".part").rpartition(".")[2]):
             _remove(draft)
 
 
 def _runs(pid: str) -> bool:
-    """Whether there is such a process, and not as a zombie."""
+    """Return whether a process is running, and not a zombie."""
     try:
         return pid.isdigit() and Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:

@@ -28,7 +28,7 @@ def register_environments() -> None:
 
 
 class _AfterGymnasium(MetaPathFinder):
-    """Registers the environments once gymnasium has registered its own."""
+    """An import hook that registers the environments once gymnasium has registered its own."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None

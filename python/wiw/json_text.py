@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON that others wrote: whatever is wrong with it is a `ValueError` that says what."""
+"""Parse untrusted JSON; every defect raises a `ValueError` that describes it."""
 
 from __future__ import annotations
 

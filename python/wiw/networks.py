@@ -40,7 +40,7 @@ OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED")
 
 @contextmanager
 def memory_guard(what: str, cures: str) -> Iterator[None]:
-    """Turn the errors of a full GPU into one that says how to use less memory.
+    """Turn out-of-memory errors into one that says how to use less memory.
 
     Raises:
         DeviceMemoryError: there is no memory left.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One small registry: a kind of thing is found by name in its own folder of `wiw`, by entry point, or by path.
+"""One small registry: world models, policies and so on are found by name, by entry point, or by path.
 
 wiw.world_model("warp")                  python/wiw/world_models/warp.py  (its class is named in `WORLD_MODELS`)
 wiw.world_model("remote:ws://HOST:1234") what follows the name is its first argument, for those that end with a colon
@@ -25,13 +25,13 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ConstructionError, Error, RegistryError, asks_to_stop
+from wiw.errors import ConstructionError, Error, RegistryError, is_stop_request
 from wiw.suggestions import did_you_mean
 
 
 @dataclass(frozen=True)
 class Registry:
-    """Names of one kind. Modules are imported when a name is first used, so that `import wiw` stays light."""
+    """The names of one kind of part. Modules are imported on first use, so that `import wiw` stays light."""
 
     kind: str
     """As in messages: "world model"."""
@@ -45,7 +45,7 @@ class Registry:
     """What programs have added under names of their own (`register`)."""
 
     def names(self) -> list[str]:
-        """All registered names, built-in ones first."""
+        """Return all registered names, built-in ones first."""
         return [*self.built_in, *sorted(({*self._plugins(), *self.registered}) - set(self.built_in))]
 
     def register(self, name: str, thing: Any) -> None:
@@ -59,7 +59,7 @@ class Registry:
         self.registered[name] = self._check_kind(name, thing)
 
     def find(self, name: str) -> Any:
-        """The class or factory behind a name or path.
+        """Return the class or factory behind a name or path.
 
         Raises:
             RegistryError: unknown name; missing file, module or attribute; an exception while it was imported (the
@@ -85,7 +85,7 @@ class Registry:
         )
 
     def make(self, what: Any, **options: Any) -> Any:
-        """An instance from a name, path, class, factory, or instance (returned as it is).
+        """Return an instance from a name, path, class, factory, or instance (returned as it is).
 
         Raises:
             RegistryError: see `find`; also when the options do not fit the constructor.
@@ -114,7 +114,7 @@ class Registry:
         try:
             return factory(**options)
         except BaseException as error:
-            if isinstance(error, Error) or asks_to_stop(error):
+            if isinstance(error, Error) or is_stop_request(error):
                 raise
             name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
             raise ConstructionError(
@@ -128,7 +128,7 @@ class Registry:
         try:
             found = load()
         except BaseException as error:  # SystemExit too: a module must not end the process that imports it
-            if asks_to_stop(error):
+            if is_stop_request(error):
                 raise
             raise RegistryError(
                 f"{self.kind} '{name}' cannot be loaded: {type(error).__name__}: {error}{_where(error)}"
@@ -136,7 +136,7 @@ class Registry:
         return self._check_kind(name, found) if inspect.isclass(found) else found
 
     def _check_kind(self, name: Any, thing: Any) -> Any:
-        """The class or instance, if it is of this kind; None stands for "without"."""
+        """Return the class or instance, if it is of this kind; None stands for "without"."""
         if not self.base or thing is None:
             return thing
         module, _, attribute = self.base.partition(":")
@@ -147,7 +147,7 @@ class Registry:
 
 
 def _makes(thing: Any) -> bool:
-    """Whether it is a class or a factory, rather than an instance."""
+    """Return whether it is a class or a factory, rather than an instance."""
     return inspect.isclass(thing) or inspect.isfunction(thing) or isinstance(thing, partial)
 
 
@@ -164,7 +164,7 @@ def _attribute(path: str) -> Any:
 
 
 def _import_file(path: Path) -> Any:
-    """The module in a Python file, as the file is now: once edited, it is imported anew.
+    """Return the module in a Python file; an edited file is imported again.
 
     Its folder is put first on the path, as for a script, so that it finds the modules beside it.
     """
@@ -190,7 +190,7 @@ def _import_file(path: Path) -> Any:
 
 
 def _where(error: BaseException) -> str:
-    """E.g. " (model.py, line 3)": where an import was left, since the message alone may not tell."""
+    """Return, e.g., " (model.py, line 3)": where an import failed, as the message alone may not say."""
     if isinstance(error, SyntaxError | FileNotFoundError | AttributeError) or error.__traceback__ is None:
         return ""
     frame = traceback.extract_tb(error.__traceback__)[-1]
@@ -327,27 +327,27 @@ PLAN_SPACES = Registry(
 
 
 def list_world_models() -> list[str]:
-    """Names that `wiw.world_model` takes."""
+    """Return the names that `wiw.world_model` takes."""
     return WORLD_MODELS.names()
 
 
 def list_policies() -> list[str]:
-    """Names that `wiw.policy` takes."""
+    """Return the names that `wiw.policy` takes."""
     return POLICIES.names()
 
 
 def list_tasks() -> list[str]:
-    """Names of the tasks; their gymnasium ids are `ImageNav-v0` and so on."""
+    """Return the names of the tasks; their gymnasium ids are `ImageNav-v0` and so on."""
     return TASKS.names()
 
 
 def list_metrics() -> list[str]:
-    """Names of the metrics that tables show."""
+    """Return the names of the metrics that tables show."""
     return METRICS.names()
 
 
 def world_model(name: Any, **options: Any) -> Any:
-    """A world model by name, `path.py:Class`, class or instance; None for "none".
+    """Return a world model by name, `path.py:Class`, class or instance; None for "none".
 
     `wiw.world_model(function, accepts=wiw.accepts(...))` makes one of a function that is called as
     `WorldModel.rollout` is.
@@ -361,7 +361,7 @@ def world_model(name: Any, **options: Any) -> Any:
 
 
 def policy(name: Any, **options: Any) -> Any:
-    """A policy by name, `path.py:Class`, class or instance.
+    """Return a policy by name, `path.py:Class`, class or instance.
 
     Raises:
         RegistryError: unknown name, or options that do not fit; the message says what is known.
@@ -370,7 +370,7 @@ def policy(name: Any, **options: Any) -> Any:
 
 
 def make(task_id: str, depth: bool = True, **options: Any) -> Any:
-    """A gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
+    """Return a gymnasium environment of a task, e.g. `wiw.make("ImageNav-v0", scenes="apartments:val", seed=0)`.
 
     Observations carry depth unless `depth=False`: the matcher maps with it and `warp` imagines with it. What else an
     environment of the task can be given to observe may be among the options (`cameras`, ... of `Manipulation-v0`).
@@ -383,7 +383,7 @@ def make(task_id: str, depth: bool = True, **options: Any) -> Any:
 
 
 def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) -> Any:
-    """A gymnasium vector environment of a task: `num_envs` episodes at a time, stepped and observed as a batch.
+    """Return a gymnasium vector environment of a task: `num_envs` episodes, stepped and observed as a batch.
 
     Raises:
         RegistryError: unknown task, or options that do not fit; the message says what is known.
@@ -394,7 +394,7 @@ def make_vec(task_id: str, num_envs: int, depth: bool = True, **options: Any) ->
 
 
 def _task(task_id: str, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-    """The task, and those of the options that are its environments'."""
+    """Return the task, and the options that belong to its environments."""
     name = task_name(task_id)
     sensors = task_class(name).sensor_options
     task = TASKS.make(name, **{key: value for key, value in options.items() if key not in sensors})
@@ -408,5 +408,5 @@ def task_class(name: str) -> Any:
 
 
 def task_name(task_id: str) -> str:
-    """The registered name behind a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths as they are."""
+    """Return the registered name of a gymnasium id: "imagenav" for "ImageNav-v0". Other names and paths stay."""
     return task_id if ":" in task_id or task_id in TASKS.names() else task_id.removesuffix("-v0").lower()

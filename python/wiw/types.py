@@ -353,20 +353,20 @@ class Fidelity:
 
 @dataclass(frozen=True)
 class Exchange:
-    """A question that was put to a language model while deciding, and what came of it."""
+    """A question to a language model during a decision, and its outcome."""
 
     purpose: str
     """What the policy wanted, such as "propose/0" or "answer"."""
     model: str
     said: tuple[Mapping[str, Any], ...]
     """Every completion: `call` (its question's name), `text`, `finish`, `logprobs`, `prompt_tokens`,
-    `completion_tokens`. With these a run can be told again without the model."""
+    `completion_tokens`. With these a run can be replayed without the model."""
     result: Mapping[str, Any] = field(default_factory=dict)
     """How it was read: `by` ("logprobs" or "votes"), `mass` of the choices, whether it was `repaired`."""
     problem: str = ""
     """Why the answer could not be used, "<kind>: <detail>"; empty where it could."""
     instead: str = ""
-    """What the policy did then."""
+    """What the policy did instead."""
 
 
 @dataclass(frozen=True)

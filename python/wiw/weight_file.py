@@ -15,7 +15,7 @@ from safetensors.torch import save as packed
 from torch import Tensor, nn
 
 from wiw.errors import ArgumentError, WeightsError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 N = TypeVar("N", bound=nn.Module)
 
@@ -42,7 +42,7 @@ class WeightFile(Generic[N]):
         return f"`wiw train {self.name}` makes some"
 
     def load(self, path: str | Path) -> tuple[N, dict[str, Any]]:
-        """The network and its card.
+        """Load the network and its card.
 
         Raises:
             WeightsError: there is no such file, or it is damaged, of another version or of something else.
@@ -64,7 +64,7 @@ class WeightFile(Generic[N]):
             ) from error
 
     def save(self, path: Path, network: N, card: Mapping[str, Any]) -> None:
-        """Writes them whole or not at all.
+        """Write them atomically.
 
         Raises:
             FileError: the file cannot be written.
@@ -72,12 +72,12 @@ class WeightFile(Generic[N]):
         header = {**self.sizes(network), "card": dict(card)}
         values = {name: value.half().contiguous() for name, value in network.state_dict().items()}
         metadata = {"format": self.format, "header": json.dumps(header, sort_keys=True), "digest": digest(values)}
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             draft.write_bytes(packed(values, metadata))
 
-    def _check(self, values: Mapping[str, Tensor], told: str | None, path: Path) -> None:
-        """That values are those that were written, as far as the file says which, and are numbers."""
-        if told is not None and told != digest(values):
+    def _check(self, values: Mapping[str, Tensor], expected: str | None, path: Path) -> None:
+        """Check that the values are finite and match the digest in the file, if it has one."""
+        if expected is not None and expected != digest(values):
             wrong = "its values are not those that were written: it is damaged"
         elif not all(value.isfinite().all() for value in values.values()):
             wrong = "some of its values are no finite numbers: it is damaged, or its training failed"

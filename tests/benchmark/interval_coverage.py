@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from wiw.analysis.intervals import clustered_bootstrap, t_of_sums, wilson
-from wiw.analysis.simulate import draw, total
+from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 from wiw.analysis.utility import ratio
 
 SCENES = (5, 10, 30, 87)
@@ -35,7 +35,7 @@ TRIPLES = np.array([92, 1, 6, 1, 20, 1, 54, 35]) / 210
 def held(shares: list[float], values: list[float], kind: str, scenes: int, correlation: float, runs: int) -> float:
     """Share of runs whose t interval holds the truth, percent."""
     rng = np.random.default_rng([scenes, round(1000 * correlation), runs])
-    sums, squares = total(draw(shares, scenes, PER_SCENE, correlation, runs, rng), values)
+    sums, squares = sum_by_scene(draw_outcome_counts(shares, scenes, PER_SCENE, correlation, runs, rng), values)
     low, high = t_of_sums(sums, squares, np.full(scenes, float(PER_SCENE)), kind)  # type: ignore[arg-type]
     return 100 * float(np.mean((low <= np.dot(shares, values)) & (np.dot(shares, values) <= high)))
 
@@ -45,7 +45,7 @@ def episodes(
 ) -> Iterator[np.ndarray]:
     """The episodes of each run, scene by scene."""
     rng = np.random.default_rng([1, scenes, round(1000 * correlation)])
-    for run in draw(shares, scenes, PER_SCENE, correlation, runs, rng):
+    for run in draw_outcome_counts(shares, scenes, PER_SCENE, correlation, runs, rng):
         yield np.concatenate([np.repeat(values, ways) for ways in run])
 
 

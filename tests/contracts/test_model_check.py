@@ -207,7 +207,7 @@ BROKEN = {
     "pictures, mirrored": (mirrored_after_frame_0, {}, "After frame 0, frames are mirrored"),
     "pictures, upside down": (upside_down_after_frame_0, {}, "After frame 0, frames are upside down"),
     "frame 0, shifted": (shift, {}, "Frame k is what follows action k"),
-    "random": (by_chance, {}, "Asked twice with the same seeds, 6 of 6 rows differ"),
+    "random": (by_chance, {}, "In two calls with the same seeds, 6 of 6 rows differ"),
     "batch": (by_the_batch, {}, "alone, 2 of 2 rows differ from the same in a batch of 4"),
     "batch, seeds": (from_the_first_seed, {}, "its own seed, not the batch's from the first one"),
     "causal": (looking_ahead, {"causal": True}, "It declares causal=True, but frames before"),

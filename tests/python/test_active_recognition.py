@@ -126,7 +126,7 @@ class Sink:
     def episode(self, result: Any) -> None:
         self.results.append(result)
 
-    def again(self, episodes: Any) -> None:
+    def record_restart(self, episodes: Any) -> None:
         raise AssertionError(episodes)
 
     def record_lost(self, spent: Any) -> None:

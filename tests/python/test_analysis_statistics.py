@@ -153,11 +153,8 @@ def test_episodes_that_were_not_judged_are_counted_and_said():
     assert summary["warp"].estimates["success"].value == 100.0
     difference = summary.difference("warp", "none")
     assert (difference.estimate.n, difference.wins, difference.losses) == (3, 3, 0)
-    assert (summary["warp"].total, summary["warp"].scored_of_total, summary["none"].scored_of_total) == (
-        5,
-        "3/5",
-        "4/5",
-    )
+    assert summary["warp"].total == 5
+    assert (summary["warp"].scored_of_total, summary["none"].scored_of_total) == ("3/5", "4/5")
     said = " ".join(notes(summary))
     assert "warp: 3 of 5 episodes are scored; 1 infrastructure error is excluded from scores; 1 still to run" in said
     assert "Over all 5, SR would be between 60.0 and 100.0 %" in said

@@ -43,7 +43,7 @@ def test_alone_is_what_a_scene_of_that_instance_alone_shows(two_rooms: str) -> N
         sine = np.sin(np.linspace(np.pi / 2, -np.pi / 2, visibility.SIZE[0] + 1))
         expected = ((ids > 0).sum(axis=2) * -np.diff(sine)).sum(axis=1) * 2 * np.pi / visibility.SIZE[1]
         np.testing.assert_allclose(
-            visibility.measure_unhidden_sizes(place, points, instance), expected, rtol=0.02, atol=2e-4
+            visibility.measure_unoccluded_sizes(place, points, instance), expected, rtol=0.02, atol=2e-4
         )
         assert (before[:, instance] <= expected * 1.02 + 2e-4).all()
     np.testing.assert_array_equal(visibility.measure_sizes(place, points), before)  # all is back in its place
@@ -56,7 +56,7 @@ def test_measuring_visibility_leaves_pictures_as_they_were() -> None:
     poses = np.stack([visibility.camera_pose(points[k], np.pi / 8 * k) for k in (6, 18)])
     before = place.renderer.perspective(poses, (480, 480), 90.0)
     for instance in range(1, len(place.scene.instances) + 1):
-        visibility.visible_share(place, points[0], instance)
+        visibility.visible_fraction(place, points[0], instance)
     after = place.renderer.perspective(poses, (480, 480), 90.0)
     for output, pixels in before.items():
         np.testing.assert_array_equal(after[output], pixels, output)
@@ -65,8 +65,8 @@ def test_measuring_visibility_leaves_pictures_as_they_were() -> None:
 def test_a_share_is_none_behind_a_wall_and_all_in_plain_sight(two_rooms: str) -> None:
     place = world(two_rooms, "cpu")
     table = next(int(thing["id"]) for thing in place.scene.instances if thing["name"] == "table")
-    assert visibility.visible_share(place, np.array([2.0, 0, -1.0]), table) == 0
-    assert visibility.visible_share(place, np.array([-1.0, 0, -1.0]), table) == pytest.approx(1)
+    assert visibility.visible_fraction(place, np.array([2.0, 0, -1.0]), table) == 0
+    assert visibility.visible_fraction(place, np.array([-1.0, 0, -1.0]), table) == pytest.approx(1)
 
 
 def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> None:
@@ -79,7 +79,7 @@ def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> Non
         thing = place.scene.instances[info["target"] - 1]
         assert thing["category"] == info["category"]
         np.testing.assert_allclose(episode.goal_position, np.asarray(thing["bounds"]).mean(axis=0), atol=1e-5)
-        share = visibility.visible_share(place, start, info["target"])
+        share = visibility.visible_fraction(place, start, info["target"])
         assert share == pytest.approx(info["visible"], abs=1e-3)
         assert info["difficulty"] == (share < 0.4) + (share < 0.2)
         best = np.asarray(info["best_position"])
@@ -87,7 +87,7 @@ def test_episodes_are_hard_at_the_start_and_can_be_mended(two_rooms: str) -> Non
         assert now >= RULES.seen
         assert then >= max(RULES.large, RULES.gain * now)
         assert share <= RULES.hidden or now <= RULES.small * then
-        assert visibility.visible_share(place, best, info["target"]) >= RULES.clear - 1e-3
+        assert visibility.visible_fraction(place, best, info["target"]) >= RULES.clear - 1e-3
         assert info["best_primitives"] <= RULES.budget
 
 

@@ -26,7 +26,7 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 from safetensors import safe_open  # noqa: E402
 from safetensors.torch import save as packed  # noqa: E402
 
-from wiw.world_models.armnet.body import plate, sights  # noqa: E402
+from wiw.world_models.armnet.body import render_arm, render_bare_table  # noqa: E402
 from wiw.world_models.armnet.model import BUILT_IN, SIZE, ArmNet  # noqa: E402
 from wiw.world_models.armnet.motion import motion  # noqa: E402
 from wiw.world_models.armnet.network import (  # noqa: E402
@@ -35,12 +35,12 @@ from wiw.world_models.armnet.network import (  # noqa: E402
     Arm,
     Mixture,
     Network,
+    build_sources,
     carry_canvas,
     clear_arm,
     compose_view,
-    in_sight,
-    shade,
-    sources,
+    compute_shading,
+    find_unoccluded_arm,
 )
 from wiw.world_models.armnet.weights import load, save  # noqa: E402
 
@@ -52,7 +52,7 @@ PLAN = np.array(
 )
 
 
-def untrained(seed: int = 0) -> ArmNet:
+def make_untrained(seed: int = 0) -> ArmNet:
     torch.manual_seed(seed)
     return ArmNet.of(Network(SMALL))
 
@@ -102,20 +102,22 @@ def test_finger_tips_are_where_a_marker_at_their_place_is_seen(spot: tuple[float
 def test_the_arm_is_drawn_as_it_is_seen_and_moves_nothing_else(table: Workbench) -> None:
     bench = table.fork()
     poses = np.stack([bench.pose, *PLAN])
-    for pose, sight in zip(poses, sights(poses, FRONT), strict=True):
+    for pose, sight in zip(poses, render_arm(poses, FRONT), strict=True):
         bench.move_to(pose)
         seen = bench.render_view("front", FRONT, ("color",))["color"]
         np.testing.assert_allclose(sight.pose, bench.pose, atol=1e-3)
         assert sight.arm.mean() > 0.03
         off = np.abs(seen.astype(int) - sight.color).max(axis=-1)
         assert np.mean(off[sight.arm] < 8) > 0.9  # the rest: cups before it
-    assert (plate(FRONT).color == plate(FRONT).color[:, ::-1]).mean() > 0.6  # nobody stands before the table
-    assert not plate(FRONT).arm.any()
+    assert (
+        render_bare_table(FRONT).color == render_bare_table(FRONT).color[:, ::-1]
+    ).mean() > 0.6  # nobody stands before the table
+    assert not render_bare_table(FRONT).arm.any()
 
 
 def test_a_pose_that_cannot_be_reached_is_gone_to_as_far_as_the_arm_does() -> None:
     deep = np.array([*PLAN[0, :2], TABLE - 0.3, np.pi, 0, 0, 1.0 + 1e-9])
-    _, after = sights(np.stack([PLAN[0], deep]), FRONT)
+    _, after = render_arm(np.stack([PLAN[0], deep]), FRONT)
     assert after.pose[2] > TABLE - 0.01
 
 
@@ -126,10 +128,10 @@ def test_without_things_that_move_the_next_view_is_known(table: Workbench) -> No
     before = bench.render_view("front", FRONT)["color"]
     bench.move_to(PLAN[0])
     after = bench.render_view("front", FRONT)["color"]
-    bare = image(plate(FRONT).color)
-    old, new = (arm_of(sight) for sight in sights(np.stack([here, PLAN[0]]), FRONT))
-    canvas = clear_arm(image(before), old, in_sight(image(before), old), bare, bare)
-    still = torch.where(new.mask > 0.5, new.color, canvas * shade(new.color, bare, new.mask))
+    bare = image(render_bare_table(FRONT).color)
+    old, new = (arm_of(sight) for sight in render_arm(np.stack([here, PLAN[0]]), FRONT))
+    canvas = clear_arm(image(before), old, find_unoccluded_arm(image(before), old), bare, bare)
+    still = torch.where(new.mask > 0.5, new.color, canvas * compute_shading(new.color, bare, new.mask))
     gap = (still - image(after)).abs().amax(1)
     copied = (image(before) - image(after)).abs().amax(1)
     assert (gap > 0.1).float().mean() < 0.1 * (copied > 0.1).float().mean()
@@ -139,9 +141,9 @@ def test_the_canvas_is_the_table_without_the_arm(table: Workbench) -> None:
     bench = table.fork()
     bench.move_to(PLAN[0])
     seen, clear = (image(bench.render_view("front", FRONT, arm=arm)["color"]) for arm in (True, False))
-    *_, sight = sights(np.stack([PLAN[0]]), FRONT)
-    bare = image(plate(FRONT).color)
-    canvas = clear_arm(seen, arm_of(sight), in_sight(seen, arm_of(sight)), bare, bare)
+    *_, sight = render_arm(np.stack([PLAN[0]]), FRONT)
+    bare = image(render_bare_table(FRONT).color)
+    canvas = clear_arm(seen, arm_of(sight), find_unoccluded_arm(seen, arm_of(sight)), bare, bare)
     assert (canvas - clear).abs().mean() < 0.15 * (seen - clear).abs().mean()
 
 
@@ -177,8 +179,8 @@ def test_each_part_of_a_mixture_is_what_it_says(part: int) -> None:
     shares[:, part] = 1
     way = motion(PLAN[:1], PLAN[1:2])
     mixture = Mixture(shares, paint, torch.zeros(1, 2, 64, 120))
-    made = compose_view(shares, sources(mixture, canvas, arm, way, bare))
-    dark = shade(color, bare, arm.mask)
+    made = compose_view(shares, build_sources(mixture, canvas, arm, way, bare))
+    dark = compute_shading(color, bare, arm.mask)
     expected = [canvas * dark, carry_canvas(canvas, way) * dark, color, paint][part].clamp(0, 1)
     torch.testing.assert_close(made, expected)
 
@@ -203,7 +205,7 @@ def front(table: Workbench) -> Any:
 
 
 def test_rows_do_not_depend_on_each_other(table: Workbench, front: Any) -> None:
-    model, here = untrained(), table.pose
+    model, here = make_untrained(), table.pose
     plans = [np.stack([here, *PLAN]), np.stack([here, *PLAN[::-1]])]
     controls = [control(plans[0]), control(plans[1]), control(plans[0], length=2, shared=1)]
     together = rollout(model, np.stack([front] * 3), controls)
@@ -215,8 +217,8 @@ def test_rows_do_not_depend_on_each_other(table: Workbench, front: Any) -> None:
 
 
 def test_it_says_what_it_is(tmp_path: Path, table: Workbench, front: Any) -> None:
-    one, other = untrained(0), untrained(1)
-    assert one.fingerprint() == untrained(0).fingerprint() != other.fingerprint()
+    one, other = make_untrained(0), make_untrained(1)
+    assert one.fingerprint() == make_untrained(0).fingerprint() != other.fingerprint()
     assert (one.accepts.space, one.accepts.view, one.accepts.frames) == ("pose7", "perspective", 0)
     assert one.accepts.causal and not one.accepts.needs and json.dumps(one.describe())
     save(tmp_path / "w.safetensors", one._network, {})
@@ -289,10 +291,10 @@ def test_the_weights_that_come_with_it_know_what_is_carried() -> None:
     seen = bench.render_view("front", SIZE)["color"]
     made = rollout(wiw.world_model("armnet"), seen[None], [control(ids)])[0, -1]
     truth = bench.render_fronts_after(plan, SIZE)[-1]
-    bare = image(plate(SIZE).color)
-    first, *_, last = (arm_of(sight) for sight in sights(ids, SIZE))
-    canvas = clear_arm(image(seen), first, in_sight(image(seen), first), bare, bare)
-    still = torch.where(last.mask > 0.5, last.color, canvas * shade(last.color, bare, last.mask))
+    bare = image(render_bare_table(SIZE).color)
+    first, *_, last = (arm_of(sight) for sight in render_arm(ids, SIZE))
+    canvas = clear_arm(image(seen), first, find_unoccluded_arm(image(seen), first), bare, bare)
+    still = torch.where(last.mask > 0.5, last.color, canvas * compute_shading(last.color, bare, last.mask))
     changed = (still - image(truth)).abs().amax(1) > 0.06
     wrong, alone = ((view - image(truth)).abs().mean(1)[changed].mean() for view in (image(made), still))
     assert wrong < 0.9 * alone

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import socket
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from wiw import errors
 from wiw.cli import main
 from wiw.errors import VlmError
 from wiw.vlm.openai import OpenAIClient
@@ -56,6 +59,8 @@ def test_list_takes_a_kind(what: str, names: list[str], others: list[str], capsy
         (["--policy-option", "turn=left"], "policy matcher: expected a number for turn, got 'left'"),
         (["--width", "2"], "give --depth 2 or more"),
         (["--policy", "recogniser"], "use it with task ar"),
+        (["--scenes", "apartment:val:1"], "wiw: apartment:val:1: no such file"),
+        (["--scenes", "apartment:val:1"], "Did you mean apartments:val:1?"),
         (["--policy", "matcher", "--revision", "recogniser"], "use it with task ar"),
         (["--world-model", f"{FAKES}:Nothing"], "fakes.py defines no 'Nothing'; it has LineEnv,"),
     ],
@@ -67,6 +72,49 @@ def test_a_mistake_is_explained_in_one_line(
     assert main(["run", "imagenav", *options, *arguments]) == 2
     last = capsys.readouterr().err.splitlines()[-1]
     assert last.startswith("wiw: ") and message in last
+
+
+def test_a_missing_episode_file_is_named_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "none.json"
+    assert main(["run", "imagenav", "--episode-file", str(file), "--out", str(tmp_path / "r")]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"wiw: {file}: No such file or directory"
+
+
+def test_facts_of_scenes_are_whole_in_80_columns(
+    two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setattr("wiw.cli.scenes._facts", lambda _: ["a" * 40, "10.5 x 12.2 x 2.6", "1,108,123", *["1234"] * 5])
+    assert main(["scenes", two_rooms, "--views", "1", "--out", str(tmp_path / "sheet.png")]) == 0
+    shown = capsys.readouterr().out
+    assert "…" not in shown and max(map(len, shown.splitlines()[:4])) <= 80
+    for text in ("triangles", "walk m2", "islands", "1,108,123", "10.5 x 12.2 x 2.6"):
+        assert text in shown
+
+
+def test_the_demo_ends_with_its_pages_and_the_ready_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    log = SimpleNamespace(report=lambda remark: reports.append(remark) or "report.html")
+    reports: list[str] = []
+    monkeypatch.setattr("wiw.studies.evaluate.evaluate", lambda *_, **__: log)
+    monkeypatch.setattr("wiw.cli.run.finish", lambda log, report, remark: print(log.report(remark)) or 0)
+    assert main(["demo", "--out", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    ready = "docs/report-imagenav.html"
+    assert ready in " ".join(shown.split()) and all(ready in remark for remark in reports) and len(reports) == 2
+    assert f"{tmp_path}/imagenav/report.html" in shown
+    text = [line for line in shown.splitlines() if not line.startswith("        ")]
+    assert max(map(len, text)) < 80
+    assert Path(__file__).parents[2].joinpath(ready).stat().st_size <= 10**6
+
+
+def test_errors_name_the_module_that_users_import() -> None:
+    for name in ("ArgumentError", "FileError", "Error", "NavigationError", "BackendError"):
+        error = getattr(errors, name)
+        assert error.__module__ == "wiw.errors"
+        assert pickle.loads(pickle.dumps(error("why"))).args == ("why",)
 
 
 def test_what_is_no_number_is_refused_plainly(capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,7 +17,7 @@ import pytest
 from crash_victims import EPISODES, Victims, evaluate
 
 from wiw.errors import FileError, StoreError
-from wiw.files import whole_file, whole_folder
+from wiw.files import atomic_file, atomic_folder
 from wiw.runs.store import RunStore, store_path
 from wiw.studies.run_log import load_run
 
@@ -205,16 +205,16 @@ def test_a_store_that_could_not_be_opened_is_not_held(reference, tmp_path):
 def test_files_are_whole_or_not_there(tmp_path):
     target, folder = tmp_path / "a.txt", tmp_path / "tables"
     (tmp_path / ".a.txt.999999999.part").write_text("of a writer that was killed")
-    with whole_file(target) as draft:
+    with atomic_file(target) as draft:
         draft.write_text("first")
         assert not target.exists()
-    with pytest.raises(ZeroDivisionError), whole_file(target) as draft:
+    with pytest.raises(ZeroDivisionError), atomic_file(target) as draft:
         draft.write_text("half")
         raise ZeroDivisionError
-    with whole_folder(folder) as draft:
+    with atomic_folder(folder) as draft:
         (draft / "x").write_text("x")
         assert not folder.exists()
-    with pytest.raises(FileError, match=r"tables holds something already.*name another"), whole_folder(folder):
+    with pytest.raises(FileError, match=r"tables holds something already.*name another"), atomic_folder(folder):
         pass
     assert target.read_text() == "first" and sorted(p.name for p in tmp_path.iterdir()) == ["a.txt", "tables"]
 

@@ -60,7 +60,7 @@ def seen(shown: list[Demonstration]) -> Samples:
     return extract_samples(shown, LENS)
 
 
-def untrained(seed: int = 0) -> Diffuser:
+def make_untrained(seed: int = 0) -> Diffuser:
     torch.manual_seed(seed)
     return Diffuser.from_network(Network(SMALL), steps=4)
 
@@ -259,7 +259,7 @@ def test_a_dense_path_leads_through_its_poses_and_is_thinned_to_them() -> None:
 
 
 def test_candidates_differ_and_are_functions_of_the_key(shown: list[Demonstration]) -> None:
-    policy, key = untrained(), Key(3, 1, 2)
+    policy, key = make_untrained(), Key(3, 1, 2)
     first, second = (situation(each, key) for each in shown)
     plans = policy.propose([first, second], 5, 50)
     assert [len(each) for each in plans] == [5, 5]
@@ -274,7 +274,7 @@ def test_candidates_differ_and_are_functions_of_the_key(shown: list[Demonstratio
 
 
 def test_weights_are_kept_with_their_shape(tmp_path: Path, shown: list[Demonstration]) -> None:
-    policy = untrained()
+    policy = make_untrained()
     policy._network.half().float()
     save(tmp_path / "weights.safetensors", policy._network, {"recipe": {"epochs": 1}})
     again = wiw.policy("diffuser", weights=tmp_path / "weights.safetensors", steps=4)

@@ -32,7 +32,7 @@ class Records:
     def episode(self, result) -> None:
         assert result.status == "done", result.error
 
-    def again(self, episodes) -> None:
+    def record_restart(self, episodes) -> None:
         raise AssertionError
 
     def record_lost(self, spent) -> None:

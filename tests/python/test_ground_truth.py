@@ -15,7 +15,7 @@ import wiw
 from recognition_file import a_file
 from wiw.action import FORWARD, TURN_LEFT
 from wiw.datasets import ar
-from wiw.datasets.visibility import measure_sizes, visible_share
+from wiw.datasets.visibility import measure_sizes, visible_fraction
 from wiw.errors import ArgumentError
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores
@@ -31,7 +31,7 @@ from wiw.tasks.imagenav import ImageNav
 from wiw.types import Answer, Goal, Key, Observation
 
 
-def started(task: Any, index: int = 0) -> Any:
+def begin_env(task: Any, index: int = 0) -> Any:
     env = task.environment(depth=False)
     env.begin(task.episode(index))
     return env
@@ -55,64 +55,64 @@ def with_true_scores(policy: Policy, model: Any = None, **numbers: Any) -> wiw.A
 
 @pytest.mark.parametrize("index", range(4))
 def test_true_plans_lead_to_the_goal_almost_as_fast_as_can_be(two_rooms: str, index: int) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"), index)
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"), index)
     steps = 0
     while not env.state.ended:
-        segment = env.run(env.guide().plan(5)[:3])
+        segment = env.run(env.guide().suggest_plan(5)[:3])
         steps += len(segment.executed)
         assert steps <= 1.2 * env.state.episode.info["ideal_primitives"] + 3
     assert env.state.success
 
 
 def test_asking_a_guide_moves_nothing(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     before, guide = env.truth(), env.guide()
-    first = guide.worth(AHEAD), guide.plan(9).tolist()
-    assert (guide.worth(AHEAD), guide.plan(9).tolist()) == first and len(first[1]) == 9
+    first = guide.evaluate_plan(AHEAD), guide.suggest_plan(9).tolist()
+    assert (guide.evaluate_plan(AHEAD), guide.suggest_plan(9).tolist()) == first and len(first[1]) == 9
     np.testing.assert_array_equal(env.truth().position, before.position)
     assert env.truth().yaw == before.yaw and env.state.actions == 0
 
 
 def test_worth_is_primitives_to_go_and_best_within_reach(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     guide, start = env.guide(), env.state.geodesic_to_goal()
-    plan = guide.plan(20)
-    worths = [guide.worth(plan[:k]) for k in range(1, 21)]
+    plan = guide.suggest_plan(20)
+    worths = [guide.evaluate_plan(plan[:k]) for k in range(1, 21)]
     assert worths == sorted(worths) and -worths[0] >= start / 0.2 - 1
-    on_the_way = guide.worth(plan)
-    assert guide.worth([*plan, *[TURN_LEFT] * 8]) >= on_the_way  # where it goes afterwards takes nothing away
+    on_the_way = guide.evaluate_plan(plan)
+    assert guide.evaluate_plan([*plan, *[TURN_LEFT] * 8]) >= on_the_way  # where it goes afterwards takes nothing away
     env.run(plan)
     while not env.state.ended:
-        env.run(env.guide().plan(5)[:3])
-    assert env.guide().worth([TURN_LEFT]) == 0
+        env.run(env.guide().suggest_plan(5)[:3])
+    assert env.guide().evaluate_plan([TURN_LEFT]) == 0
 
 
 def test_a_goal_that_cannot_be_walked_to_is_judged_in_a_straight_line(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     env.state.goal_position = np.array([40.0, 0.0, 0.0])
-    worths = [env.guide().worth(plan) for plan in FAN]
-    assert np.isfinite(worths).all() and len(env.guide().plan(5)) == 5
+    worths = [env.guide().evaluate_plan(plan) for plan in FAN]
+    assert np.isfinite(worths).all() and len(env.guide().suggest_plan(5)) == 5
 
 
 def test_recognition_progresses_with_what_is_seen(two_rooms: str, tmp_path: Path) -> None:
     task = AR(episode_file=a_file(tmp_path, two_rooms, start=(-1.2, 0.0, 1.2), yaw=np.pi / 2), backend="cpu")
-    env = started(task)
+    env = begin_env(task)
     state, target = env.state, int(env.state.episode.info["target"])
     place = env.fork().position
-    size, share = measure_sizes(state.world, place[None])[0, target], visible_share(state.world, place, target)
+    size, share = measure_sizes(state.world, place[None])[0, target], visible_fraction(state.world, place, target)
     clarity = ar.measure_clarity(state.world, place, target)
     assert clarity == pytest.approx(share * min(1, size / ar.EpisodeRules().enough)) and 0 < clarity < 1
     best = task.find_destination(state)
     assert ar.measure_clarity(state.world, best, target) > 1.5 * clarity
     while np.linalg.norm(env.truth().position - best) > 0.25:
-        env.run(env.guide().plan(4)[:1], unsure(task))
+        env.run(env.guide().suggest_plan(4)[:1], unsure(task))
         assert env.state.actions <= 9
     assert ar.measure_clarity(state.world, np.array([3.0, 0.0, 0.0]), target) == 0  # from the other room
 
 
 def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    worths = [env.guide().worth(plan) for plan in FAN[:3]]
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
+    worths = [env.guide().evaluate_plan(plan) for plan in FAN[:3]]
     for policy, model in ((Noise(), None), (Noise(), "copy")):
         decision = decide(with_true_scores(policy, model), env)
         np.testing.assert_array_equal(decision.scores, worths)
@@ -126,16 +126,18 @@ def test_scoring_follows_the_truth_whatever_policies_say(two_rooms: str) -> None
 
 
 def test_deeper_beams_are_scored_by_the_truth(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     decision = decide(with_true_scores(Noise(), "copy", depth=2), env)
     assert max(len(plan.actions) for plan in decision.proposals) == 10
-    np.testing.assert_array_equal(decision.scores, [env.guide().worth(plan.actions) for plan in decision.proposals])
+    np.testing.assert_array_equal(
+        decision.scores, [env.guide().evaluate_plan(plan.actions) for plan in decision.proposals]
+    )
 
 
 def test_a_true_plan_leads_and_the_last_one_gives_way(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    env.run(env.guide().plan(9))
-    true = env.guide().plan(5)
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
+    env.run(env.guide().suggest_plan(9))
+    true = env.guide().suggest_plan(5)
     assert FORWARD in true
     decision = decide(wiw.Agent(TruePlans(Spinner()), "copy", candidates=3), env)
     plans = [plan.actions.tolist() for plan in decision.proposals]
@@ -150,11 +152,11 @@ def test_a_true_plan_leads_and_the_last_one_gives_way(two_rooms: str) -> None:
 
 
 def test_a_pool_keeps_the_true_plan_first(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
-    env.run(env.guide().plan(9))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
+    env.run(env.guide().suggest_plan(9))
     agent = wiw.Agent(TruePlans(Spinner()), candidates=2, pool=3)
     plans = [plan.actions.tolist() for plan in decide(agent, env).proposals]
-    assert plans == [env.guide().plan(5).tolist(), list(map(int, SPIN[0]))]
+    assert plans == [env.guide().suggest_plan(5).tolist(), list(map(int, SPIN[0]))]
 
 
 class Rememberer(Noise):
@@ -193,7 +195,7 @@ class Rememberer(Noise):
     ],
 )
 def test_proposer_and_reviser_of_one_policy_share_its_memory(two_rooms: str, make: Any) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     policy = Rememberer()
     decision = decide(make(policy), env)
     assert (policy.begun, policy.observed, len(policy.memories)) == (1, 1, 2)
@@ -201,7 +203,7 @@ def test_proposer_and_reviser_of_one_policy_share_its_memory(two_rooms: str, mak
 
 
 def test_another_reviser_keeps_a_memory_of_its_own(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     proposer, reviser = Rememberer(), Rememberer()
     decide(wiw.Agent(TruePlans(proposer), "copy", reviser=TrueScores(reviser)), env)
     assert proposer.begun == reviser.begun == proposer.observed == reviser.observed == 1
@@ -209,7 +211,7 @@ def test_another_reviser_keeps_a_memory_of_its_own(two_rooms: str) -> None:
 
 
 def test_true_plans_and_true_scores_compose_with_each_other_and_with_a_changed_model(two_rooms: str) -> None:
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     model = Gated(ShuffledPlacebo(wiw.world_model("oracle")), 1.0)
     found = [
         decide(agent, env)
@@ -221,7 +223,9 @@ def test_true_plans_and_true_scores_compose_with_each_other_and_with_a_changed_m
     ]
     for decision in found:
         assert decision.proposals[0].note == "true" and decision.calls["rows"] > 0
-        np.testing.assert_array_equal(decision.scores, [env.guide().worth(plan.actions) for plan in decision.proposals])
+        np.testing.assert_array_equal(
+            decision.scores, [env.guide().evaluate_plan(plan.actions) for plan in decision.proposals]
+        )
 
 
 def test_a_wrapper_that_scores_by_itself_is_asked(two_rooms: str) -> None:
@@ -229,7 +233,7 @@ def test_a_wrapper_that_scores_by_itself_is_asked(two_rooms: str) -> None:
         def score(self, situations: Any, proposals: Any, rollouts: Any) -> Any:
             return [-scores for scores in super().score(situations, proposals, rollouts)]
 
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     plain, other = (decide(wiw.Agent(policy, "copy"), env) for policy in (Noise(), TruePlans(Reversed(Noise()))))
     np.testing.assert_array_equal(other.scores, -plain.scores)
 
@@ -261,7 +265,7 @@ def test_nobody_is_given_the_truth_unasked(two_rooms: str) -> None:
         def __getattr__(self, name: str) -> Any:
             raise AssertionError(f"somebody asks for {name}")
 
-    env = started(ImageNav(scenes=two_rooms, backend="cpu"))
+    env = begin_env(ImageNav(scenes=two_rooms, backend="cpu"))
     environments = LiveEnvironments()
     environments.add(Key(0, 0), Guarded())
     agent = wiw.Agent(Noise(), "copy")

@@ -81,7 +81,7 @@ def task(two_rooms: str) -> ImageNav:
     return ImageNav(scenes=two_rooms, decisions=4)
 
 
-def lived(task, agent, decisions=4, episode=0):
+def record_episode(task, agent, decisions=4, episode=0):
     """The observations of some decisions by hand, and what was carried out after each."""
     env = task.environment()
     observation, seen, carried = env.begin(task.episode(episode)), [], []
@@ -96,7 +96,7 @@ def lived(task, agent, decisions=4, episode=0):
 @pytest.mark.parametrize("view", ["perspective", "panorama"])
 def test_a_row_sees_the_episodes_latest_observations_with_what_lies_between(task: ImageNav, view: str) -> None:
     model = Watching(view=view)
-    seen, carried = lived(task, wiw.Agent(Walking(), model, horizon=4, execute=2))
+    seen, carried = record_episode(task, wiw.Agent(Walking(), model, horizon=4, execute=2))
     assert len(model._calls) == 4
     ahead = [observations.image[0] for observations, _ in model._calls]  # the first plan has no leading turns
     for decision, (observations, _) in enumerate(model._calls):
@@ -128,7 +128,7 @@ def compose(odometry, pose):
 
 def test_after_leading_turns_the_present_observation_is_the_frame_before(task: ImageNav) -> None:
     model = Watching()
-    lived(task, wiw.Agent(Walking(), model, horizon=4, execute=2), decisions=3)
+    record_episode(task, wiw.Agent(Walking(), model, horizon=4, execute=2), decisions=3)
     history = model._calls[-1][0].history
     ahead, left, right = range(3)
     for row, turns in ((left, 2), (right, -1)):
@@ -146,7 +146,7 @@ def test_after_leading_turns_the_present_observation_is_the_frame_before(task: I
 
 def test_a_young_episode_is_padded_with_its_first_frame_and_says_so(task: ImageNav) -> None:
     model = Watching(history=5)
-    lived(task, wiw.Agent(Walking(), model, candidates=1, horizon=4, execute=2), decisions=2)
+    record_episode(task, wiw.Agent(Walking(), model, candidates=1, horizon=4, execute=2), decisions=2)
     first, second = (observations.history for observations, _ in model._calls)
     assert first.valid.tolist() == [[False] * 4 + [True]] and second.valid.tolist() == [[False] * 3 + [True] * 2]
     assert first.count.tolist() == [1] and second.count.tolist() == [2]
@@ -185,7 +185,7 @@ class Recorder:
     def episode(self, result):
         self.results[result.episode] = result
 
-    def again(self, episodes):
+    def record_restart(self, episodes):
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
     def record_lost(self, spent):
@@ -402,7 +402,7 @@ def test_who_declares_a_history_says_that_it_is_needed() -> None:
 
 def test_one_frame_is_frame_0(task: ImageNav) -> None:
     model = Watching(history=1)
-    lived(task, wiw.Agent(Walking(), model, horizon=4), decisions=2)
+    record_episode(task, wiw.Agent(Walking(), model, horizon=4), decisions=2)
     observations = model._calls[-1][0]
     np.testing.assert_array_equal(observations.history.images[:, 0], observations.image)
     assert observations.history.actions.shape == (3, 0, 1) and observations.history.count.tolist() == [1, 1, 1]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from wiw.analysis.intervals import clustered_bootstrap, clustered_t, t_of_sums, wilson
-from wiw.analysis.simulate import draw, total
+from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 
 RUNS, PER_SCENE = 5000, 5
 NOISE = 0.9
@@ -16,7 +16,7 @@ PAIRS = [[won, lost, 1 - won - lost] for won in (0.1, 0.2, 0.3) for lost in (0.0
 
 def held(shares, values, kind, scenes, correlation, runs=RUNS):
     rng = np.random.default_rng(scenes)
-    sums, squares = total(draw(shares, scenes, PER_SCENE, correlation, runs, rng), values)
+    sums, squares = sum_by_scene(draw_outcome_counts(shares, scenes, PER_SCENE, correlation, runs, rng), values)
     low, high = t_of_sums(sums, squares, np.full(scenes, float(PER_SCENE)), kind)
     truth = np.dot(shares, values)
     return 100 * np.mean((low <= truth) & (truth <= high))
@@ -38,7 +38,7 @@ def test_t_over_scenes_covers(scenes, correlation, kind, truths, values):
 def test_why_neither_the_bootstrap_nor_independent_episodes():
     """Where the t interval holds the truth in 95 %, the bootstrap does in 86 % and Wilson's in 90 %."""
     scenes, labels = 5, np.repeat(np.arange(5), PER_SCENE)
-    counts = draw([0.35, 0.65], scenes, PER_SCENE, 0.15, 300, np.random.default_rng(0))
+    counts = draw_outcome_counts([0.35, 0.65], scenes, PER_SCENE, 0.15, 300, np.random.default_rng(0))
     found = np.zeros(3)
     for run in counts:
         data = np.concatenate([np.repeat([1.0, 0.0], ways) for ways in run])
@@ -53,9 +53,9 @@ def test_why_neither_the_bootstrap_nor_independent_episodes():
 
 
 def test_simulated_episodes_of_a_scene_are_correlated_as_asked():
-    counts = draw([0.3, 0.1, 0.6], 4, 2, 0.4, 100_000, np.random.default_rng(1))
+    counts = draw_outcome_counts([0.3, 0.1, 0.6], 4, 2, 0.4, 100_000, np.random.default_rng(1))
     assert counts.sum(-1).min() == counts.sum(-1).max() == 2
-    sums, squares = total(counts, [1, -1, 0])
+    sums, squares = sum_by_scene(counts, [1, -1, 0])
     mean, variance = 0.2, 0.4 - 0.2**2
     assert sums.mean() / 2 == pytest.approx(mean, abs=0.005)
     assert sums.var() == pytest.approx(2 * variance * 1.4, rel=0.02)  # two episodes: 2 v (1 + correlation)

@@ -33,7 +33,7 @@ class Recorder:
     def episode(self, result) -> None:
         self.results[result.episode] = result
 
-    def again(self, episodes) -> None:
+    def record_restart(self, episodes) -> None:
         self.decisions = {key: record for key, record in self.decisions.items() if key[0] not in episodes}
 
     def record_lost(self, spent) -> None:
@@ -305,7 +305,7 @@ def test_costs_are_each_episodes_own(task: ImageNav) -> None:
 
 def test_a_task_settles_what_an_agent_leaves_open() -> None:
     agent = wiw.Agent(Greedy(), Stamp(), candidates=2)
-    resolved = agent.parts.config.resolve({"candidates": 4, "horizon": 7, "execute": -2})
+    resolved = agent.spec.config.resolve({"candidates": 4, "horizon": 7, "execute": -2})
     assert (resolved.candidates, resolved.horizon, resolved.execute) == (2, 7, -2)
     assert agent.replace(config=resolved).config == resolved.complete()
     own = AgentConfig(horizon=9).resolve({"candidates": 4, "horizon": 5, "execute": 3}).complete()

@@ -311,10 +311,10 @@ def test_plans_of_poses_are_judged_by_the_truth() -> None:
         def __init__(self, target: Any) -> None:
             self.target = target
 
-        def worth(self, plan: Any) -> float:
+        def evaluate_plan(self, plan: Any) -> float:
             return -float(np.linalg.norm(plan[-1][:2] - self.target))
 
-        def plan(self, length: int) -> Any:
+        def suggest_plan(self, length: int) -> Any:
             return resample(np.array([[*self.target, *HOME[2:]]]), length, start=np.array(HOME, float))
 
     class Guided(DotEnv):
@@ -330,7 +330,9 @@ def test_plans_of_poses_are_judged_by_the_truth() -> None:
     decision = agent.decide(observation, env.goal, Key(0, 0))
     assert decision.chosen == 0 and len(decision.proposals) == 4
     np.testing.assert_allclose(decision.scores[0], 0, atol=1e-9)
-    np.testing.assert_array_equal(decision.scores, [env.guide().worth(plan.actions) for plan in decision.proposals])
+    np.testing.assert_array_equal(
+        decision.scores, [env.guide().evaluate_plan(plan.actions) for plan in decision.proposals]
+    )
     assert env.run(decision.actions).terminated
 
 

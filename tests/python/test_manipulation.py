@@ -20,7 +20,7 @@ from wiw.tasks.manipulation import TABLETOP_TASKS, Manipulation
 GRID = PoseGrid()
 
 
-def solved(env: ManipulationEnv, discrete: bool = False) -> dict[str, float]:
+def solve_episode(env: ManipulationEnv, discrete: bool = False) -> dict[str, float]:
     """The result of an episode that its expert plays, asked anew where a plan was not enough."""
     kind, setup = env.table.kind, env.table.setup
     while True:
@@ -40,7 +40,7 @@ def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
     for index in range(4):
         env.reset(options={"episode": index})
         assert not env.table.is_success()
-        results.append(solved(env, discrete))
+        results.append(solve_episode(env, discrete))
     assert sum(result["success"] for result in results) >= 3
     assert all(result["poses"] <= 15 for result in results)
 

@@ -38,7 +38,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def told(path: Path) -> dict[Any, Any]:
+def collect_outcomes(path: Path) -> dict[Any, Any]:
     """What was decided and what came of it, by arm and episode."""
     log = load_run(path)
     ends = {(e["arm"], e["episode"]): (e["status"], e["metrics"]) for e in log.episodes}
@@ -88,8 +88,8 @@ def test_two_processes_decide_as_one(run: Path, tmp_path: Path) -> None:
         fidelity=True,
         keep_images=0,
     )
-    one = {key: value for key, value in told(run).items() if key[0] == "oracle"}
-    assert told(tmp_path / "two") == one and len(one) == 8
+    one = {key: value for key, value in collect_outcomes(run).items() if key[0] == "oracle"}
+    assert collect_outcomes(tmp_path / "two") == one and len(one) == 8
 
 
 def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -118,7 +118,9 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
     with RunStore.read(tmp_path) as store:
         assert 0 < len(store.outcomes()) < 4
     resume_run(tmp_path, progress=False)
-    assert told(tmp_path) == {key: value for key, value in told(run).items() if key[0] == "oracle"}
+    assert collect_outcomes(tmp_path) == {
+        key: value for key, value in collect_outcomes(run).items() if key[0] == "oracle"
+    }
 
 
 @pytest.mark.parametrize(
@@ -188,21 +190,21 @@ def test_a_guide_knows_what_plans_are_worth() -> None:
     env = Manipulation("stack_cups").environment()
     env.begin(env.task.episode(1))
     guide, bench = env.guide(), env.table.bench
-    still, plan = bench.pose[None], guide.plan(5)
+    still, plan = bench.pose[None], guide.suggest_plan(5)
     before = bench.pose
-    assert len(plan) == 5 and guide.worth(plan) > guide.worth(still) > -20
+    assert len(plan) == 5 and guide.evaluate_plan(plan) > guide.evaluate_plan(still) > -20
     np.testing.assert_array_equal(bench.pose, before)
     while not env.table.is_success():
-        env.run(env.guide().plan(5))
-    assert env.guide().worth(bench.pose[None]) == 0.0
+        env.run(env.guide().suggest_plan(5))
+    assert env.guide().evaluate_plan(bench.pose[None]) == 0.0
 
     env = Manipulation("push_buttons").environment()
     env.begin(env.task.episode(0))
     kind, setup = env.table.kind, env.table.setup
     wrong = kind.plan_expert(env.observation.places, setup.objects[2:])
     assert not env.run(wrong).terminated
-    assert env.guide().worth(env.table.bench.pose[None]) < -100
-    assert len(env.guide().plan(5)) == 1
+    assert env.guide().evaluate_plan(env.table.bench.pose[None]) < -100
+    assert len(env.guide().suggest_plan(5)) == 1
 
 
 class Sinking(Pressing):

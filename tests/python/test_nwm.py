@@ -60,7 +60,7 @@ def observations(rows: int, seed: int = 0) -> Conditioning:
     return Conditioning(np.kron(coarse, np.ones((1, 40, 40, 1))).astype(np.uint8))
 
 
-def published(depth: int, width: int, context: int = 4, side: int = 28) -> dict[str, tuple[int, ...]]:
+def list_published_shapes(depth: int, width: int, context: int = 4, side: int = 28) -> dict[str, tuple[int, ...]]:
     """Names and shapes of the parameters in the public checkpoints, by the rule that makes them."""
 
     def linear(name: str, out: int, into: int) -> dict[str, tuple[int, ...]]:
@@ -91,7 +91,7 @@ def test_parameters_have_the_published_names_and_shapes(name: str) -> None:
     size = SIZES[name]
     with torch.device("meta"):
         state = CDiT(size).state_dict()
-    assert {key: tuple(value.shape) for key, value in state.items()} == published(size.depth, size.width)
+    assert {key: tuple(value.shape) for key, value in state.items()} == list_published_shapes(size.depth, size.width)
     assert Architecture.of(state) == size
     if name == "XL":
         assert sum(value.numel() for value in state.values()) == pytest.approx(1.0e9, rel=0.03)  # "1B" in the paper

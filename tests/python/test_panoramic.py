@@ -23,7 +23,7 @@ from wiw.errors import RemoteError
 from wiw.types import Conditioning, Control
 from wiw.wire.messages import Ask, Hello, Refusal, Welcome, decode, encode
 from wiw.wire.rows import pack_row, row_id
-from wiw.world_models.base import patience
+from wiw.world_models.base import answer_deadline
 from wiw.world_models.panoramic.served import Served
 from wiw.world_models.status import is_served
 
@@ -55,7 +55,9 @@ def se3ds(official: Path) -> Iterator[Served]:
         model.close()
 
 
-def seen(rows: int = 1, category: int = 3, metres: float = 2.0, semantic: bool = True, seed: int = 0) -> Conditioning:
+def make_conditioning(
+    rows: int = 1, category: int = 3, metres: float = 2.0, semantic: bool = True, seed: int = 0
+) -> Conditioning:
     """Soft panoramas in the middle of a round room."""
     random = np.random.default_rng(seed)
     coarse = random.integers(40, 216, (rows, 18, 32, 3)).repeat(32, 1).repeat(32, 2).astype(np.uint8)
@@ -72,12 +74,12 @@ def plan(*actions: int, shared: int = 0) -> Control:
 
 def imagine_plans(model: Served, observations: Conditioning, *plans: Control, seed: int = 5) -> np.ndarray:
     seeds = np.arange(seed, seed + len(plans), dtype=np.uint64)
-    with patience(30):
+    with answer_deadline(30):
         return model.rollout(observations, plans, seeds)
 
 
 def test_turns_roll_the_observation_and_standing_still_keeps_it(se3ds: Served) -> None:
-    observations = seen(semantic=False)
+    observations = make_conditioning(semantic=False)
     frames = imagine_plans(se3ds, observations, plan(TURN_LEFT, STOP, TURN_LEFT))[0]
     image = observations.image[0]
     for frame, columns in zip(frames, (0, SIDE, SIDE, 2 * SIDE), strict=True):
@@ -85,7 +87,7 @@ def test_turns_roll_the_observation_and_standing_still_keeps_it(se3ds: Served) -
 
 
 def test_a_turn_after_a_step_rolls_what_was_imagined(pathdreamer: Served) -> None:
-    frames = imagine_plans(pathdreamer, seen(), plan(FORWARD, TURN_LEFT, TURN_LEFT))[0]
+    frames = imagine_plans(pathdreamer, make_conditioning(), plan(FORWARD, TURN_LEFT, TURN_LEFT))[0]
     assert np.abs(frames[1].astype(int) - frames[0]).mean() > 1
     np.testing.assert_array_equal(frames[2], np.roll(frames[1], SIDE, axis=1))
     np.testing.assert_array_equal(frames[3], np.roll(frames[1], 2 * SIDE, axis=1))
@@ -116,29 +118,31 @@ def test_frames_are_projections_from_the_viewpoints(se3ds: Served) -> None:
 def test_semantics_and_depth_reach_the_networks(pathdreamer: Served) -> None:
     """Holes are painted by category and depth; at the masked top there is nothing else."""
     for category in (3, 40):
-        top = imagine_plans(pathdreamer, seen(category=category), plan(FORWARD))[0, 1, 20:60, :, 0].astype(int)
+        top = imagine_plans(pathdreamer, make_conditioning(category=category), plan(FORWARD))[0, 1, 20:60, :, 0].astype(
+            int
+        )
         assert (np.abs(top - 255 * category / 41) < 8).mean() > 0.3
     for metres in (2.0, 6.0):
-        top = imagine_plans(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1, 20:60, :, 1].astype(int)
+        top = imagine_plans(pathdreamer, make_conditioning(metres=metres), plan(FORWARD))[0, 1, 20:60, :, 1].astype(int)
         assert (np.abs(top - 255 * metres / 10) < 15).mean() > 0.3
 
 
 def test_what_is_beyond_the_scale_or_nothing_is_a_hole(pathdreamer: Served, se3ds: Served) -> None:
     for metres in (0.0, 10.0, 30.0):
-        frame = imagine_plans(pathdreamer, seen(metres=metres), plan(FORWARD))[0, 1]
+        frame = imagine_plans(pathdreamer, make_conditioning(metres=metres), plan(FORWARD))[0, 1]
         assert np.abs(frame[..., 0].astype(int) - 255 / 41).max() < 3  # all walls, as the structure fills them
-    frame = imagine_plans(se3ds, seen(metres=12.0, semantic=False), plan(FORWARD))[0, 1]
+    frame = imagine_plans(se3ds, make_conditioning(metres=12.0, semantic=False), plan(FORWARD))[0, 1]
     assert np.ptp(frame[100:-100]) > 20  # 20 m is the other one's scale
 
 
 def test_predictions_are_remembered(se3ds: Served) -> None:
     """Holes of one frame are known in the next: the grey that was imagined stays where it is."""
-    frames = imagine_plans(se3ds, seen(metres=30.0, semantic=False), plan(FORWARD, FORWARD))[0]
+    frames = imagine_plans(se3ds, make_conditioning(metres=30.0, semantic=False), plan(FORWARD, FORWARD))[0]
     assert np.abs(frames[1:].astype(int) - 127).max() <= 1
 
 
 def test_rows_do_not_meet_and_equal_questions_have_equal_answers(pathdreamer: Served, official: Path) -> None:
-    one, two = seen(1, 3), seen(1, 7, seed=1)
+    one, two = make_conditioning(1, 3), make_conditioning(1, 7, seed=1)
     both = Conditioning(
         np.concatenate([one.image, two.image]),
         depth=np.concatenate([one.depth, two.depth]),
@@ -155,15 +159,15 @@ def test_rows_do_not_meet_and_equal_questions_have_equal_answers(pathdreamer: Se
 
 
 def test_shared_frames_are_computed_but_do_not_travel(pathdreamer: Served) -> None:
-    whole = imagine_plans(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT))[0]
-    tail = imagine_plans(pathdreamer, seen(), plan(FORWARD, FORWARD, TURN_LEFT, shared=1))[0]
+    whole = imagine_plans(pathdreamer, make_conditioning(), plan(FORWARD, FORWARD, TURN_LEFT))[0]
+    tail = imagine_plans(pathdreamer, make_conditioning(), plan(FORWARD, FORWARD, TURN_LEFT, shared=1))[0]
     np.testing.assert_array_equal(tail[2:], whole[2:])
 
 
 def test_noise_is_drawn_from_the_seed(official: Path) -> None:
     with fake_panoramic.serving(official, "pathdreamer", "--noise") as address:
         model = wiw.world_model("pathdreamer", address=address)
-        room = seen(metres=30.0)
+        room = make_conditioning(metres=30.0)
         first, other = (imagine_plans(model, room, plan(FORWARD), seed=seed)[0, 1] for seed in (1, 2))
         assert (first != other).any() and not model.accepts.causal
         np.testing.assert_array_equal(imagine_plans(model, room, plan(FORWARD, TURN_LEFT), seed=1)[0, 1], first)
@@ -175,12 +179,12 @@ def test_what_a_network_raises_is_told_and_others_go_on(se3ds: Served) -> None:
     with pytest.raises(RemoteError, match="out of memory") as caught:
         imagine_plans(se3ds, white, plan(FORWARD))
     assert caught.value.kind == "raised"
-    imagine_plans(se3ds, seen(semantic=False), plan(FORWARD))
+    imagine_plans(se3ds, make_conditioning(semantic=False), plan(FORWARD))
 
 
 def test_unknown_categories_are_refused(pathdreamer: Served) -> None:
     with pytest.raises(RemoteError, match="categories below 42") as caught:
-        imagine_plans(pathdreamer, seen(category=42), plan(FORWARD))
+        imagine_plans(pathdreamer, make_conditioning(category=42), plan(FORWARD))
     assert caught.value.kind == "row"
 
 
@@ -217,7 +221,7 @@ def dialogue(address: str, *messages: Any) -> Any:
 
 
 def row(**changes: Any) -> bytes:
-    packed = msgpack.unpackb(pack_row(seen(semantic=False), 0, plan(FORWARD), 1))
+    packed = msgpack.unpackb(pack_row(make_conditioning(semantic=False), 0, plan(FORWARD), 1))
     return msgpack.packb({**packed, **changes})
 
 
@@ -286,11 +290,11 @@ def test_killed_in_mid_run_and_started_again_it_answers(official: Path) -> None:
     assert first.stdout is not None
     address = first.stdout.readline().split()[-1]
     model = wiw.world_model("se3ds", address=address)
-    expected = imagine_plans(model, seen(semantic=False), plan(FORWARD, FORWARD))
+    expected = imagine_plans(model, make_conditioning(semantic=False), plan(FORWARD, FORWARD))
     first.send_signal(signal.SIGKILL)
     first.wait()
     with fake_panoramic.serving(official, "se3ds", port=int(address.rpartition(":")[2])):
-        again = imagine_plans(model, seen(semantic=False), plan(FORWARD, FORWARD))
+        again = imagine_plans(model, make_conditioning(semantic=False), plan(FORWARD, FORWARD))
     np.testing.assert_array_equal(again, expected)
     model.close()
 

@@ -181,13 +181,13 @@ def test_a_cube_is_grasped_carried_and_let_go() -> None:
     go(world, place(*at[:3, 3] + [0, 0, 0.12], rpy=(np.pi, 0, yaw)))
     go(world, place(*at[:3, 3], rpy=(np.pi, 0, yaw)))
     assert gripper.opening > 0.99 and gripper.held is None
-    assert gripper.close() == cube == gripper.held == gripper.between()
+    assert gripper.close() == cube == gripper.held == gripper.find_body_between_fingers()
     assert gripper.opening == pytest.approx(0.5, abs=0.01)
     held = np.linalg.inv(world.link_poses()[TCP]) @ world.body_poses()[cube]
     go(world, place(0.5, 0.1, 0.35, rpy=(np.pi, 0.3, yaw + 0.5)))
     now = np.linalg.inv(world.link_poses()[TCP]) @ world.body_poses()[cube]
     assert np.linalg.norm(now[:3, 3] - held[:3, 3]) < 2e-3 and angle(now, held) < np.radians(2)
-    assert gripper.between() == cube  # the fingers press on
+    assert gripper.find_body_between_fingers() == cube  # the fingers press on
     others = [i for i in range(1, 5) if i != cube]
     assert np.abs(world.body_velocities()[others]).max() < 0.02
     gripper.open()

@@ -30,7 +30,7 @@ PAPER = {
 OFFICIAL = {**PAPER, "decisions": 21, "execute": -2, "checked": "decision", "distance": "geodesic", "spl": "actions"}
 
 
-def written(folder: Path, text: str) -> Path:
+def write_preset(folder: Path, text: str) -> Path:
     path = folder / "own.yaml"
     path.write_text(text)
     return path
@@ -55,9 +55,9 @@ def test_they_lie_inside_the_package_and_are_shown_at_the_root() -> None:
 
 
 def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None:
-    own = written(tmp_path, "base: official\nabout: longer\ndecisions: 40\nradius: 1\n")
+    own = write_preset(tmp_path, "base: official\nabout: longer\ndecisions: 40\nradius: 1\n")
     assert asdict(ImageNav(preset=own).rules) == {**OFFICIAL, "decisions": 40, "radius": 1.0}
-    assert asdict(ImageNav(preset=str(written(tmp_path, "motion: slide"))).rules) == {**PAPER, "motion": "slide"}
+    assert asdict(ImageNav(preset=str(write_preset(tmp_path, "motion: slide"))).rules) == {**PAPER, "motion": "slide"}
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_a_file_of_ones_own_starts_from_a_shipped_preset(tmp_path: Path) -> None
 )
 def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type, message: str) -> None:
     with pytest.raises(error, match=message):
-        ImageNav(preset=written(tmp_path, text))
+        ImageNav(preset=write_preset(tmp_path, text))
 
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
@@ -93,12 +93,12 @@ def test_a_run_takes_a_preset_by_name_or_file_and_resume_refuses_a_changed_one(
     two_rooms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    own = written(tmp_path, "base: official\ndecisions: 1\n")
+    own = write_preset(tmp_path, "base: official\ndecisions: 1\n")
     arguments = ["--scenes", two_rooms, "--policy", "heuristic", "--episodes", "1", "--no-report", "--keep-images", "0"]
     assert main(["run", "imagenav", "--preset", own.name, "--out", "run", *arguments]) == 0
     log = wiw.load_run("run")
     assert log.store.config["task"]["decisions"] == 1 and log.store.config["task"]["spl"] == "actions"
-    written(tmp_path, "base: official\ndecisions: 2\n")
+    write_preset(tmp_path, "base: official\ndecisions: 2\n")
     monkeypatch.chdir("/")
     with pytest.raises(StoreError, match="decisions: the run has 1, now 2"):
         resume_run(tmp_path / "run")

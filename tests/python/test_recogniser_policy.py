@@ -18,7 +18,7 @@ import wiw
 from recognition_file import CHOICES, a_file
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.imagenav import camera_pose
-from wiw.datasets.visibility import visible_share
+from wiw.datasets.visibility import visible_fraction
 from wiw.datasets.worlds import world
 from wiw.loop.scheduler import run_episodes
 from wiw.policies.recogniser import steering
@@ -53,7 +53,7 @@ def test_the_side_of_a_detour_is_where_more_is_seen(two_rooms: str, start: Any) 
     mask, depth, thing = panorama_of(place, start, -np.pi / 2, "shelf")  # through the door, behind the wall beside it
     seen = steering.locate_in_view(mask, depth)
     assert seen.side != 0
-    left, right = (visible_share(place, np.add(start, (0, 0, step)), thing) for step in (-0.15, 0.15))
+    left, right = (visible_fraction(place, np.add(start, (0, 0, step)), thing) for step in (-0.15, 0.15))
     assert seen.side == (1 if left > right else -1)
     assert abs(left - right) > 0.05
     first = steering.rank_headings(seen, seen.bearing, 0)[0]

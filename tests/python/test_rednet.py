@@ -146,7 +146,7 @@ def test_it_computes_what_its_twin_does(network: RedNet) -> None:
     assert expected.std() > 1e-3
 
 
-def seen(count: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def make_views(count: int = 2) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     images = rng.integers(0, 255, (count, 32, 64, 3), np.uint8)
     return images, rng.uniform(0, 12, (count, 32, 64)).astype(np.float32)
@@ -154,7 +154,7 @@ def seen(count: int = 2) -> tuple[np.ndarray, np.ndarray]:
 
 def test_views_are_fed_as_the_weights_were_trained(network: RedNet, checkpoint: Path) -> None:
     source = SEMANTICS.make("rednet", weights=checkpoint, device="cpu", batch=1)
-    images, depth = seen()
+    images, depth = make_views()
     fed: list[Any] = []
     source._model.register_forward_pre_hook(lambda module, inputs: fed.append(inputs))
     found = source.label_views(images, depth)
@@ -174,7 +174,7 @@ def test_views_are_fed_as_the_weights_were_trained(network: RedNet, checkpoint: 
 
 def test_panoramas_are_looked_at_by_the_faces_of_their_cube(checkpoint: Path) -> None:
     source = SEMANTICS.make("rednet", weights=checkpoint.parent, device="cpu", face=32)
-    images, depth = seen()
+    images, depth = make_views()
     found = source.label_panoramas(images, depth)
     assert (found.shape, found.dtype) == ((2, 32, 64), np.dtype(np.uint32))
     np.testing.assert_array_equal(found[1:], source.label_panoramas(images[1:], depth[1:]))
@@ -203,7 +203,7 @@ def test_what_it_cannot_use_is_named(checkpoint: Path, tmp_path: Path) -> None:
     with pytest.raises(ArgumentError, match="metres"):
         SEMANTICS.make("rednet", weights=checkpoint, metres=(5, 5))
     source = SEMANTICS.make("rednet", weights=checkpoint, device="cpu", face=32)
-    images, depth = seen()
+    images, depth = make_views()
     with pytest.raises(ArgumentError, match="depth"):
         source.label_panoramas(images)
     with pytest.raises(ArgumentError, match="multiples of 32"):

@@ -6,11 +6,15 @@ import pytest
 from fakes import LineAgent, LineTask
 
 from wiw.analysis.summary import summarise
+from wiw.errors import ArgumentError
 from wiw.report.episodes import read_stories
 from wiw.report.maps import frame_of_picture, frame_of_points, start_and_goal, trail
-from wiw.report.page import render, sentence
+from wiw.report.page import SCALES, render, sentence
 from wiw.report.plans import glyphs
+from wiw.report.plots import BLAME_COLORS, _readable_on
 from wiw.report.story import Album
+from wiw.report.templating import environment
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.studies.evaluate import run_arms
 from wiw.types import Episode
 
@@ -95,6 +99,68 @@ def test_pictures_are_kept_small_and_inside(page):
     assert uses == identifiers
 
 
+def count_stories(file):
+    return sum(tag == "article" for tag, _ in Page(file.read_text(encoding="utf-8")).tags)
+
+
+def test_a_report_shows_as_many_episodes_as_asked_the_most_telling_first(log, tmp_path):
+    assert count_stories(log.report(tmp_path / "two.html")) == 2
+    one = log.report(tmp_path / "one.html", episodes=1)
+    assert count_stories(one) == 1
+    assert f'id="episode-{choose_pictured_episodes(log.store)[0]}"' in one.read_text(encoding="utf-8")
+    assert count_stories(log.report(tmp_path / "none.html", episodes=0)) == 0
+
+
+def test_a_report_of_limited_size_shrinks_pictures_and_then_leaves_out_episodes(log, tmp_path):
+    sizes = {
+        (episodes, scale): len(render(log, episodes, scale).encode())
+        for episodes, scale in ((2, 1.0), (2, SCALES[-1]), (1, 1.0), (1, SCALES[-1]), (0, 1.0))
+    }
+    shrunk = log.report(tmp_path / "shrunk.html", max_mb=(sizes[2, 1.0] - 1) / 1e6)
+    assert count_stories(shrunk) == 2
+    assert sizes[2, SCALES[-1]] <= shrunk.stat().st_size < sizes[2, 1.0]
+    fewer = log.report(tmp_path / "fewer.html", max_mb=(sizes[2, SCALES[-1]] - 1) / 1e6)
+    assert count_stories(fewer) == 1
+    assert fewer.stat().st_size == sizes[1, 1.0] < sizes[2, SCALES[-1]], (
+        "one episode fits with its pictures as they are"
+    )
+    bare = log.report(tmp_path / "bare.html", max_mb=(sizes[1, SCALES[-1]] - 1) / 1e6)
+    assert count_stories(bare) == 0
+    with pytest.raises(ArgumentError, match="tables and plots alone take"):
+        log.report(tmp_path / "no.html", max_mb=(sizes[0, 1.0] - 1) / 1e6)
+    with pytest.raises(ArgumentError, match="episodes of at least 0"):
+        log.report(tmp_path / "no.html", episodes=-1)
+    assert not (tmp_path / "no.html").exists()
+
+
+def test_shrunk_pictures_are_shown_as_large_as_others(log):
+    pages = [Page(render(log, 1, scale)) for scale in (1.0, SCALES[-1])]
+    strips, small = (
+        [tuple(map(int, a["viewbox"].split()[2:])) for _, a in page.tags if a.get("class") == "picture"]
+        for page in pages
+    )
+    assert len(strips) == len(small) > 0
+    assert all(
+        abs(a - b) <= 2 for one, other in zip(strips, small, strict=True) for a, b in zip(one, other, strict=True)
+    )
+
+
+def test_the_title_names_task_and_folder_once(log):
+    text = render(log, 0)
+    assert "<title>line · run</title>" in text or "<title>run</title>" in text
+
+
+def test_plots_carry_no_metadata_and_numbers_on_bars_can_be_read(page):
+    assert not any(tag.startswith(("rdf:", "metadata")) for tag, _ in page.tags)
+    assert _readable_on("#ffffff") == "black" and _readable_on("#000000") == "white"
+    assert _readable_on(BLAME_COLORS["beyond"]) == "black", "3.2 : 1 in white"
+
+
+def test_counts_of_one_are_singular():
+    count = environment().filters["counted"]
+    assert [count("consultations", 1), count("rows", 3)] == ["1 consultation", "3 rows"]
+
+
 def test_text_from_a_run_is_escaped(tmp_path):
     class Evil(LineTask):
         def episodes(self, count):
@@ -136,7 +202,7 @@ def summary(wins, n=40, saved=0.0):
 
 
 def test_the_sentence_claims_no_more_than_the_interval_bears():
-    assert "the interval includes 0" in sentence(summary(1))
+    assert "which includes 0: no evidence of a difference" in sentence(summary(1))
     assert "includes 0" not in sentence(summary(30)) and "75.0 points more" in sentence(summary(30))
     assert "primitives" not in sentence(summary(1))
     assert "It took 2.0 fewer primitives" in sentence(summary(1, saved=2.0))

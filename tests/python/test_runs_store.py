@@ -42,7 +42,7 @@ def record(episode, index, rollouts=True):
     return DecisionRecord(episode, index, decision, np.array([1, 1]), before, before, np.zeros((3, 3)))
 
 
-def done(episode, **metrics):
+def make_result(episode, **metrics):
     return EpisodeResult(episode, f"{episode:04d}", "line/0", "done", {"success": 1.0, "actions": 4.0, **metrics}, 1.5)
 
 
@@ -54,7 +54,7 @@ def run(tmp_path):
 
 def test_what_is_written_is_read_back(run):
     run.write(decision_row("warp", record(0, 0), with_images=True))
-    run.write(OutcomeRow("warp", done(0)))
+    run.write(OutcomeRow("warp", make_result(0)))
     with RunStore.read(run.path.parent) as reader:
         (decision,) = reader.decisions("warp", 0)
         (outcome,) = reader.outcomes()
@@ -85,7 +85,7 @@ def test_pictures_only_where_wanted_and_goal_once(run):
 
 def test_partial_episodes_are_discarded_on_resume_and_never_shown(run, tmp_path):
     run.write(decision_row("warp", record(0, 0), with_images=True))
-    run.write(OutcomeRow("warp", done(0)))
+    run.write(OutcomeRow("warp", make_result(0)))
     run.write(decision_row("warp", record(1, 0), with_images=True))
     assert len(run.decisions()) == 1
     run.close()
@@ -201,7 +201,7 @@ def test_damaged_and_missing_stores_are_named(tmp_path):
 def test_records_become_data_frames(run):
     pytest.importorskip("pandas")
     run.write(decision_row("warp", record(0, 0), with_images=False))
-    run.write(OutcomeRow("warp", done(0)))
+    run.write(OutcomeRow("warp", make_result(0)))
     log = load_run(run.path.parent)
     assert list(log.episodes.to_pandas()["success"]) == [1.0]
     assert list(log.decisions.to_pandas()["arm"]) == ["warp"]

@@ -370,7 +370,7 @@ import wiw.scenes
 from pathlib import Path
 from wiw import _core
 make = _core.scene.apartment
-def slow(seed, split):
+def slow(seed, split, edits):
     with Path(sys.argv[1]).open("a") as log:
         log.write("made\\n")
     time.sleep(0.3)
@@ -390,7 +390,7 @@ def test_an_apartment_is_made_once_for_all_processes(tmp_path: Path, own_cache: 
 
 def test_an_apartment_is_kept_by_seed_split_and_build(monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[tuple[int, str]] = []
-    monkeypatch.setattr(_core.scene, "apartment", lambda seed, split: made.append((seed, split)) or flat())
+    monkeypatch.setattr(_core.scene, "apartment", lambda seed, split, edits: made.append((seed, split)) or flat())
     for _ in range(2):
         for seed, split in ((1, "val"), (2, "val"), (1, "test")):
             scenes.apartment(seed, split)

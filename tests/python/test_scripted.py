@@ -19,7 +19,7 @@ from wiw.tasks.manipulation import Manipulation
 from wiw.types import Goal, Key, Proposal, Rollout
 
 
-def begun(name: str, episode: int = 0, seed: int = 11) -> tuple[Any, Situation]:
+def begin_situation(name: str, episode: int = 0, seed: int = 11) -> tuple[Any, Situation]:
     env = Manipulation(name, seed=seed).environment()
     observation = env.begin(env.task.episode(episode))
     return env, Situation(observation, env.goal, Key(seed, episode), None)
@@ -27,8 +27,8 @@ def begun(name: str, episode: int = 0, seed: int = 11) -> tuple[Any, Situation]:
 
 @pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_plans_are_functions_of_the_decision(name: str) -> None:
-    _, one = begun(name)
-    _, other = begun(name, 1)
+    _, one = begin_situation(name)
+    _, other = begin_situation(name, 1)
     together = Scripted().propose([one, other], 5, 5)
     alone = Scripted().propose([other], 3, 5)[0]
     for plan, again in zip(alone, together[1], strict=False):
@@ -42,7 +42,7 @@ def test_plans_are_functions_of_the_decision(name: str) -> None:
 
 
 def test_a_single_plan_where_nothing_is_imagined() -> None:
-    _, situation = begun("slide_block")
+    _, situation = begin_situation("slide_block")
     blind = Situation(situation.observation, situation.goal, situation.key, None, imagines=False)
     (only,) = Scripted().propose([blind], 5, 5)[0]
     np.testing.assert_array_equal(only.actions, Scripted().propose([situation], 5, 5)[0][0].actions)
@@ -50,7 +50,7 @@ def test_a_single_plan_where_nothing_is_imagined() -> None:
 
 def test_it_errs_at_its_rates() -> None:
     """Mistaken targets, and places astray by chance but never by much."""
-    env, situation = begun("slide_block")
+    env, situation = begin_situation("slide_block")
     kind, setup = env.table.kind, env.table.setup
     square = situation.observation.places[setup.target][:2, 3]
     plans = [
@@ -69,7 +69,7 @@ def test_it_errs_at_its_rates() -> None:
 
 
 def test_it_stays_where_nothing_is_left() -> None:
-    env, situation = begun("push_buttons")
+    env, situation = begin_situation("push_buttons")
     setup = env.table.setup
     wrong = next(name for name in setup.objects if name != setup.target[0])
     for pose in env.table.kind.plan_expert(situation.observation.places, (wrong,)):
@@ -81,7 +81,7 @@ def test_it_stays_where_nothing_is_left() -> None:
 
 @pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_true_futures_of_right_plans_score_best(name: str) -> None:
-    env, situation = begun(name, 2)
+    env, situation = begin_situation(name, 2)
     kind, setup = env.table.kind, env.table.setup
     places = situation.observation.places
     targets = [setup.target, *kind.list_alternatives(setup.objects, setup.target)[:2]]
@@ -130,7 +130,7 @@ def test_it_revises_other_policies_of_a_gripper(tmp_path: Path) -> None:
 
 
 def test_what_it_cannot_read_is_refused() -> None:
-    _, situation = begun("slide_block")
+    _, situation = begin_situation("slide_block")
     for goal in (Goal("manipulation"), Goal("imagenav", text="fetch the milk")):
         with pytest.raises(ArgumentError, match="about one of button, block, ring, cup"):
             Scripted().propose([Situation(situation.observation, goal, situation.key, None)], 5, 5)

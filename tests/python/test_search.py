@@ -27,7 +27,7 @@ def step(state: int, action: int) -> int:
     return (state * 5 + int(action) * 37 + 11) % 251
 
 
-def shown_after(state: int, plan) -> int:
+def render_last_frame(state: int, plan) -> int:
     """The slow twin of a rollout's last frame."""
     leading = 0
     while leading < len(plan) and (plan[leading] == plan[0] != FORWARD or plan[leading] == STOP):
@@ -111,7 +111,7 @@ def brute_force(asked: Query, width: int, depth: int):
     state, here, key = int(asked.observation.panorama[0, 0, 0]), asked.observation, asked.key
     level = [(p.actions.tolist(), p.prior) for p in Wanderer.plans(here, key, 1, CANDIDATES, HORIZON)]
     for number in range(1, depth + 1):
-        scores = [shown_after(state, plan) + 1e-3 * prior for plan, prior in level]
+        scores = [render_last_frame(state, plan) + 1e-3 * prior for plan, prior in level]
         if number == depth:
             return level, scores
         longer = []
@@ -120,7 +120,7 @@ def brute_force(asked: Query, width: int, depth: int):
             if STOP in plan:
                 longer.append((plan, prior))
                 continue
-            shown = shown_after(state, plan)
+            shown = render_last_frame(state, plan)
             there = Observation(
                 np.full((72, 128, 3), shown, np.uint8),
                 np.full((48, 48, 3), shown, np.uint8),
@@ -162,7 +162,7 @@ def test_a_wide_beam_is_exhaustive_search() -> None:
     agent = wiw.Agent(Fixed(), model_of(), candidates=3, horizon=4, depth=2, width=3)
     decision = agent.decide_batch([query(0, 42)])[0]
     plans = [p.actions.tolist() for p in Fixed().propose([0], 3, 4)[0]]
-    every = {(*a, *b): shown_after(42, [*a, *b]) for a in plans for b in plans}
+    every = {(*a, *b): render_last_frame(42, [*a, *b]) for a in plans for b in plans}
     assert {tuple(p.actions.tolist()) for p in decision.proposals} == set(every)
     assert every[tuple(decision.actions.tolist())] == max(every.values())
 
@@ -171,7 +171,7 @@ def test_imagining_deeper_leaves_the_real_memory_alone_and_keeps_seeds() -> None
     model = model_of()
     agent = wiw.Agent(Wanderer(), model, candidates=CANDIDATES, horizon=HORIZON, depth=3)
     decision = agent.decide_batch([query(0, 90)])[0]
-    memory = agent.components.memories.recall([query(0, 90)], agent.components.imaginer)[0][0].memory
+    memory = agent.parts.memories.recall([query(0, 90)], agent.parts.imaginer)[0][0].memory
     assert memory.observed == [90]
     assert model.seeds <= {core.fold_key([5, 0, 2, c]) for c in range(CANDIDATES)}
     assert len(decision.proposals) > CANDIDATES and decision.calls["rows"] > len(decision.proposals)

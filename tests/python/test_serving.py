@@ -31,14 +31,14 @@ from wiw.loop import attempts
 from wiw.loop.attempts import Attempted
 from wiw.serving import outbox
 from wiw.serving import server as serving
+from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.background import serve_in_background
-from wiw.serving.known import Known
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
 from wiw.types import Conditioning, Control, History
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
-from wiw.world_models.base import patience
+from wiw.world_models.base import answer_deadline
 from wiw.world_models.remote import link
 from wiw.world_models.remote.limits import check_row
 from wiw.world_models.remote.model import Remote
@@ -46,7 +46,7 @@ from wiw.world_models.remote.model import Remote
 SIZE = (8, 16)
 
 
-def seen(batch, needs=(), start=0):
+def make_conditioning(batch, needs=(), start=0):
     shades = np.arange(start, start + batch).astype(np.uint8)[:, None, None]
     image = np.broadcast_to(shades[..., None], (batch, *SIZE, 3)).copy()
     return Conditioning(
@@ -137,7 +137,7 @@ class Plain(wiw.WorldModel):
 
 def ask(model, batch=4, start=0, count=5):
     return model.rollout(
-        seen(batch, model.accepts.needs, start), plans(batch, count), np.arange(batch, dtype=np.uint64)
+        make_conditioning(batch, model.accepts.needs, start), plans(batch, count), np.arange(batch, dtype=np.uint64)
     )
 
 
@@ -156,7 +156,11 @@ def remote(model, **options):
 
 def test_it_answers_as_at_home_and_says_what_it_is():
     model = Mixing()
-    given = seen(20, model.accepts.needs), plans(20), np.arange(20, dtype=np.uint64) + np.uint64(2**64 - 20)
+    given = (
+        make_conditioning(20, model.accepts.needs),
+        plans(20),
+        np.arange(20, dtype=np.uint64) + np.uint64(2**64 - 20),
+    )
     home = model.rollout(*given)
     with remote(model) as (client, _):
         np.testing.assert_array_equal(client.rollout(*given), home)
@@ -167,7 +171,7 @@ def test_it_answers_as_at_home_and_says_what_it_is():
 
 def test_only_a_rows_own_frames_travel():
     model = Mixing()
-    given = seen(2, model.accepts.needs), plans(2, length=4, shared=1), np.arange(2, dtype=np.uint64)
+    given = make_conditioning(2, model.accepts.needs), plans(2, length=4, shared=1), np.arange(2, dtype=np.uint64)
     home = model.rollout(*given)
     with remote(model) as (client, _):
         found = client.rollout(*given)
@@ -227,7 +231,9 @@ def test_a_row_that_the_model_cannot_do_fails_alone():
             ask(client)
         assert caught.value.kind == "raised"
         before = len(model.rows)
-        np.testing.assert_array_equal(ask(client, 2)[:, 5], seen(2).image)  # known: rows 0 and 1 were answered
+        np.testing.assert_array_equal(
+            ask(client, 2)[:, 5], make_conditioning(2).image
+        )  # known: rows 0 and 1 were answered
         assert len(model.rows) == before and [2] in model.rows
 
 
@@ -247,7 +253,7 @@ def test_a_broken_contract_is_named_as_at_home(answer, kind, monkeypatch):
             ask(client)
         assert caught.value.kind == kind
         with pytest.raises(RolloutError) as caught:
-            Attempted(client, 20.0).rollout(seen(4), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 20.0).rollout(make_conditioning(4), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == kind
 
 
@@ -257,11 +263,11 @@ def test_a_deadline_that_passes_is_a_typed_error_and_the_row_is_not_begun(monkey
     model = Plain(lambda observations: gate.wait(20) and None)
     with remote(model) as (client, server):
         begin = time.monotonic()
-        with pytest.raises(RemoteError, match="busy or hung") as caught, patience(0.5):
+        with pytest.raises(RemoteError, match="busy or hung") as caught, answer_deadline(0.5):
             ask(client, 4)
         assert caught.value.kind == "deadline" and time.monotonic() - begin < 5
         with pytest.raises(RolloutError) as caught:
-            Attempted(client, 0.5).rollout(seen(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
+            Attempted(client, 0.5).rollout(make_conditioning(4, start=90), plans(4), np.arange(4, dtype=np.uint64))
         assert caught.value.kind == "deadline"
         wait_for(lambda: len(server.queue) == 0)
         gate.set()
@@ -273,13 +279,13 @@ def test_a_row_that_is_asked_for_again_while_it_is_computed_gets_its_answer_and_
     gate = threading.Event()
     model = Plain(lambda observations: gate.wait(20) and None)
     with remote(model) as (client, _), ThreadPoolExecutor(2) as pool:
-        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+        with pytest.raises(RemoteError, match="busy or hung"), answer_deadline(0.3):
             ask(client, 4)
         again, other = pool.submit(ask, client, 4), pool.submit(ask, client, 2, 90)
         time.sleep(0.3)
         gate.set()
-        np.testing.assert_array_equal(again.result(20)[:, 5], seen(4).image)
-        np.testing.assert_array_equal(other.result(20)[:, 5], seen(2, start=90).image)
+        np.testing.assert_array_equal(again.result(20)[:, 5], make_conditioning(4).image)
+        np.testing.assert_array_equal(other.result(20)[:, 5], make_conditioning(2, start=90).image)
     assert sorted(chain(*model.rows)) == [0, 1, 2, 3, 90, 91]
 
 
@@ -289,13 +295,13 @@ def test_a_row_whose_first_asker_waited_too_short_is_asked_for_again():
     with remote(model) as (client, server), ThreadPoolExecutor(2) as pool:
         busy = pool.submit(ask, client, 4, 90)
         wait_for(lambda: model.rows)
-        with pytest.raises(RemoteError, match="busy or hung"), patience(0.3):
+        with pytest.raises(RemoteError, match="busy or hung"), answer_deadline(0.3):
             ask(client, 2)
         again = pool.submit(ask, client, 2)
         wait_for(lambda: len(server.queue) == 2)
         time.sleep(0.5)  # the first question's deadline at the server passes meanwhile
         gate.set()
-        np.testing.assert_array_equal(again.result(20)[:, 5], seen(2).image)
+        np.testing.assert_array_equal(again.result(20)[:, 5], make_conditioning(2).image)
         busy.result(20)
 
 
@@ -305,7 +311,7 @@ def test_the_callers_deadline_counts_however_long_it_is(monkeypatch):
         rows = client._link.ask
         monkeypatch.setattr(client._link, "ask", lambda *a: given.append(a[1] - time.monotonic()) or rows(*a))
         ask(client)
-        with patience(1000.0):
+        with answer_deadline(1000.0):
             ask(client)
     assert given == [pytest.approx(300.0, abs=30), pytest.approx(950.0, abs=30)]
 
@@ -313,7 +319,7 @@ def test_the_callers_deadline_counts_however_long_it_is(monkeypatch):
 def test_announced_rows_that_are_known_are_not_waited_for():
     with remote(Plain()) as (client, server):
         ask(client, 1)
-        rows = seen(2)
+        rows = make_conditioning(2)
         rows.image[1] = 77
         swapped = Conditioning(rows.image[::-1].copy())
         client.rollout(swapped, plans(2), np.zeros(2, np.uint64))  # the second one is known
@@ -355,7 +361,7 @@ def test_a_full_queue_tells_the_client_to_wait_and_all_is_answered():
         decoded = decode
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("wiw.world_models.remote.link.decode", lambda data: said.append(decoded(data)) or said[-1])
-            np.testing.assert_array_equal(ask(client, 16)[:, 5], seen(16).image)
+            np.testing.assert_array_equal(ask(client, 16)[:, 5], make_conditioning(16).image)
     waits = [message for message in said if isinstance(message, Wait)]
     assert waits and all(0 < message.seconds <= 2 and message.reason == "the queue is full" for message in waits)
     assert sorted(chain(*model.rows)) == list(range(16))
@@ -367,10 +373,10 @@ def test_a_lost_connection_is_mended_and_no_row_is_computed_twice():
         answer = pool.submit(ask, client, 8)
         for lost in range(3):
             wait_for(lambda lost=lost: len(model.rows) > min(lost, 1) and server.clients == 1)
-            for connection in list(server._owed):
+            for connection in list(server._unanswered):
                 server._loop.call_soon_threadsafe(connection.transport.abort)
             time.sleep(0.05)
-        np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
+        np.testing.assert_array_equal(answer.result(30)[:, 5], make_conditioning(8).image)
     assert sorted(chain(*model.rows)) == list(range(8))
 
 
@@ -387,7 +393,7 @@ def test_a_server_that_comes_back_is_not_asked_for_what_was_answered():
         server._loop.call_soon_threadsafe(server.end)
         wait_for(lambda: not server.clients)
         with serve_in_background(second := Plain(), port=port):
-            np.testing.assert_array_equal(answer.result(30)[:, 5], seen(8).image)
+            np.testing.assert_array_equal(answer.result(30)[:, 5], make_conditioning(8).image)
         gate.set()
     client.close()
     assert sorted(chain(*second.rows)) == [4, 5, 6, 7]
@@ -416,7 +422,7 @@ def test_nobody_there():
     assert caught.value.kind == "connection" and time.monotonic() - begin < 5
     with serve_in_background(Plain()) as server:
         client = Remote(server.address)
-    with pytest.raises(RemoteError, match="could not be reached in time") as caught, patience(0.5):
+    with pytest.raises(RemoteError, match="could not be reached in time") as caught, answer_deadline(0.5):
         ask(client)
     assert caught.value.kind == "connection"
 
@@ -449,8 +455,8 @@ def test_a_client_that_was_closed_says_so_at_once():
 
 def test_a_row_that_is_too_large_is_told_of_at_once():
     with remote(Mixing()) as (client, _):
-        observations = seen(1, ("depth", "semantic"))
-        history = seen(1, ("history",)).history
+        observations = make_conditioning(1, ("depth", "semantic"))
+        history = make_conditioning(1, ("history",)).history
         history = replace(history, images=np.zeros((1, 3000, *SIZE, 3), np.uint8))
         observations = replace(observations, history=history)
         with pytest.raises(RemoteError, match="or a shorter history if it needs one") as caught:
@@ -584,7 +590,7 @@ def greeted(connection):
 
 
 def row(count=5, **changes):
-    return pack_row(seen(1), 0, plans(1, count, **changes)[0], 7)
+    return pack_row(make_conditioning(1), 0, plans(1, count, **changes)[0], 7)
 
 
 def test_another_version_is_refused_at_the_handshake():
@@ -631,7 +637,7 @@ def test_rows_that_the_model_does_not_take_are_refused_one_by_one():
     other_size = pack_row(Conditioning(np.zeros((1, 4, 4, 3), np.uint8)), 0, plans(1)[0], 7)
     wrong = {
         "pixels": other_size,
-        "does not take it": pack_row(seen(1, ("depth",)), 0, plans(1)[0], 7),
+        "does not take it": pack_row(make_conditioning(1, ("depth",)), 0, plans(1)[0], 7),
         "at least 1": row(0),
         "no msgpack": b"\xc1",
         "missing are": b"\x80",
@@ -664,7 +670,7 @@ def test_fixed_lengths_and_needs_are_held_to():
         greeted(connection)
         for text, data in {
             "row.depth: missing": row(3),
-            "row.ids": pack_row(seen(1, ("depth",)), 0, plans(1, 3)[0], 7),
+            "row.ids": pack_row(make_conditioning(1, ("depth",)), 0, plans(1, 3)[0], 7),
         }.items():
             connection.send(encode(Ask(row_id(data), data, 5.0, 0)))
             assert text in decode(connection.recv()).text
@@ -796,7 +802,7 @@ def test_told_to_end_it_finishes_what_it_has_taken_and_takes_no_more():
             said = decode(late.recv())
             assert isinstance(said, Wait) and said.reason == "the server is ending"
             gate.set()
-            np.testing.assert_array_equal(answer.result(20)[:, 5], seen(8).image)
+            np.testing.assert_array_equal(answer.result(20)[:, 5], make_conditioning(8).image)
             with pytest.raises(ConnectionClosed, match="1001"):
                 late.recv(timeout=20)
 
@@ -892,7 +898,7 @@ def test_a_queue_takes_no_more_than_it_may_and_ends():
 
 
 def test_answers_are_kept_up_to_a_size():
-    known = Known(10)
+    known = AnswerCache(10)
     for name in (b"a", b"b", b"c"):
         known.put(name, b"1234")
     assert known.get(b"a") is None and known.get(b"b") == b"1234"
@@ -930,7 +936,7 @@ def unread(server):
 
 def unsent(server):
     """Bytes in the buffers of the server's connections, and those that wait to get there."""
-    return sum(client.transport.get_write_buffer_size() for client in list(server._owed)) + server.unsent_bytes
+    return sum(client.transport.get_write_buffer_size() for client in list(server._unanswered)) + server.unsent_bytes
 
 
 @pytest.mark.parametrize("known", [False, True])

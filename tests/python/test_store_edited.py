@@ -48,7 +48,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def edited(whole: Path, folder: Path, table: str, column: str, value: Any) -> Path:
+def edit_store(whole: Path, folder: Path, table: str, column: str, value: Any) -> Path:
     shutil.copytree(whole, folder)
     with sqlite3.connect(folder / "run.sqlite") as other:
         where = "" if table == "run" else "WHERE episode = 0"
@@ -76,7 +76,7 @@ def read_all(run: Path, report: bool) -> None:
 def test_an_edited_text_is_read_or_named(whole: Path, tmp_path: Path, table: str, column: str) -> None:
     refused = 0
     for number, value in enumerate(ODD):
-        run = edited(whole, tmp_path / str(number), table, column, value)
+        run = edit_store(whole, tmp_path / str(number), table, column, value)
         try:
             read_all(run, report=number % 6 == 5)
         except StoreError as error:
@@ -92,7 +92,7 @@ def test_an_edited_text_is_read_or_named(whole: Path, tmp_path: Path, table: str
     [("episode", "start_x"), ("episode", "geodesic"), ("outcome", "seconds"), ("decision", "before_yaw")],
 )
 def test_an_edited_number_is_named(whole: Path, tmp_path: Path, table: str, column: str) -> None:
-    run = edited(whole, tmp_path / "run", table, column, "far")
+    run = edit_store(whole, tmp_path / "run", table, column, "far")
     with pytest.raises(StoreError, match=rf"{table} \(.*{column}: expected float, got str"):
         read_all(run, report=True)
 

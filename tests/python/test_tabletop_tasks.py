@@ -15,7 +15,7 @@ from wiw.tabletop.workbench import TABLE, Workbench
 from wiw.types import ArmObservation
 
 
-def seen(bench: Workbench, objects) -> ArmObservation:
+def observe(bench: Workbench, objects) -> ArmObservation:
     return ArmObservation(bench.render_view()["color"], bench.pose, None, bench.get_poses(objects))
 
 
@@ -84,7 +84,7 @@ def test_experts_go_on_from_where_things_stand(name: str, cut: int) -> None:
     for pose in whole[:cut]:
         bench.move_to(pose)
     assert not kind.is_success(bench, setup)
-    now = seen(bench, setup.objects)
+    now = observe(bench, setup.objects)
     rest = kind.plan_expert(now.places, kind.find_remaining_target(now, setup.target), now.pose)
     assert len(rest) <= len(whole) - cut + 1
     for pose in rest:
@@ -98,10 +98,10 @@ def test_what_is_left_of_a_row_of_buttons_shows() -> None:
     assert len(setup.target) == 3
     bench = setup.build_workbench()
     first, *rest = setup.target
-    assert kind.find_remaining_target(seen(bench, setup.objects), setup.target) == setup.target
+    assert kind.find_remaining_target(observe(bench, setup.objects), setup.target) == setup.target
     for pose in kind.plan_expert(bench.get_poses(setup.objects), (first,)):
         bench.move_to(pose)
-    now = seen(bench, setup.objects)
+    now = observe(bench, setup.objects)
     assert kind.find_remaining_target(now, setup.target) == tuple(rest)
     assert kind.find_remaining_target(now, (first,)) is None
     assert kind.find_remaining_target(now, (rest[0], first)) is None

@@ -102,7 +102,7 @@ def test_what_an_environment_lacks_is_named() -> None:
 def test_spl_of_an_episode_is_the_metric_s(two_rooms: str) -> None:
     env = wiw.make("ImageNav-v0", scenes=two_rooms, depth=False)
     env.reset(options={"episode": 0})
-    env.run(env.guide().plan(60))
+    env.run(env.guide().suggest_plan(60))
     got = env.result()
     assert got["success"] == 1 and 0.5 < got["spl"] <= 1
     assert got["spl"] == path_efficiency([True], [got["shortest"]], [got["travelled"]])[0]
@@ -161,10 +161,10 @@ def test_the_example_of_a_variant_runs_under_the_presets_of_what_it_derives_from
     assert task.rules == ImageNav().rules and TASKS.make(name, preset="official").rules.decisions == 21
     env = task.environment()
     env.begin(task.episode(0))
-    plan = env.guide().plan(60)
+    plan = env.guide().suggest_plan(60)
     assert not env.run(plan[:30]).terminated or env.state.success is False
     while env.state.distance_to_goal() > 0.5:
-        env.run(env.guide().plan(1))
+        env.run(env.guide().suggest_plan(1))
     assert not env.state.success and env.run([STOP]).terminated and env.result()["success"] == 1
     with pytest.raises(ArgumentError, match=r"no preset 'offical'; there are paper, official.*Did you mean official\?"):
         TASKS.make(name, preset="offical")

@@ -17,7 +17,7 @@ import pytest
 import wiw
 from wiw.envs import Segment
 from wiw.errors import ArgumentError, ContractError, StoreError
-from wiw.loop.contract import check_kind, check_needs
+from wiw.loop.contract import check_needs, check_plan_space
 from wiw.loop.imagination import Imagination, Request
 from wiw.loop.imagine import seed_of
 from wiw.loop.plan_space import PlanSpace, plan_space
@@ -55,7 +55,7 @@ class Dial(PlanSpace):
         return plan
 
     def check_model(self, model: wiw.WorldModel, longest: int) -> None:
-        check_kind(model, "dial", self.words)
+        check_plan_space(model, "dial", self.words)
         check_needs(model)
 
     def imagine(self, model: wiw.WorldModel, request: Request) -> DialFutures:

@@ -43,7 +43,7 @@ def overlap(a: Any, b: Any) -> float:
     return float((a & b).sum() / max(1, (a | b).sum()))
 
 
-def boxed(box: Any, columns: int = 1024) -> Any:
+def make_box_mask(box: Any, columns: int = 1024) -> Any:
     """The box as a mask."""
     filled = np.zeros((576, columns), bool)
     left, top, right, bottom = (round(edge) for edge in box)
@@ -60,7 +60,8 @@ def test_reprojected_boxes_are_where_true_ones_are(two_rooms: str, position: Any
     observation, frames, truth = look(world(two_rooms), position, yaw, name)
     track = Reprojection().track([observation], [to_viewpoints(PLAN)], [frames])[0]
     agreement = [
-        overlap(boxed(box), boxed(find_box(mask, wraps=True))) for box, mask in zip(track.boxes, truth, strict=True)
+        overlap(make_box_mask(box), make_box_mask(find_box(mask, wraps=True)))
+        for box, mask in zip(track.boxes, truth, strict=True)
     ]
     assert min(agreement) > 0.7
     assert np.median(agreement) > 0.85
@@ -86,7 +87,7 @@ def test_what_comes_into_sight_is_grown_into(two_rooms: str) -> None:
     observation, frames, truth = look(world(two_rooms), (-1.0, 0, 1.05), -np.pi / 2, "shelf", aside)
     plain, more = (tracker.track([observation], [aside], [frames])[0] for tracker in (Reprojection(), Growing()))
     boxes = [
-        [overlap(boxed(b), boxed(find_box(t, True))) for b, t in zip(x.boxes, truth, strict=True)]
+        [overlap(make_box_mask(b), make_box_mask(find_box(t, True))) for b, t in zip(x.boxes, truth, strict=True)]
         for x in (plain, more)
     ]
     assert np.mean(boxes[0]) < 0.5

@@ -84,8 +84,8 @@ def test_a_way_goes_on_from_what_the_network_made(plays: Plays) -> None:
     torch.testing.assert_close(whole.prediction[:4], steps[0].prediction)  # from the same canvas
     assert (whole.prediction[4:] - steps[1].prediction).abs().max() > 0.05  # from that of the true view
     for step in steps:
-        assert step.prediction.requires_grad and not step.still.requires_grad
-        assert (step.still - step.target).abs().mean() < (step.prediction - step.target).abs().mean() * 2
+        assert step.prediction.requires_grad and not step.static_view.requires_grad
+        assert (step.static_view - step.target).abs().mean() < (step.prediction - step.target).abs().mean() * 2
 
 
 def test_the_same_lesson_gives_the_same_network_stopped_or_not(plays: Plays, tmp_path: Path) -> None:
@@ -119,8 +119,8 @@ def test_training_teaches_what_becomes_of_things(plays: Plays) -> None:
     batch = build_sequences(one, np.zeros(7, np.int64), np.arange(7), 1)
     with torch.inference_mode():
         (step,) = predict_free_running(network, batch)
-        changed = (step.target - step.still).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
-        wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.prediction, step.still))
+        changed = (step.target - step.static_view).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
+        wrong, alone = (((view - step.target).abs() * changed).sum() for view in (step.prediction, step.static_view))
     assert wrong < 0.95 * alone
 
 

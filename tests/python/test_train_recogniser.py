@@ -23,7 +23,7 @@ NAMES = ("bars", "dots", "plain")
 KINDS = (START, PERFECT, PERFECT, PERFECT, WARPED, WARPED, WARPED)
 
 
-def drawn(label: int, rng: Any, hidden: bool, wrong: bool) -> Any:
+def draw_texture(label: int, rng: Any, hidden: bool, wrong: bool) -> Any:
     """A view [64, 64, 3] of a texture; hidden: as good as nothing is seen of it; wrong: all red, of another texture."""
     shown = (label + 1 + rng.integers(2)) % 3 if wrong else label
     rows, columns = np.indices((SIDE, SIDE)) // 4
@@ -39,7 +39,7 @@ def made_up(sets: int, seed: int) -> GlimpseSets:
     labels = rng.integers(0, 3, sets)
     images = np.array(
         [
-            [drawn(label, rng, rng.random() < 0.6, kind == WARPED and rng.random() < 0.5)] * 2
+            [draw_texture(label, rng, rng.random() < 0.6, kind == WARPED and rng.random() < 0.5)] * 2
             for label in labels
             for kind in KINDS
         ]

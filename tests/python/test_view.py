@@ -16,7 +16,7 @@ from PIL import Image
 
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
-from wiw.report.site import Beside, write_view
+from wiw.report.site import PictureFolder, write_view
 from wiw.runs.rows import decode_jpeg, encode_jpeg
 from wiw.runs.store import store_path
 from wiw.studies.evaluate import run_arms
@@ -115,7 +115,7 @@ def test_a_view_is_replaced_and_nothing_else_is(log, tmp_path, capsys):
 
 def test_a_picture_that_cannot_be_made_is_told(tmp_path):
     with ThreadPoolExecutor(2) as pool:
-        album = Beside(tmp_path / "images", pool)
+        album = PictureFolder(tmp_path / "images", pool)
         assert [album.draw(name, lambda name=name: name.encode()).source for name in "ab"] == [
             "../images/a.webp",
             "../images/b.webp",

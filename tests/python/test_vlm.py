@@ -156,12 +156,12 @@ def test_an_unusable_answer_is_asked_for_again_then_it_is_the_outcome() -> None:
     texts = iter(["nonsense", '{"reason": "a", "actions": ["forward"]}'])
     client = MockClient(lambda call: next(texts))
     reply = ask(client, "Plan!", schema=Plan, tries=2)
-    assert reply.value.actions == ["forward"] and [said.used for said in reply.said] == [False, True]
+    assert reply.value.actions == ["forward"] and [each.used for each in reply.completions] == [False, True]
     first, second = client.calls
     assert first.temperature == 0 and second.temperature > 0 and first.seed != second.seed
     reply = ask(MockClient(lambda call: "nonsense"), "Plan!", schema=Plan, tries=2)
     assert reply.value is None and reply.problem.kind == "malformed" and reply.problem.raw == "nonsense"
-    assert len(reply.said) == 2
+    assert len(reply.completions) == 2
 
 
 def test_a_question_is_named_by_all_that_its_answer_depends_on() -> None:
@@ -181,10 +181,10 @@ def test_a_question_is_named_by_all_that_its_answer_depends_on() -> None:
         ((IMAGE, "?"), {"temperature": 0.5}),
         ((IMAGE.reshape(60, 40, 3), "?"), base),
     ):
-        names.add(ask(client, *content, **options).said[0].call)
-    names.add(ask(MockClient(model="other"), IMAGE, "?", **base).said[0].call)
+        names.add(ask(client, *content, **options).completions[0].call)
+    names.add(ask(MockClient(model="other"), IMAGE, "?", **base).completions[0].call)
     assert len(names) == 10
-    assert ask(MockClient(), IMAGE.copy(), "?", **base).said[0].call in names
+    assert ask(MockClient(), IMAGE.copy(), "?", **base).completions[0].call in names
 
 
 def test_the_cache_answers_what_was_of_use(tmp_path: Path) -> None:
@@ -214,7 +214,7 @@ def test_the_cache_keeps_to_its_budget_and_survives_damage(tmp_path: Path, caplo
     (tmp_path / "broken").mkdir()
     (tmp_path / "broken/replies.sqlite").write_bytes(b"no database" * 100)
     broken = ReplyCache(tmp_path / "broken")
-    assert broken.get("a") is None and "not kept any more" in caplog.text
+    assert broken.get("a") is None and "no longer cached" in caplog.text
     broken.put({"a": Completion("x")})
     with pytest.raises(ArgumentError, match="above 0"):
         ReplyCache(tmp_path, 0)
@@ -287,7 +287,9 @@ def test_a_recorded_answer_is_given_again_and_nothing_else(tmp_path: Path) -> No
     reply = ask(MockClient(), IMAGE, choices=("a", "b"))
     exchange = {
         "model": "mock",
-        "said": [{"call": said.call, **json.loads(json.dumps(said.completion.to_json()))} for said in reply.said],
+        "said": [
+            {"call": said.call, **json.loads(json.dumps(said.completion.to_json()))} for said in reply.completions
+        ],
     }
     with sqlite3.connect(tmp_path / "run.sqlite") as connection:
         connection.execute("CREATE TABLE decision (exchanges TEXT)")

@@ -43,7 +43,7 @@ def answer(*actions: list[int], words: str = "Go there.") -> dict[str, Any]:
     }
 
 
-def said(*actions: list[int], **options: Any) -> str:
+def write_answer(*actions: list[int], **options: Any) -> str:
     return json.dumps(answer(*actions, **options))
 
 
@@ -55,7 +55,7 @@ def words(call: Call) -> str:
     return "\n".join(part for message in call.messages for part in message.content if isinstance(part, str))
 
 
-def decided(policy: Any, model: Any = None, kind: str = "push_buttons", **options: Any) -> Any:
+def decide_at_table(policy: Any, model: Any = None, kind: str = "push_buttons", **options: Any) -> Any:
     env = Manipulation(kind, seed=1).environment()
     env.reset(options={"episode": 1})
     agent = agent_for(env.task, wiw.Agent(policy, model, **options), cache="off")
@@ -76,9 +76,18 @@ class Reader(wiw.WorldModel):
 
 
 def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
-    answers = iter([said(ABOVE), said(BELOW, words="Down."), said(ABOVE, BELOW), said(ABOVE), said(BELOW), said(BELOW)])
+    answers = iter(
+        [
+            write_answer(ABOVE),
+            write_answer(BELOW, words="Down."),
+            write_answer(ABOVE, BELOW),
+            write_answer(ABOVE),
+            write_answer(BELOW),
+            write_answer(BELOW),
+        ]
+    )
     client, model = MockClient(lambda call: next(answers)), Reader()
-    decision = decided(ArmVLM(client), model)
+    decision = decide_at_table(ArmVLM(client), model)
     *proposing, revising = client.calls
     assert len(proposing) == 5 and len({call.seed for call in proposing}) == 5
     assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
@@ -100,21 +109,21 @@ def test_plans_are_asked_for_then_one_that_knows_the_futures() -> None:
 
 
 def test_without_a_world_model_one_plan_is_asked_for() -> None:
-    client = MockClient(lambda call: said(ABOVE, BELOW))
-    decision = decided(ArmVLM(client))
+    client = MockClient(lambda call: write_answer(ABOVE, BELOW))
+    decision = decide_at_table(ArmVLM(client))
     assert len(client.calls) == 1 and decision.chosen == 0 and decision.execute == 2
 
 
 def test_a_plan_may_be_written_anew_or_chosen_and_plans_may_be_listed() -> None:
     both = json.dumps({"plans": [answer(ABOVE), answer(ABOVE, BELOW)]})
-    client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(ABOVE, ABOVE))
-    decision = decided(ArmVLM(client, proposals="listed"), "copy")
+    client = MockClient(lambda call: both if "plans" in call.schema["properties"] else write_answer(ABOVE, ABOVE))
+    decision = decide_at_table(ArmVLM(client, proposals="listed"), "copy")
     assert len(client.calls) == 2 and "Give 5 plans" in words(client.calls[0])
     assert client.calls[0].max_tokens == 5 * client.calls[1].max_tokens
     assert decision.chosen is None and decision.scores.tolist() == [0.5, 0.5]
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE, ABOVE]))
     client = MockClient(lambda call: {"B": 0.7, "A": 0.3} if call.labels else both)
-    decision = decided(ArmVLM(client, proposals="listed", revision="select"), "copy")
+    decision = decide_at_table(ArmVLM(client, proposals="listed", revision="select"), "copy")
     assert decision.chosen == 1 and "B. plan 2" in words(client.calls[-1])
 
 
@@ -131,7 +140,7 @@ class Glider(wiw.Policy):
 
 def test_of_another_policys_plans_one_is_chosen_by_some_of_its_poses() -> None:
     client = MockClient(lambda call: {"B": 0.8, "A": 0.2})
-    decision = decided(Glider(), "copy", reviser=ArmVLM(client), horizon=12, execute=12)
+    decision = decide_at_table(Glider(), "copy", reviser=ArmVLM(client), horizon=12, execute=12)
     (call,) = client.calls
     assert decision.chosen == 1 and call.labels == ("A", "B")
     assert [strip.shape[1] // 384 for strip in images(call)[1:]] == [5, 5]
@@ -143,8 +152,8 @@ def test_of_another_policys_plans_one_is_chosen_by_some_of_its_poses() -> None:
 def test_a_long_plan_that_may_be_written_again_is_told_whole() -> None:
     long = [[50, 50, height, 0, 60, 60, 1] for height in range(30, 23, -1)]
     both = json.dumps({"plans": [answer(*long), answer(ABOVE)]})
-    client = MockClient(lambda call: both if "plans" in call.schema["properties"] else said(*long))
-    decision = decided(ArmVLM(client, proposals="listed"), "copy", horizon=7)
+    client = MockClient(lambda call: both if "plans" in call.schema["properties"] else write_answer(*long))
+    decision = decide_at_table(ArmVLM(client, proposals="listed"), "copy", horizon=7)
     assert f"Plan 1: Go there.\nActions: {long}" in words(client.calls[-1])
     assert [strip.shape[1] // 384 for strip in images(client.calls[-1])[1:]] == [5, 1]
     assert decision.chosen == 0
@@ -159,7 +168,7 @@ def test_the_end_of_a_plan_is_always_shown(count: int, places: Any) -> None:
 
 def test_numbers_out_of_range_are_understood_and_counted() -> None:
     odd = [100, -3, 250, 120, -60, 180, 2]
-    decision = decided(ArmVLM(MockClient(lambda call: said(ABOVE, odd))))
+    decision = decide_at_table(ArmVLM(MockClient(lambda call: write_answer(ABOVE, odd))))
     np.testing.assert_array_equal(decision.actions[1], GRID.decode([99, 0, 99, 0, 60, 60, 1]))
     assert decision.exchanges[0].result["out_of_range"] == 5 and decision.note == ""
 
@@ -167,11 +176,11 @@ def test_numbers_out_of_range_are_understood_and_counted() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        (said(ABOVE[:6]), "schema: executable_plan.0.action"),
-        (said([*ABOVE[:6], 10**30]), "schema: executable_plan.0.action.6"),
-        (said([0.5, *ABOVE[1:]]), "schema: executable_plan.0.action.0"),
-        (said(*[ABOVE] * 6), "schema: executable_plan"),
-        (said(), "schema: executable_plan"),
+        (write_answer(ABOVE[:6]), "schema: executable_plan.0.action"),
+        (write_answer([*ABOVE[:6], 10**30]), "schema: executable_plan.0.action.6"),
+        (write_answer([0.5, *ABOVE[1:]]), "schema: executable_plan.0.action.0"),
+        (write_answer(*[ABOVE] * 6), "schema: executable_plan"),
+        (write_answer(), "schema: executable_plan"),
         (json.dumps({"executable_plan": [{"action": ABOVE}]}), "schema: visual_state_description"),
         ("I go to the left.", "malformed"),
         ("I'm sorry, no.", "refusal"),
@@ -179,19 +188,19 @@ def test_numbers_out_of_range_are_understood_and_counted() -> None:
 )
 def test_unusable_answers_are_asked_for_again_and_then_a_pose_is_drawn(text: str, problem: str) -> None:
     client = MockClient(lambda call: text)
-    decision = decided(ArmVLM(client, tries=2))
+    decision = decide_at_table(ArmVLM(client, tries=2))
     assert len(client.calls) == 2 and decision.exchanges[0].problem.startswith(problem)
     assert "a pose was drawn" in decision.note and decision.actions.shape == (1, 7)
     assert plans.is_on_grid(decision.actions) and "drawn" in decision.proposals[0].note
-    some = iter(["junk", said(ABOVE), text.replace("'", ""), *["junk"] * 3])
-    decision = decided(ArmVLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
+    some = iter(["junk", write_answer(ABOVE), text.replace("'", ""), *["junk"] * 3])
+    decision = decide_at_table(ArmVLM(MockClient(lambda call: next(some)), tries=1), "copy", candidates=3)
     assert len(decision.proposals) == 1 and decision.chosen == 0
     assert "the plan was left out" in decision.note and "the first plan was taken" in decision.note
 
 
 def test_slips_of_syntax_are_mended() -> None:
-    slip = said(ABOVE).replace('"language_plan"', "language_plan")
-    decision = decided(ArmVLM(MockClient(lambda call: f"Here you are:\n{slip}")))
+    slip = write_answer(ABOVE).replace('"language_plan"', "language_plan")
+    decision = decide_at_table(ArmVLM(MockClient(lambda call: f"Here you are:\n{slip}")))
     np.testing.assert_array_equal(decision.actions, GRID.decode([ABOVE]))
     assert decision.exchanges[0].result["repaired"] is True
 
@@ -279,8 +288,8 @@ def test_a_users_own_prompts_have_the_tasks_slots(tmp_path: Path) -> None:
     (tmp_path / "manipulation").mkdir()
     file = tmp_path / "manipulation/planner.j2"
     file.write_text("Up to {{ position_bins }}, {{ rotation_bins }}, {{ rotation_degrees }}!")
-    client = MockClient(lambda call: said(ABOVE))
-    decided(ArmVLM(client, prompts=tmp_path))
+    client = MockClient(lambda call: write_answer(ABOVE))
+    decide_at_table(ArmVLM(client, prompts=tmp_path))
     assert words(client.calls[0]).startswith("Up to 100, 120, 3!")
     file.write_text("{{ obs_key }}")
     with pytest.raises(PromptError, match="unknown slot 'obs_key'; the slots are look_ahead_action_num"):
@@ -299,7 +308,7 @@ def test_one_name_for_primitives_and_poses() -> None:
     assert posing.policy.describe()["policy"] == "ArmVLM" and "tracker" not in posing.policy.describe()
     for policy, name in (("heuristic", "Heuristic"), (agent.policy, "VLM")):
         with pytest.raises(
-            ArgumentError, match=f"asked for in poses of a gripper, but policy {name} makes them of discrete primitives"
+            ArgumentError, match=f"plans in poses of a gripper, but policy {name} makes them of discrete primitives"
         ):
             agent_for(Manipulation(), wiw.Agent(policy))
     with pytest.raises(ArgumentError, match="among ar, imagenav, got 'manipulation'"):
@@ -345,5 +354,5 @@ def test_the_tiny_random_model_writes_plans() -> None:
 
     with tempfile.TemporaryDirectory() as folder:
         client = TransformersClient(make_tiny(Path(folder) / "tiny"), device="cpu")
-        decision = decided(ArmVLM(client, tries=1), horizon=1, execute=1)
+        decision = decide_at_table(ArmVLM(client, tries=1), horizon=1, execute=1)
     assert decision.note == "" and decision.actions.shape == (1, 7)

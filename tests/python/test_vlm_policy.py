@@ -59,7 +59,7 @@ def imagenav(scene: str) -> Any:
     return wiw.make("ImageNav-v0", scenes=scene, seed=0)
 
 
-def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
+def decide_in(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
     _, info = env.reset(options={"episode": 0})
     agent = agent_for(env.unwrapped.task, wiw.Agent(policy, model, **options))
     return agent.decide(env.observation, env.goal, info["key"])
@@ -67,7 +67,7 @@ def decided(env: Any, policy: Any, model: Any = None, **options: Any) -> Any:
 
 def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms: str) -> None:
     client = MockClient(script)
-    decision = decided(imagenav(two_rooms), VLM(client), "copy")
+    decision = decide_in(imagenav(two_rooms), VLM(client), "copy")
     *proposing, revising = client.calls
     assert len(proposing) == 3 and len({call.seed for call in proposing}) == 3
     assert {call.temperature for call in proposing} == {1.0} and revising.temperature == 0
@@ -85,7 +85,7 @@ def test_navigation_asks_for_plans_then_for_one_that_knows_the_futures(two_rooms
 
 def test_without_a_world_model_one_plan_is_asked_for(two_rooms: str) -> None:
     client = MockClient(script)
-    decision = decided(imagenav(two_rooms), VLM(client))
+    decision = decide_in(imagenav(two_rooms), VLM(client))
     assert len(client.calls) == 1 and decision.actions.tolist() == [FORWARD, FORWARD, LEFT] and decision.chosen == 0
 
 
@@ -105,7 +105,7 @@ def test_answers_do_not_depend_on_who_else_is_asked_for(two_rooms: str) -> None:
 def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
     plans = iter([["forward"], ["turn_left", "forward"], ["turn_right"], ["turn_left", "turn_left"]])
     client = MockClient(lambda call: json.dumps({"reason": "r", "actions": next(plans)}))
-    decision = decided(imagenav(two_rooms), VLM(client), "copy")
+    decision = decide_in(imagenav(two_rooms), VLM(client), "copy")
     assert decision.actions.tolist() == [LEFT, LEFT] and decision.chosen is None
     assert decision.scores.tolist() == [0.0, 0.5, 0.0]
     plans = iter([["forward"], ["turn_left", "forward"], ["turn_right"]])
@@ -114,7 +114,7 @@ def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
             {"B": 0.6, "A": 0.3, "C": 0.1} if call.labels else json.dumps({"reason": "r", "actions": next(plans)})
         )
     )
-    decision = decided(imagenav(two_rooms), VLM(chooser, revision="select"), "copy")
+    decision = decide_in(imagenav(two_rooms), VLM(chooser, revision="select"), "copy")
     assert decision.actions.tolist() == [LEFT, FORWARD] and decision.chosen == 1
     np.testing.assert_allclose(decision.scores, [0.3, 0.6, 0.1])
     assert "B. plan 2: turn_left, forward" in words(chooser.calls[-1])
@@ -123,7 +123,7 @@ def test_a_plan_may_be_written_anew_or_chosen(two_rooms: str) -> None:
 def test_plans_may_be_listed_in_one_answer(two_rooms: str) -> None:
     answer = json.dumps({"plans": [{"reason": "r", "actions": [name]} for name in ("forward", "turn_left", "forward")]})
     client = MockClient(lambda call: answer if "plans" in call.schema["properties"] else WALK)
-    decision = decided(imagenav(two_rooms), VLM(client, proposals="listed"), "copy")
+    decision = decide_in(imagenav(two_rooms), VLM(client, proposals="listed"), "copy")
     assert len(client.calls) == 2 and "Give 3 plans" in words(client.calls[0])
     assert [plan.actions.tolist() for plan in decision.proposals] == [[FORWARD], [LEFT]]
 
@@ -140,7 +140,7 @@ def redness(image: Any) -> int:
 
 def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
     client = MockClient(script)
-    decision = decided(recognition, VLM(client), "warp")
+    decision = decide_in(recognition, VLM(client), "warp")
     proposing, (moving, answering) = client.calls[:-2], client.calls[-2:]
     assert [each.purpose for each in decision.exchanges] == ["propose/0", "propose/1", "move", "answer"]
     assert len(proposing) == 2 and "next 4 action(s)" in words(proposing[0])
@@ -161,7 +161,7 @@ def test_recognition_without_a_world_model_is_two_questions(recognition: Any) ->
     client = MockClient(
         lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)
     )
-    decision = decided(recognition, VLM(client))
+    decision = decide_in(recognition, VLM(client))
     assert [each.purpose for each in decision.exchanges] == ["move", "answer"]
     assert decision.actions.tolist() == [RIGHT] and decision.chosen == 0
     assert [len(images(call)) for call in client.calls] == [2, 1]
@@ -171,7 +171,7 @@ def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: 
     client = MockClient(
         lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)
     )
-    decision = decided(recognition, VLM(client), "copy")
+    decision = decide_in(recognition, VLM(client), "copy")
     assert decision.actions.tolist() == [RIGHT] and decision.chosen is None and decision.scores[0] < 0.5
 
 
@@ -181,13 +181,13 @@ def test_a_target_out_of_sight_is_not_asked_about(tmp_path: Path, two_rooms: str
     env.reset(options={"episode": 0})
     assert not env.unwrapped.observation.target.mask.any(), "the test needs a hidden target"
     client = MockClient(lambda call: {letter_of(call, "go straight for 0.20 m"): 1.0})
-    decision = decided(env, VLM(client))
+    decision = decide_in(env, VLM(client))
     assert len(client.calls) == 1 and "nothing was asked, no choice was preferred" in decision.note
     assert decision.answer.confidence == pytest.approx(0.25, abs=1e-6)
 
 
 def test_unusable_answers_are_recorded_and_no_choice_is_preferred(recognition: Any, two_rooms: str) -> None:
-    decision = decided(recognition, VLM(MockClient(lambda call: "I'm sorry, no."), tries=2), "copy")
+    decision = decide_in(recognition, VLM(MockClient(lambda call: "I'm sorry, no."), tries=2), "copy")
     problems = {each.purpose: each for each in decision.exchanges}
     assert problems["propose/0"].problem.startswith("refusal") and problems["answer"].problem.startswith("no_option")
     assert problems["answer"].instead == "no choice was preferred" and len(problems["propose/0"].said) == 2
@@ -203,7 +203,7 @@ def test_unusable_answers_are_recorded_and_no_choice_is_preferred(recognition: A
         labels.add(agent.decide(recognition.unwrapped.observation, recognition.unwrapped.goal, key).answer.label)
     assert len(labels) > 1, "one choice is always first"
     some = iter(["junk", WALK, WALK, "junk"])
-    decision = decided(imagenav(two_rooms), VLM(MockClient(lambda call: next(some)), tries=1), "copy")
+    decision = decide_in(imagenav(two_rooms), VLM(MockClient(lambda call: next(some)), tries=1), "copy")
     assert len(decision.proposals) == 1 and decision.chosen == 0
     assert "propose/0: malformed" in decision.note and "the plan was left out" in decision.note
     assert "revise: malformed" in decision.note and "the first plan was taken" in decision.note
@@ -255,7 +255,7 @@ def test_a_users_own_prompts_are_checked(tmp_path: Path, two_rooms: str) -> None
     assert own.render("imagenav", "planner", **SLOTS) == "Walk 5 steps!" and own.digest != shipped.digest
     assert own.render("ar", "answerer", **SLOTS) == shipped.render("ar", "answerer", **SLOTS)
     client = MockClient(script)
-    decided(imagenav(two_rooms), VLM(client, prompts=tmp_path))
+    decide_in(imagenav(two_rooms), VLM(client, prompts=tmp_path))
     assert words(client.calls[0]).startswith("Walk 5 steps!")
     for source, said in (
         ("{{ goal_colour }}", "unknown slot 'goal_colour'; the slots are obs_key"),

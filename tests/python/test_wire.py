@@ -164,7 +164,7 @@ def test_another_version_is_told_from_nonsense():
         assert caught.value.kind == "version"
 
 
-def refused(data, read=decode):
+def catch_refusal(data, read=decode):
     with pytest.raises(RemoteError) as caught:
         read(data)
     assert caught.value.kind in ("message", "version")
@@ -172,8 +172,8 @@ def refused(data, read=decode):
 
 @given(st.binary(max_size=300))
 def test_random_bytes_are_refused(data):
-    refused(data)
-    refused(data, unpack_row)
+    catch_refusal(data)
+    catch_refusal(data, unpack_row)
 
 
 nested = st.recursive(
@@ -193,14 +193,14 @@ def test_a_field_of_another_type_is_refused(message, data):
     values = msgpack.unpackb(encode(message))
     name = data.draw(st.sampled_from(sorted(set(values) - {"v", "type"})))
     value = data.draw(nested.filter(lambda value: type(value) is not type(values[name])))
-    refused(msgpack.packb({**values, name: value}))
-    refused(msgpack.packb({**values, "more": value}))
-    refused(msgpack.packb({key: kept for key, kept in values.items() if key != name}))
+    catch_refusal(msgpack.packb({**values, name: value}))
+    catch_refusal(msgpack.packb({**values, "more": value}))
+    catch_refusal(msgpack.packb({key: kept for key, kept in values.items() if key != name}))
 
 
 @given(st.integers(0, len(ROW) - 1))
 def test_a_row_cut_short_is_refused(length):
-    refused(ROW[:length], unpack_row)
+    catch_refusal(ROW[:length], unpack_row)
 
 
 @given(st.integers(0, len(ROW) - 1), st.integers(0, 255))
@@ -251,7 +251,7 @@ LIES = {
 
 @pytest.mark.parametrize("lie", LIES)
 def test_a_row_that_is_not_what_it_says_is_refused(lie):
-    refused(msgpack.packb({**ROW_VALUES, **LIES[lie]}), unpack_row)
+    catch_refusal(msgpack.packb({**ROW_VALUES, **LIES[lie]}), unpack_row)
 
 
 BOMBS = {
@@ -270,15 +270,15 @@ BOMBS = {
 def test_what_unpacks_to_much_more_takes_no_memory(bomb):
     data = BOMBS[bomb]
     tracemalloc.start()
-    refused(data)
-    refused(data, unpack_row)
+    catch_refusal(data)
+    catch_refusal(data, unpack_row)
     _, most = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert most < 2**20
 
 
 def test_only_binary_frames_are_read():
-    refused("text")
+    catch_refusal("text")
 
 
 def test_a_history_of_gripper_poses_comes_out_as_it_went_in():

@@ -49,8 +49,8 @@ TEST_CASE("a wall makes two islands and stops every step through it") {
   CHECK(mesh->try_step(left, right) == left);
   const Distance distance = mesh->geodesic_distance(left, right, Metric::kDetour);
   CHECK(std::isinf(distance.metres));
-  CHECK(distance.reason == Reason::kOtherIsland);
-  CHECK(mesh->geodesic_distance(left, {50, 0, 0}, Metric::kDetour).reason == Reason::kEndOffMesh);
+  CHECK(distance.reason == NoPathReason::kOtherIsland);
+  CHECK(mesh->geodesic_distance(left, {50, 0, 0}, Metric::kDetour).reason == NoPathReason::kEndOffMesh);
 }
 
 TEST_CASE("steps slide along walls or stop at them") {

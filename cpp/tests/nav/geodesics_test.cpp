@@ -127,7 +127,7 @@ TEST_CASE("distances over several floors approach the slow twin's from below") {
 TEST_CASE("points above each other are as far apart as the stairs are long") {
   const auto mesh = mesh_of(stairwell());
   const Distance down = mesh->geodesic_distance({2, 0.2f, 3}, {2, 5, 3});
-  CHECK(down.reason == Reason::kNone);
+  CHECK(down.reason == NoPathReason::kNone);
   CHECK(down.metres > 18);
   const Path path = mesh->shortest_path({2, 0.2f, 3}, {2, 5, 3});
   CHECK(mesh->surface_length(path.points) > down.metres + 0.5);

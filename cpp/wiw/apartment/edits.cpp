@@ -15,7 +15,7 @@ namespace wiw::apartment {
 
 namespace {
 
-using Box = Eigen::AlignedBox3f;
+using WorldBox = Eigen::AlignedBox3f;
 
 constexpr float kHead = 1.5f;     // what hangs higher is in nobody's way
 constexpr float kCounter = 1.2f;  // furniture to put things on is lower
@@ -148,8 +148,8 @@ class Editor {
  private:
   Object& object(std::size_t index) { return draft_.objects[index]; }
 
-  static Box box_of(const Object& object, const Eigen::Affine3f& pose) {
-    Box box = object.shape.bounds();
+  static WorldBox box_of(const Object& object, const Eigen::Affine3f& pose) {
+    WorldBox box = object.shape.bounds();
     return box.isEmpty() ? box : box.transformed(pose);
   }
 
@@ -250,7 +250,7 @@ class Editor {
       return "expected " + listed(others) + did_you_mean(state, others);
     MaterialTable scratch = draft_.materials;
     const BuiltPiece built = build_piece(*changed.design, state, scratch, draft_.palette);
-    for (const Box& leaf : built.object.leaves) {
+    for (const WorldBox& leaf : built.object.leaves) {
       const std::string hit = leaf_obstacle(index, leaf.transformed(changed.pose));
       if (!hit.empty()) return "its door " + hit;
     }
@@ -258,9 +258,9 @@ class Editor {
   }
 
   /// What an open door would hit; empty if it has room and people can still pass.
-  std::string leaf_obstacle(std::size_t owner, const Box& leaf) {
+  std::string leaf_obstacle(std::size_t owner, const WorldBox& leaf) {
     const std::int32_t room = object(owner).room;
-    const Box core(leaf.min() + Vec3::Constant(kTouch), leaf.max() - Vec3::Constant(kTouch));
+    const WorldBox core(leaf.min() + Vec3::Constant(kTouch), leaf.max() - Vec3::Constant(kTouch));
     for (std::size_t i = 0; i < boxes_.size(); ++i) {
       if (i == owner || !is_solid(i) || object(i).room != room) continue;
       if (core.intersects(boxes_[i])) return "would hit '" + labels_[i] + "'";
@@ -405,8 +405,8 @@ class Editor {
   }
 
   /// Everything that moves with an object, as one box.
-  Box group_box(std::size_t index, const Eigen::Affine3f& pose) {
-    Box box;
+  WorldBox group_box(std::size_t index, const Eigen::Affine3f& pose) {
+    WorldBox box;
     for (std::size_t i = 0; i < labels_.size(); ++i) {
       if (gone_[i] || !belongs_to(i, index)) continue;
       const Eigen::Affine3f moved = pose * object(index).pose.inverse() * object(i).pose;
@@ -418,10 +418,10 @@ class Editor {
   std::string place_obstacle(std::size_t goes, std::size_t stays) {
     const Object &piece = object(goes), &other = object(stays);
     const Eigen::Affine3f pose = pose_in_place_of(piece, other);
-    Box box = group_box(goes, pose);
+    WorldBox box = group_box(goes, pose);
     if (stand_of(piece) == Stand::kTop && box.sizes().y() > other.headroom) return "it is too high";
-    box = Box(box.min() + Vec3::Constant(kTouch), box.max() - Vec3::Constant(kTouch));
-    const Box before = group_box(stays, other.pose);
+    box = WorldBox(box.min() + Vec3::Constant(kTouch), box.max() - Vec3::Constant(kTouch));
+    const WorldBox before = group_box(stays, other.pose);
     for (std::size_t i = 0; i < boxes_.size(); ++i) {
       if (!is_solid(i) || object(i).room != other.room || belongs_to(i, goes) || belongs_to(i, stays)) continue;
       if (box.intersects(boxes_[i]) && !before.intersects(boxes_[i])) return "'" + labels_[i] + "' is in the way";
@@ -440,7 +440,7 @@ class Editor {
   }
 
   /// Whether something at a wall stands or hangs before an opening in it.
-  static bool hides_opening(const RoomFloor& floor, const Rect& area, const Box& box) {
+  static bool hides_opening(const RoomFloor& floor, const Rect& area, const WorldBox& box) {
     const Rect& inside = floor.inside();
     const std::array<std::pair<Side, float>, 4> gaps{{{Side::kWest, area.x0 - inside.x0},
                                                       {Side::kEast, inside.x1 - area.x1},
@@ -490,7 +490,7 @@ class Editor {
   Draft& draft_;
   std::vector<std::string> labels_;
   std::vector<bool> gone_;
-  std::vector<Box> boxes_;  // of shapes, in the world
+  std::vector<WorldBox> boxes_;  // of shapes, in the world
 };
 
 bool is_used(const Edit& edit, const std::vector<Edit>& applied) {

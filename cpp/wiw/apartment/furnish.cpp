@@ -145,7 +145,7 @@ BuiltPiece build_piece(const Design& design, const std::string& state, MaterialT
                        const Palette& palette) {
   const Category& category = catalogue()[design.category];
   Rng rng(stream_key({design.key, 1}));
-  Make make{design.size, rng, materials, palette.rooms[static_cast<std::size_t>(design.room)]};
+  FurnitureBuilder make{design.size, rng, materials, palette.rooms[static_cast<std::size_t>(design.room)]};
   make.on = state.empty() ? design.on : state == "on";
   make.state = state;
   category.make(make);

@@ -180,7 +180,7 @@ void LightSolver::find_reach(const Draft& draft) {
   }
 }
 
-Rgb LightSolver::from_light(const Sample& sample, const Lit& lit) const {
+Rgb LightSolver::from_light(const Sample& sample, const VisibleLight& lit) const {
   const Light& light = lights_[lit.light];
   RayTracer::Directions to;
   std::array<bool, RayTracer::kWidth> active{};
@@ -213,7 +213,7 @@ Rgb LightSolver::from_light(const Sample& sample, const Lit& lit) const {
 Rgb LightSolver::direct(const Sample& sample) const {
   Rgb sum = Rgb::Zero();
   if (sample.room == kOutside) return sum;
-  for (const Lit& lit : lit_[static_cast<std::size_t>(sample.room)]) sum += from_light(sample, lit);
+  for (const VisibleLight& lit : lit_[static_cast<std::size_t>(sample.room)]) sum += from_light(sample, lit);
   return sum;
 }
 

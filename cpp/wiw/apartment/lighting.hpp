@@ -32,8 +32,8 @@ class LightSolver {
     std::int32_t chart = scene::kNone;        // its light is in the chart's texels, or
     std::array<std::uint32_t, 3> vertices{};  // at these samples
   };
-  /// A light as seen from one room: directly, or through an opening into the room where it burns.
-  struct Lit {
+  /// A light that reaches a room: directly, or through an opening to the room it stands in.
+  struct VisibleLight {
     std::size_t light;
     const Opening* through = nullptr;
   };
@@ -42,7 +42,7 @@ class LightSolver {
   void add_vertices(const Submesh& part, const Object& object);
   void find_reach(const Draft& draft);
   [[nodiscard]] Rgb direct(const Sample& sample) const;
-  [[nodiscard]] Rgb from_light(const Sample& sample, const Lit& lit) const;
+  [[nodiscard]] Rgb from_light(const Sample& sample, const VisibleLight& lit) const;
   [[nodiscard]] Rgb bounced(const Sample& sample, const std::vector<Rgb>& direct_light,
                             const std::vector<Rgb>& ambient) const;
   [[nodiscard]] std::vector<Rgb> ambient(const std::vector<Rgb>& direct_light, std::size_t rooms) const;
@@ -50,7 +50,7 @@ class LightSolver {
   const Atlas& atlas_;
   const std::vector<Chart>& charts_;
   std::vector<Light> lights_;
-  std::vector<std::vector<Lit>> lit_;  // by room
+  std::vector<std::vector<VisibleLight>> lit_;  // by room
   std::vector<Sample> samples_;
   std::vector<Face> faces_;
   std::vector<std::int32_t> face_room_;

@@ -136,13 +136,13 @@ Palette make_palette(std::uint64_t seed, Split split, const FloorPlan& plan) {
 namespace {
 
 /// Middle of a colour's name: lightness, chroma and hue.
-struct NamedColor {
+struct ColorRange {
   std::string name;
   Eigen::Vector2f lightness, chroma, hue;
 };
 
-const std::vector<NamedColor>& named_colors() {
-  static const std::vector<NamedColor> kColors{{"beige", {0.8f, 0.87f}, {0.045f, 0.06f}, {75.f, 95.f}},
+const std::vector<ColorRange>& named_colors() {
+  static const std::vector<ColorRange> kColors{{"beige", {0.8f, 0.87f}, {0.045f, 0.06f}, {75.f, 95.f}},
                                                {"black", {0.2f, 0.26f}, {0.005f, 0.012f}, {0.f, 360.f}},
                                                {"blue", {0.45f, 0.6f}, {0.1f, 0.15f}, {240.f, 270.f}},
                                                {"brown", {0.4f, 0.5f}, {0.06f, 0.09f}, {48.f, 72.f}},
@@ -163,14 +163,14 @@ const std::vector<NamedColor>& named_colors() {
 const std::vector<std::string>& color_names() {
   static const std::vector<std::string> kNames = [] {
     std::vector<std::string> names;
-    for (const NamedColor& color : named_colors()) names.push_back(color.name);
+    for (const ColorRange& color : named_colors()) names.push_back(color.name);
     return names;
   }();
   return kNames;
 }
 
 Rgb draw_color(const std::string& name, Split split, Rng& rng) {
-  for (const NamedColor& color : named_colors()) {
+  for (const ColorRange& color : named_colors()) {
     for (int attempt = 0; color.name == name && attempt < 1000; ++attempt) {
       const float lightness = range(rng, color.lightness.x(), color.lightness.y()),
                   chroma = range(rng, color.chroma.x(), color.chroma.y());

@@ -115,7 +115,7 @@ PlacedPiece RoomPlan::design(std::size_t category) {
   return piece;
 }
 
-bool RoomPlan::stand_at_wall(PlacedPiece piece, Side side, float middle) {
+bool RoomPlan::place_at_wall(PlacedPiece piece, Side side, float middle) {
   const Category& row = catalogue()[piece.category];
   const float half = 0.5f * piece.size.x();
   const Rect body = floor.at_wall(side, middle - half, middle + half, kGap, piece.size.z());
@@ -156,7 +156,7 @@ bool RoomPlan::hang(PlacedPiece piece, Side side, float middle, float height) {
 bool place_at_walls(RoomPlan& room, const PlacedPiece& piece, const Side* wanted, float near) {
   const std::vector<Spot> spots = wall_spots(room, piece, wanted, near);
   return std::any_of(spots.begin(), spots.end(),
-                     [&](const Spot& spot) { return room.stand_at_wall(piece, spot.side, spot.middle); });
+                     [&](const Spot& spot) { return room.place_at_wall(piece, spot.side, spot.middle); });
 }
 
 std::vector<PlacedPiece> place_furniture(const FloorPlan& plan, std::int32_t room, std::uint64_t seed) {

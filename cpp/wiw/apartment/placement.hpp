@@ -40,7 +40,7 @@ struct RoomPlan {
   /// A piece of the category with a size of its own, not yet placed.
   PlacedPiece design(std::size_t category);
   /// Back to the wall with the middle at `middle`; false and unchanged if it does not fit.
-  bool stand_at_wall(PlacedPiece piece, Side side, float middle);
+  bool place_at_wall(PlacedPiece piece, Side side, float middle);
   bool stand_free(const PlacedPiece& piece, float front);
   bool hang(PlacedPiece piece, Side side, float middle, float height);
 };

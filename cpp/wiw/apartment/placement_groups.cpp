@@ -18,7 +18,7 @@ Vec3 in_room(const PlacedPiece& piece, float x, float z) {
   return piece.position + Vec3(c * x + s * z, 0.f, -s * x + c * z);
 }
 
-/// Wall behind a piece that was put there by stand_at_wall.
+/// Wall behind a piece that was put there by place_at_wall.
 Side wall_behind(const PlacedPiece& piece) {
   for (const Side side : kSides) {
     if (std::abs(yaw_from_wall(side) - piece.yaw) < 0.01f) return side;
@@ -33,7 +33,7 @@ void place_beside(RoomPlan& room, const PlacedPiece& owner, PlacedPiece piece, i
   const float reach = 0.5f * (owner.size.x() + piece.size.x()) + 0.03f, middle = along_wall(side, owner.position);
   int placed = 0;
   for (const float sign : {-1.f, 1.f}) {
-    if (placed < most && room.stand_at_wall(piece, side, middle + sign * reach)) {
+    if (placed < most && room.place_at_wall(piece, side, middle + sign * reach)) {
       ++placed;
       place_companions(room, room.pieces.size() - 1);
     }
@@ -150,7 +150,7 @@ void place_windows(RoomPlan& room) {
     if (o.kind != OpeningKind::kWindow || o.room_a != room.room) continue;
     const float middle = 0.5f * (o.low + o.high);
     radiator.size.x() = std::min(1.3f, 0.8f * o.width());
-    if (heated && o.bottom > 0.72f) room.stand_at_wall(radiator, o.side, middle);
+    if (heated && o.bottom > 0.72f) room.place_at_wall(radiator, o.side, middle);
     if (!curtains) continue;
     PlacedPiece piece = curtain;
     const float bottom = o.bottom > 0.6f && room.type() == RoomType::kKitchen ? o.bottom - 0.1f : 0.03f;

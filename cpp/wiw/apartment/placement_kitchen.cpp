@@ -88,7 +88,7 @@ void place_line(RoomPlan& room, const Stretch& stretch, const std::vector<Kitche
     if (std::string(unit.category) != "refrigerator") piece.size.y() = height;
     const float middle = from_high ? at - 0.5f * unit.width : at + 0.5f * unit.width;
     at += from_high ? -unit.width : unit.width;
-    if (room.stand_at_wall(piece, stretch.side, middle)) add_overhead(room, unit, stretch.side, middle);
+    if (room.place_at_wall(piece, stretch.side, middle)) add_overhead(room, unit, stretch.side, middle);
   }
 }
 

@@ -13,7 +13,7 @@ struct WallPatch {
   float low = 0.f, high = 0.f, bottom = 0.f, top = 0.f;
 };
 
-/// What still is free in one room: floor, walls, and ways to walk.
+/// The free space of one room: floor, walls, and walkable passages.
 class RoomFloor {
  public:
   RoomFloor(const FloorPlan& plan, std::int32_t room);

@@ -43,8 +43,8 @@ class ThreadPool {
   std::vector<std::thread> workers_;
 };
 
-/// From now on what the calling thread asks of any pool runs inline: for a thread that is one of as many as there are
-/// cores, each with work of its own.
+/// Runs all later jobs of the calling thread inline, on any pool. For threads that already use every core between them,
+/// each with work of its own.
 void run_inline();
 
 /// Shorthand for ThreadPool::shared().parallel_for.

@@ -48,26 +48,27 @@ CornerGraph::CornerGraph(const PolygonGraph& graph, const Corners& corners) {
   for (std::size_t i = 1; i < offsets_.size(); ++i) offsets_[i] += offsets_[i - 1];
 }
 
-void CornerGraph::spread(std::span<const Leg> seeds, std::span<double> metres,
-                         std::vector<std::int32_t>* parents) const {
-  const auto farther = [](const Leg& a, const Leg& b) { return a.metres > b.metres; };
+void CornerGraph::find_distances(std::span<const CornerDistance> seeds, std::span<double> metres,
+                                 std::vector<std::int32_t>* parents) const {
+  const auto farther = [](const CornerDistance& a, const CornerDistance& b) { return a.metres > b.metres; };
   std::fill(metres.begin(), metres.end(), std::numeric_limits<double>::infinity());
   if (parents) parents->assign(size(), -1);
-  std::vector<Leg> heap;
-  const auto offer = [&](const Leg& leg, std::int32_t from) {
+  std::vector<CornerDistance> heap;
+  const auto offer = [&](const CornerDistance& leg, std::int32_t from) {
     if (leg.metres >= metres[leg.corner]) return;
     metres[leg.corner] = leg.metres;
     if (parents) (*parents)[leg.corner] = from;
     heap.push_back(leg);
     std::push_heap(heap.begin(), heap.end(), farther);
   };
-  for (const Leg& seed : seeds) offer(seed, -1);
+  for (const CornerDistance& seed : seeds) offer(seed, -1);
   while (!heap.empty()) {
     std::pop_heap(heap.begin(), heap.end(), farther);
-    const Leg nearest = heap.back();
+    const CornerDistance nearest = heap.back();
     heap.pop_back();
     if (nearest.metres > metres[nearest.corner]) continue;
-    for (const Leg& edge : edges(nearest.corner)) offer({edge.corner, nearest.metres + edge.metres}, nearest.corner);
+    for (const CornerDistance& edge : edges(nearest.corner))
+      offer({edge.corner, nearest.metres + edge.metres}, nearest.corner);
   }
 }
 

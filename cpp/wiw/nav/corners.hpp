@@ -8,7 +8,7 @@
 
 namespace wiw::nav {
 
-/// A vertex around which shortest ways bend: the free space around it, a fan of polygons between two walls, spans more
+/// A vertex around which shortest paths bend: the free space around it, a fan of polygons between two walls, spans more
 /// than 180 degrees. Two fans that touch in one vertex are two corners, since nothing passes through the point between.
 struct Corner {
   Point2 at;
@@ -16,7 +16,7 @@ struct Corner {
   int vertex = -1;     // of the tile
   std::vector<std::pair<int, int>> fan;  // polygons counter-clockwise, each with the place of this vertex in it
 
-  /// Whether a way that arrives from `from`, inside the fan, can bend here without getting longer than needed, that
+  /// Whether a path that arrives from `from`, inside the fan, can bend here without getting longer than needed, that
   /// is, whether the fan leaves at least 180 degrees on one side of it.
   [[nodiscard]] bool is_taut(Point2 from) const { return orient(at, first, from) <= 0 || orient(at, from, last) <= 0; }
 };

@@ -8,7 +8,7 @@
 
 namespace wiw::nav {
 
-/// Detour's own way between two projected points: A* over polygons, then a taut string through the corridor found.
+/// Detour's own path between two projected points: A* over polygons, then a taut string through the corridor found.
 /// With `capped` it stops at 256 polygons and 2048 nodes, where Habitat reports "unreachable". Empty if it stopped.
 std::vector<Eigen::Vector3f> detour_path(const DetourMesh& mesh, const MeshPoint& start, const MeshPoint& end,
                                          bool capped);

@@ -28,10 +28,11 @@ DistanceField::DistanceField(std::shared_ptr<const NavMesh> mesh, std::span<cons
 Distance DistanceField::distance(const Eigen::Vector3f& point) const {
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
   const auto projection = mesh_->project(point);
-  if (!projection) return {kInfinity, Reason::kStartOffMesh};
+  if (!projection) return {kInfinity, NoPathReason::kStartOffMesh};
   const int island = mesh_->surface().polygon_island[projection->polygon];
-  if (std::find(islands_.begin(), islands_.end(), island) == islands_.end()) return {kInfinity, Reason::kOtherIsland};
-  return {search_->metres(mesh_->geodesics().site(*projection)), Reason::kNone};
+  if (std::find(islands_.begin(), islands_.end(), island) == islands_.end())
+    return {kInfinity, NoPathReason::kOtherIsland};
+  return {search_->metres(mesh_->geodesics().site(*projection)), NoPathReason::kNone};
 }
 
 }  // namespace wiw::nav

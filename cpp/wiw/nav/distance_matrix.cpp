@@ -66,19 +66,19 @@ class MatrixJob {
 
   void connect(std::size_t begin, std::size_t end) {
     for (std::size_t c = begin; c < end; ++c) {
-      const Leg seed{static_cast<std::int32_t>(c), 0};
-      geodesics_.corner_graph().spread({&seed, 1}, {between_.data() + c * corners_, corners_});
+      const CornerDistance seed{static_cast<std::int32_t>(c), 0};
+      geodesics_.corner_graph().find_distances({&seed, 1}, {between_.data() + c * corners_, corners_});
     }
   }
 
   // With fewer sites than corners one search a site is cheaper than all ways between corners.
   void reach_corners(std::size_t i, std::span<double> metres) const {
     if (between_.empty()) {
-      geodesics_.corner_graph().spread(legs_[i], metres);
+      geodesics_.corner_graph().find_distances(legs_[i], metres);
       return;
     }
     std::fill(metres.begin(), metres.end(), kInfinity);
-    for (const Leg& leg : legs_[i]) {
+    for (const CornerDistance& leg : legs_[i]) {
       const double* row = between_.data() + static_cast<std::size_t>(leg.corner) * corners_;
       for (std::size_t c = 0; c < corners_; ++c) metres[c] = std::min(metres[c], leg.metres + row[c]);
     }
@@ -91,7 +91,7 @@ class MatrixJob {
       double* row = upper_.data() + i * sites_.size();
       for (std::size_t j = i + 1; j < sites_.size(); ++j) {
         if (row[j] < kInfinity) continue;
-        for (const Leg& leg : legs_[j]) row[j] = std::min(row[j], metres[leg.corner] + leg.metres);
+        for (const CornerDistance& leg : legs_[j]) row[j] = std::min(row[j], metres[leg.corner] + leg.metres);
       }
     }
   }
@@ -110,7 +110,7 @@ class MatrixJob {
   std::vector<Site> sites_;
   std::vector<std::size_t> original_;  // place of each sorted site among the caller's
   std::vector<std::size_t> first_;     // per polygon: its first site; one more at the end
-  std::vector<std::vector<Leg>> legs_;
+  std::vector<std::vector<CornerDistance>> legs_;
   std::vector<double> between_;  // metres between corners; empty where that would cost more than it saves
   std::vector<double> upper_;    // metres between sites, by sorted place
 };

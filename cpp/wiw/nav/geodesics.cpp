@@ -23,7 +23,7 @@ Site Geodesics::site(const MeshPoint& projection) const {
 
 Geodesics::Way Geodesics::way(const Site& start, const Site& end) const {
   bool seen = start.polygon == end.polygon;
-  std::vector<Leg> legs;
+  std::vector<CornerDistance> legs;
   Sight sight(graph_, corners_);
   sight.from_site(
       start, [&](int c) { legs.push_back(leg(c, start.at)); },
@@ -31,7 +31,7 @@ Geodesics::Way Geodesics::way(const Site& start, const Site& end) const {
   if (seen) return {metres(start.at, end.at), {}};
   std::vector<double> from_start(corners_.list.size());
   std::vector<std::int32_t> parents;
-  corner_graph_.spread(legs, from_start, &parents);
+  corner_graph_.find_distances(legs, from_start, &parents);
   Way way{kInfinity, {}};
   int last = -1;
   const auto arrive = [&](int c) {
@@ -49,12 +49,12 @@ Geodesics::Way Geodesics::way(const Site& start, const Site& end) const {
 GoalSearch::GoalSearch(const Geodesics& geodesics, std::vector<Site> goals)
     : geodesics_(geodesics), goals_(std::move(goals)), corner_metres_(geodesics.corners().list.size()) {
   std::sort(goals_.begin(), goals_.end(), [](const Site& a, const Site& b) { return a.polygon < b.polygon; });
-  std::vector<Leg> legs;
+  std::vector<CornerDistance> legs;
   Sight sight(geodesics.graph(), geodesics.corners());
   for (const Site& goal : goals_) {
     sight.from_site(goal, [&](int c) { legs.push_back(geodesics.leg(c, goal.at)); }, kIgnoreCones);
   }
-  geodesics.corner_graph().spread(legs, corner_metres_);
+  geodesics.corner_graph().find_distances(legs, corner_metres_);
 }
 
 double GoalSearch::nearest_goal(const Site& site, int polygon, const Cone* cone) const {

@@ -10,8 +10,8 @@
 
 namespace wiw::nav {
 
-/// Exact shortest ways over the mesh, measured horizontally. A shortest way is straight except at corners around which
-/// it is taut, so it is a shortest way of the corners' visibility graph between the corners that its ends see.
+/// Exact shortest paths over the mesh, measured horizontally. A shortest path is straight except at corners around
+/// which it is taut, so it is a shortest path of the corners' visibility graph between the corners that its ends see.
 class Geodesics {
  public:
   /// Keeps a reference to the graph.
@@ -23,7 +23,9 @@ class Geodesics {
 
   [[nodiscard]] Site site(const MeshPoint& projection) const;
   [[nodiscard]] double metres(Point2 a, Point2 b) const { return graph_.scale() * length(b - a); }
-  [[nodiscard]] Leg leg(int corner, Point2 from) const { return {corner, metres(from, corners_.list[corner].at)}; }
+  [[nodiscard]] CornerDistance leg(int corner, Point2 from) const {
+    return {corner, metres(from, corners_.list[corner].at)};
+  }
 
   struct Way {
     double metres = 0;         // infinite if there is none
@@ -31,7 +33,7 @@ class Geodesics {
   };
   [[nodiscard]] Way way(const Site& start, const Site& end) const;
 
-  /// Row-major [n, n] metres between all pairs; symmetric, zero on the diagonal, infinite where there is no way.
+  /// Row-major [n, n] metres between all pairs; symmetric, zero on the diagonal, infinite where there is no path.
   void matrix(std::span<const Site> sites, std::span<double> metres) const;
 
  private:
@@ -40,7 +42,7 @@ class Geodesics {
   CornerGraph corner_graph_;
 };
 
-/// Distances to the nearest of fixed goals: what they see and the ways from there to all corners are computed once.
+/// Distances to the nearest of fixed goals: what they see and the paths from there to all corners are computed once.
 class GoalSearch {
  public:
   /// Keeps a reference to the geodesics.

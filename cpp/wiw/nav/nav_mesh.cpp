@@ -15,13 +15,13 @@
 
 namespace wiw::nav {
 
-const char* reason_text(Reason reason) {
+const char* reason_text(NoPathReason reason) {
   switch (reason) {
-    case Reason::kNone: return "";
-    case Reason::kStartOffMesh: return "start off mesh";
-    case Reason::kEndOffMesh: return "end off mesh";
-    case Reason::kOtherIsland: return "other island";
-    case Reason::kSearchLimit: return "search limit of 256 polygons or 2048 nodes";
+    case NoPathReason::kNone: return "";
+    case NoPathReason::kStartOffMesh: return "start off mesh";
+    case NoPathReason::kEndOffMesh: return "end off mesh";
+    case NoPathReason::kOtherIsland: return "other island";
+    case NoPathReason::kSearchLimit: return "search limit of 256 polygons or 2048 nodes";
   }
   return "";
 }
@@ -113,15 +113,16 @@ std::vector<Eigen::Vector3f> NavMesh::sample(std::size_t count, std::uint64_t se
 NavMesh::Ends NavMesh::project_ends(const Eigen::Vector3f& start, const Eigen::Vector3f& end) const {
   const auto from = mesh_.project(start);
   const auto to = mesh_.project(end);
-  if (!from) return {.reason = Reason::kStartOffMesh};
-  if (!to) return {.reason = Reason::kEndOffMesh};
+  if (!from) return {.reason = NoPathReason::kStartOffMesh};
+  if (!to) return {.reason = NoPathReason::kEndOffMesh};
   const bool connected = surface_.polygon_island[from->polygon] == surface_.polygon_island[to->polygon];
-  return {*from, *to, connected ? Reason::kNone : Reason::kOtherIsland};
+  return {*from, *to, connected ? NoPathReason::kNone : NoPathReason::kOtherIsland};
 }
 
 Eigen::Vector3f NavMesh::try_step(const Eigen::Vector3f& start, const Eigen::Vector3f& end, bool sliding) const {
   const Ends ends = project_ends(start, end);
-  return ends.reason == Reason::kNone ? walk(mesh_, graph_, surface_.polygon_island, ends.start, end, sliding) : start;
+  return ends.reason == NoPathReason::kNone ? walk(mesh_, graph_, surface_.polygon_island, ends.start, end, sliding)
+                                            : start;
 }
 
 const Geodesics& NavMesh::geodesics() const {
@@ -148,10 +149,10 @@ Path NavMesh::exact_path(const MeshPoint& start, const MeshPoint& end) const {
 Path NavMesh::shortest_path(const Eigen::Vector3f& start, const Eigen::Vector3f& end, Metric metric) const {
   constexpr double kInfinity = std::numeric_limits<double>::infinity();
   const Ends ends = project_ends(start, end);
-  if (ends.reason != Reason::kNone) return {.length = kInfinity, .reason = ends.reason};
+  if (ends.reason != NoPathReason::kNone) return {.length = kInfinity, .reason = ends.reason};
   if (metric == Metric::kExact) return exact_path(ends.start, ends.end);
   Path path{.points = detour_path(mesh_, ends.start, ends.end, metric == Metric::kDetour)};
-  if (path.points.empty()) return {.length = kInfinity, .reason = Reason::kSearchLimit};
+  if (path.points.empty()) return {.length = kInfinity, .reason = NoPathReason::kSearchLimit};
   path.length = polyline_length(path.points);
   return path;
 }

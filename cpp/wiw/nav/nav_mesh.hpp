@@ -17,27 +17,27 @@
 
 namespace wiw::nav {
 
-/// How the length of a way is measured.
+/// How the length of a path is measured.
 enum class Metric {
-  kExact,           // shortest way over the mesh, horizontal length
+  kExact,           // shortest path over the mesh, horizontal length
   kDetour,          // Habitat's answer, 3D length, with its limits of 256 polygons and 2048 nodes
   kDetourUncapped,  // the same search without those limits
 };
 
-/// Why there is no way.
-enum class Reason { kNone, kStartOffMesh, kEndOffMesh, kOtherIsland, kSearchLimit };
-const char* reason_text(Reason reason);
+/// Why there is no path.
+enum class NoPathReason { kNone, kStartOffMesh, kEndOffMesh, kOtherIsland, kSearchLimit };
+const char* reason_text(NoPathReason reason);
 
 struct Distance {
   double metres = 0;  // infinite unless reason is kNone
-  Reason reason = Reason::kNone;
+  NoPathReason reason = NoPathReason::kNone;
 };
 
-/// Bends of a way, start and end included; points lie on the mesh.
+/// The corners of a path, start and end included; points lie on the mesh.
 struct Path {
   std::vector<Eigen::Vector3f> points;
   double length = 0;  // metres, in the sense of the metric asked for
-  Reason reason = Reason::kNone;
+  NoPathReason reason = NoPathReason::kNone;
 };
 
 /// Where an agent can stand, for one body size. Immutable; const methods may be called from any thread.
@@ -76,7 +76,7 @@ class NavMesh {
                                            Metric metric = Metric::kExact) const;
   [[nodiscard]] Path shortest_path(const Eigen::Vector3f& start, const Eigen::Vector3f& end,
                                    Metric metric = Metric::kExact) const;
-  /// Row-major [n, n] metres between all pairs, infinite where there is no way. kExact is symmetric; the Detour
+  /// Row-major [n, n] metres between all pairs, infinite where there is no path. kExact is symmetric; the Detour
   /// metrics are asked once for each ordered pair.
   [[nodiscard]] std::vector<double> distance_matrix(std::span<const Eigen::Vector3f> points,
                                                     Metric metric = Metric::kExact) const;
@@ -92,7 +92,7 @@ class NavMesh {
  private:
   struct Ends {
     MeshPoint start, end;
-    Reason reason = Reason::kNone;
+    NoPathReason reason = NoPathReason::kNone;
   };
   NavMesh(std::vector<std::uint8_t> tile, const NavMeshSettings& settings);
   [[nodiscard]] Ends project_ends(const Eigen::Vector3f& start, const Eigen::Vector3f& end) const;

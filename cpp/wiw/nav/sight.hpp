@@ -16,13 +16,13 @@ struct Site {
   Point2 eye;  // for sight: strictly inside the polygon
 };
 
-/// Finds the corners that shortest ways from a point or corner can bend at first. One object a thread.
+/// Finds the corners at which shortest paths from a point or corner can bend first. One object a thread.
 class Sight {
  public:
   Sight(const PolygonGraph& graph, const Corners& corners)
       : graph_(graph), corners_(corners), expansion_(graph), stamp_(corners.list.size(), 0) {}
 
-  /// see(c) for every corner seen from `site` at which a way may bend; cone(c) for every cone of sight, so that the
+  /// see(c) for every corner seen from `site` at which a path may bend; cone(c) for every cone of sight, so that the
   /// caller can look for its own targets. Everything in the site's own polygon is seen without a cone.
   template <class See, class OnCone>
   void from_site(const Site& site, See&& see, OnCone&& on_cone) {

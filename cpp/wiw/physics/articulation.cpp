@@ -69,7 +69,7 @@ void Articulation::check_within_limits(const Eigen::VectorXd& positions, const c
   }
 }
 
-Eigen::VectorXd Articulation::coupled(Eigen::VectorXd positions) const {
+Eigen::VectorXd Articulation::apply_mimics(Eigen::VectorXd positions) const {
   for (const Joint& joint : joints_) {
     if (!joint.mimic) continue;
     const double wanted = joint.mimic->multiplier * positions[joint.mimic->index] + joint.mimic->offset;

@@ -30,7 +30,7 @@ struct Link {
   std::vector<Visual> visual;
 };
 
-/// A joint that goes where another one tells it: `multiplier` x its position + `offset`.
+/// A mimic joint, which follows another one: `multiplier` x its position + `offset`.
 struct Mimic {
   int index = 0;  // of the other, among the movable joints
   double multiplier = 1, offset = 0;
@@ -67,7 +67,7 @@ class Articulation {
   /// `folder` is where relative mesh files are looked for.
   static std::shared_ptr<const Articulation> parse(const std::string& urdf, const std::filesystem::path& folder = {});
 
-  /// Takes parts that are consistent; the readers see to that.
+  /// Expects consistent parts; the URDF readers check them.
   Articulation(std::string name, std::vector<Link> links, std::vector<Joint> joints, JointLimits limits);
 
   [[nodiscard]] const std::string& name() const { return name_; }
@@ -85,8 +85,8 @@ class Articulation {
   /// As check_positions, and within the limits up to 1e-6.
   void check_within_limits(const Eigen::VectorXd& positions, const char* what) const;
 
-  /// The same positions, but of joints that mimic, which get theirs from what they mimic, within their limits.
-  [[nodiscard]] Eigen::VectorXd coupled(Eigen::VectorXd positions) const;
+  /// The positions with those of mimic joints computed from the joints they mimic, within their limits.
+  [[nodiscard]] Eigen::VectorXd apply_mimics(Eigen::VectorXd positions) const;
 
   /// T_base_link of every link.
   [[nodiscard]] std::vector<Pose> forward_kinematics(const Eigen::VectorXd& positions) const;

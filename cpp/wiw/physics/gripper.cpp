@@ -35,7 +35,7 @@ Gripper::Gripper(World& world, int articulation, const GripperNames& names, doub
 std::optional<int> Gripper::close(int steps) {
   move(0, steps);
   if (const auto body = held()) return body;
-  const auto body = between();
+  const auto body = find_body_between_fingers();
   if (body) world_.attach(articulation_, hand_, *body);
   return body;
 }
@@ -85,7 +85,7 @@ std::optional<int> Gripper::held() const {
   return std::nullopt;
 }
 
-std::optional<int> Gripper::between() {
+std::optional<int> Gripper::find_body_between_fingers() {
   std::array<std::set<int>, 2> touched;
   for (const Contact& contact : world_.contacts(kTouching)) {
     for (const auto& [ours, theirs] : {std::pair(contact.a, contact.b), std::pair(contact.b, contact.a)}) {

@@ -29,11 +29,11 @@ class Gripper {
   /// Lets go and opens to `amount` of the way (in [0, 1]) until the fingers stand still, at most `steps`.
   void open(double amount = 1, int steps = 480);
 
-  /// Of the way from closed to open, in [0, 1].
+  /// Opening of the gripper, from 0 (closed) to 1 (open).
   [[nodiscard]] double opening() const;
   [[nodiscard]] std::optional<int> held() const;
   /// The dynamic body that both fingers touch.
-  [[nodiscard]] std::optional<int> between();
+  [[nodiscard]] std::optional<int> find_body_between_fingers();
 
  private:
   void move(double amount, int steps);

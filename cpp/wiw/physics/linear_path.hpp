@@ -20,14 +20,14 @@ struct LinearPathOptions {
 enum class PathReason { kFree, kOutOfReach, kJointLimits, kNotConverged, kJump, kCollision };
 const char* reason_text(PathReason reason);
 
-/// A straight way of a link, position and rotation interpolated together. Waypoint 0 is the start.
+/// A straight path of a link, position and rotation interpolated together. Waypoint 0 is the start.
 struct LinearPath {
   PathReason reason = PathReason::kFree;
   std::vector<Eigen::VectorXd> joints;  // of the waypoints that are reached without a collision
   std::vector<int> moved;               // joints of the chain; the others stay where they are
   int waypoints = 0;                    // of the whole way
   std::optional<Contact> contact;       // what is touched first
-  /// Share of the way that is free, in [0, 1].
+  /// Free share of the path, in [0, 1].
   [[nodiscard]] double free() const;
 };
 

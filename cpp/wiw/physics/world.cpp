@@ -74,7 +74,7 @@ struct World::Impl {
   }
   int build(const std::shared_ptr<const ArmModel>& model, const Pose& base) {
     arms.push_back(std::make_unique<Arm>(model, base, simulation.world()));
-    arms.back()->number(static_cast<int>(arms.size()) - 1);
+    arms.back()->set_index(static_cast<int>(arms.size()) - 1);
     built.emplace_back(std::pair(model, base));
     return static_cast<int>(arms.size()) - 1;
   }
@@ -264,10 +264,10 @@ std::vector<Pose> World::simulated_link_poses(int articulation) const {
 void World::set_joint_positions(int articulation, const Eigen::VectorXd& positions) {
   Arm& arm = impl_->arm(articulation);
   arm.articulation().check_within_limits(positions, "positions");
-  const Eigen::VectorXd coupled = arm.articulation().coupled(positions);
-  arm.set_positions(coupled);
-  arm.set_velocities(Eigen::VectorXd::Zero(coupled.size()));
-  arm.set_targets(coupled);
+  const Eigen::VectorXd clamped = arm.articulation().apply_mimics(positions);
+  arm.set_positions(clamped);
+  arm.set_velocities(Eigen::VectorXd::Zero(clamped.size()));
+  arm.set_targets(clamped);
 }
 
 void World::set_joint_velocities(int articulation, const Eigen::VectorXd& velocities) {
@@ -279,7 +279,7 @@ void World::set_joint_velocities(int articulation, const Eigen::VectorXd& veloci
 void World::set_joint_targets(int articulation, const Eigen::VectorXd& targets) {
   Arm& arm = impl_->arm(articulation);
   arm.articulation().check_within_limits(targets, "targets");
-  arm.set_targets(arm.articulation().coupled(targets));
+  arm.set_targets(arm.articulation().apply_mimics(targets));
 }
 
 void World::set_joint_forces(int articulation, const Eigen::VectorXd& forces) {

@@ -60,7 +60,7 @@ struct WorldState {
   std::vector<int> layout;  // of the world: how many bodies, then joints and links of each articulation
 };
 
-/// What an arm may touch on its way.
+/// What an arm may touch along its path.
 struct Touchable {
   std::vector<int> bodies, articulations;
 };

@@ -12,7 +12,7 @@ enum class Leading {
   kAny,            // up to the first forward
 };
 
-/// What the planner has to know about a world model.
+/// Properties of a world model that the planner needs.
 struct ModelSpec {
   bool causal = false;  // frame k depends on actions 1..k only
   int frames = 0;       // length of a rollout, the observation included; 0: any

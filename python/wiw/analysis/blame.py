@@ -23,7 +23,7 @@ from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
 from wiw.experiments.ground_truth import STAGES
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.metrics.metric import SUCCESS
 from wiw.runs.rows import to_json
 from wiw.runs.store import RunStore
@@ -146,7 +146,7 @@ class Blame:
     def save(self) -> Path:
         """Write blame.json into the run's folder and return its path."""
         path = self.run / "blame.json"
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             draft.write_text(self.to_json(), encoding="utf-8")
         return path
 
@@ -222,7 +222,7 @@ def list_failures(run: RunStore, arm: str) -> list[int]:
 
 
 def list_reruns(run: RunStore, arm: str) -> list[str]:
-    """Return the reruns that change something of an arm: the oracle's futures are the ground truth already."""
+    """Return the reruns that make a difference for an arm: the oracle's rollouts are the ground truth already."""
     agent = next(one["agent"] for one in run.config["arms"] if one["name"] == arm)
     exact = agent.get("model") == "oracle" and "placebo" not in agent
     return [rerun for rerun in RERUNS if not (exact and rerun == "imagination")]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Costs: what each arm asked of its world model, how long it took, and the cost of a success."""
+"""Costs: each arm's requests to its world model, its wall time, and the cost per success."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Costs:
 
     @property
     def all_seconds(self) -> float:
-        """Wall time of all stages except replays, which only measure."""
+        """Wall time of all stages except replays, which only serve measurement."""
         return sum(seconds for stage, seconds in self.seconds.items() if stage != "replay")
 
     def per_success(self, total: float) -> float:

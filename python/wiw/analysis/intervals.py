@@ -62,7 +62,7 @@ def agresti_min(differences: ArrayLike, confidence: float = 0.95) -> Interval:
 
 
 def clustered_t(values: ArrayLike, clusters: ArrayLike, kind: Kind, confidence: float = 0.95) -> Interval:
-    """Return the interval of the pooled mean when whole clusters are drawn: Student's t over clusters.
+    """Return the interval of the pooled mean with clusters as the sampling unit: Student's t over clusters.
 
     Args:
         values: float [n], one an episode.
@@ -115,7 +115,7 @@ def t_of_sums(
 def stabilise_mean(
     sums: NDArray[np.float64], squares: ArrayLike, counts: NDArray[np.float64], kind: Kind
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the mean and its variance by clusters, over the episodes and the made-up ones; see `t_of_sums`."""
+    """Return the mean and its variance by clusters, over the episodes and the pseudo-episodes; see `t_of_sums`."""
     n, total = counts.sum(), sums.sum(-1)
     mean, variance = total / n, jackknife_covariance(sums, sums, counts)
     if kind == "length":
@@ -163,7 +163,7 @@ def clustered_bootstrap(
     seed: int = 0,
     method: str = "bca",
 ) -> Interval:
-    """Return the interval of the pooled mean when whole clusters are drawn with replacement.
+    """Return the interval of the pooled mean from resampling whole clusters with replacement.
 
     Args:
         values: float [n], one an episode.

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from wiw.analysis.intervals import t_of_sums
-from wiw.analysis.simulate import draw, total
+from wiw.analysis.simulate import draw_outcome_counts, sum_by_scene
 from wiw.errors import ArgumentError
 
 BASE, LOSSES, CORRELATION, PER_SCENE = 20.0, 2.0, 0.05, 5
@@ -25,7 +25,7 @@ _DRAWS = 2_000_000
 
 @dataclass(frozen=True)
 class Power:
-    """The answer of `wiw.power`; shows itself as a sentence or two."""
+    """The result of `wiw.power`; its string form is a sentence or two."""
 
     difference: float
     """Points of success rate between two arms that the run shows."""
@@ -48,7 +48,7 @@ class Power:
 
     @property
     def episodes(self) -> int:
-        """Needed, of each arm."""
+        """Number of episodes needed per arm."""
         return self.scenes * self.per_scene
 
     @property
@@ -126,7 +126,7 @@ def power(
 
 @dataclass(frozen=True)
 class _Plan:
-    """The fixed inputs while the number of scenes, or the difference, is searched for."""
+    """The fixed inputs of the search for the number of scenes, or for the difference."""
 
     losses: float
     correlation: float
@@ -201,8 +201,8 @@ def simulate_power(
 ) -> tuple[float, float]:
     """Return the shares of simulated runs whose interval, and whose McNemar test, show which arm is better."""
     runs = max(400, min(8000, _DRAWS // scenes))
-    counts = draw([won, lost, 1 - won - lost], scenes, per_scene, correlation, runs, rng)
-    sums, squares = total(counts, [1, -1, 0])
+    counts = draw_outcome_counts([won, lost, 1 - won - lost], scenes, per_scene, correlation, runs, rng)
+    sums, squares = sum_by_scene(counts, [1, -1, 0])
     low, _ = t_of_sums(sums, squares, np.full(scenes, float(per_scene)), "difference", confidence)
     wins, losses, _ = counts.sum(1).T
     p_values = np.minimum(1.0, 2 * stats.binom.cdf(np.minimum(wins, losses), wins + losses, 0.5))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Made-up runs, whose truth is known: to plan real ones, and to measure what intervals are worth."""
+"""Simulated runs with known success rates: to plan real runs, and to measure the coverage of intervals."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
-def draw(
+def draw_outcome_counts(
     shares: ArrayLike, scenes: int, per_scene: int, correlation: float, runs: int, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Draw the number of episodes per scene and outcome, int64 [runs, scenes, ways].
@@ -31,7 +31,7 @@ def draw(
     return np.asarray(rng.multinomial(per_scene, local), np.int64)
 
 
-def total(counts: NDArray[np.int64], values: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def sum_by_scene(counts: NDArray[np.int64], values: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return sums by scene, [runs, scenes], and sums of squares, [runs], of each outcome's value."""
     worth = np.asarray(values, np.float64)
     return counts @ worth, (counts @ worth**2).sum(-1)

@@ -113,7 +113,7 @@ class Summary:
         return ()
 
     def utility(self, arm: str) -> Utility:
-        """Return an arm's share of the way from floor to ceiling."""
+        """Return an arm's utility: its share of the gain from floor to ceiling."""
         for found in self.utilities:
             if found.arm == arm:
                 return found
@@ -123,7 +123,7 @@ class Summary:
 
     @property
     def invalid(self) -> tuple[str, ...]:
-        """Why the run must not be reported, a sentence per arm; empty for a valid run."""
+        """Reasons why the run must not be reported, a sentence per arm; empty for a valid run."""
         return tuple(
             f"{line.errors} of {line.total} episodes of {line.name} ended with an infrastructure error "
             f"({100 * line.errors / line.total:.1f} %, more than {100 * MAX_ERROR_SHARE:g} %)."
@@ -263,7 +263,7 @@ def load_metrics() -> tuple[Metric, ...]:
 
 @cache
 def _load_metrics_on(path: tuple[str, ...]) -> tuple[Metric, ...]:
-    """Look for packages once per state of `sys.path`: that takes longer than all the numbers of a run."""
+    """Load metrics once per state of `sys.path`: the search for packages takes longer than a whole summary."""
     found = []
     for name in METRICS.names():
         try:

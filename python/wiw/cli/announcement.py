@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run is about to do, in four lines, before anything heavy is loaded."""
+"""Announce a run in four lines, before anything heavy is loaded."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the command line to a command, and from what goes wrong to one clean message and an exit code."""
+"""Dispatch the command line to a command, and turn errors into one clean message and an exit code."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
-from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, terminable
+from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
@@ -50,29 +50,29 @@ on a task, for one world model or several on the same episodes, and measures how
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
-Exit codes: 0 done, 1 the run is invalid (verify: it differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by SIGTERM,
-within 5 seconds; after both of these everything recorded is kept and `wiw resume` goes on."""
+Exit codes: 0 done, 1 the run is invalid (verify: something differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by
+SIGTERM, within 5 seconds. A stopped run keeps everything recorded; `wiw resume` continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
-    (list_names, "list", "World models, policies, trackers, tasks, presets and metrics by name."),
+    (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
-    (resume, "resume", "Go on with a run that was stopped."),
+    (resume, "resume", "Resume a run that was stopped."),
     (blame, "blame", "Find the stage of the loop that causes a run's failures."),
     (compare, "compare", "Compare two runs on the same episodes."),
-    (power, "power", "How many episodes a run needs to show a difference."),
+    (power, "power", "Compute how many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),
-    (report, "report", "Table and HTML report of a run."),
-    (export, "export", "A run as CSV or Parquet tables, or as a Rerun recording."),
-    (verify, "verify", "Run some episodes of a run again, and compare."),
-    (view, "view", "Pages to walk through a run, to every decision."),
-    (check_model, "check-model", "Whether a world model keeps its contract, in plain words."),
+    (report, "report", "Print the tables of a run and write its HTML report."),
+    (export, "export", "Export a run as CSV or Parquet tables, or as a Rerun recording."),
+    (verify, "verify", "Rerun some episodes of a run and compare them with the record."),
+    (view, "view", "Write HTML pages to browse a run, decision by decision."),
+    (check_model, "check-model", "Check a world model against its contract."),
     (serve, "serve", "Serve a world model to other processes or machines."),
-    (doctor, "doctor", "What this machine can do, and what to mend."),
-    (scenes, "scenes", "Look at scenes: pictures and figures."),
-    (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
-    (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
-    (collect, "collect", "Collect demonstrations of manipulation tasks, to learn from."),
+    (doctor, "doctor", "Check this machine, with a remedy for what is missing."),
+    (scenes, "scenes", "Draw scenes and print their sizes."),
+    (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
+    (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
+    (collect, "collect", "Collect demonstrations of manipulation tasks as training data."),
     (train, "train", "Train a network: recogniser, warpnet, armnet or diffuser."),
 )
 
@@ -111,7 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"wiw {wiw.__version__}")
         return 0
     try:
-        with terminable():
+        with raise_on_sigterm():
             return _dispatch(given) or 0
     except Error as error:
         if debug:

@@ -28,27 +28,27 @@ def collect(
     backend: Literal["auto", "cpu", "gpu"] = "auto",
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
-    """Collect demonstrations of the manipulation tasks, for networks to learn from: Parquet files.
+    """Collect demonstrations of the manipulation tasks as training data, in Parquet files.
 
     $ wiw collect manipulation --out demos --workers 4
     $ wiw collect manipulation --tasks push_buttons,stack_cups --episodes 20 --size 128 --frames 60 --depth --out few
 
-    Experts who know where things are play each task; only what succeeds is kept. A row is a frame: the front view,
-    where the gripper is and where it is told to go. `docs/demonstrations.md` names the columns,
-    `wiw.datasets.demonstrations.Demonstrations` reads them. Tables are never those of an evaluation. The same command
-    again goes on where one was stopped.
+    Scripted experts that know all object poses perform each task; only successes are kept. A row is a frame: the front
+    view, the gripper's pose and its commanded pose. `docs/demonstrations.md` names the columns, and
+    `wiw.datasets.demonstrations.Demonstrations` reads them. The tables are never those of an evaluation. To resume an
+    interrupted collection, repeat the command.
 
     Args:
         what: manipulation.
-        out: Folder that is new, or was begun by the same command.
+        out: New folder, or one that the same command began.
         tasks: all, or push_buttons, slide_block, insert_peg, stack_cups with commas between them.
-        episodes: Demonstrations of each task.
-        seed: The demonstrations are a function of it.
-        size: Pixels of a side of the front view.
-        frames: Of each demonstration, evenly spread over its time.
-        format: Of the pictures: jpeg of quality 95, or png without loss.
-        depth: Writes the front view's depth too.
-        keep_failed: Keeps demonstrations that fail, too; else another table takes the place of theirs.
+        episodes: Demonstrations per task.
+        seed: Seed; it determines the demonstrations.
+        size: Side of the square front view in pixels.
+        frames: Frames per demonstration, evenly spaced in time.
+        format: Image format: jpeg of quality 95, or lossless png.
+        depth: Whether to write the front view's depth too.
+        keep_failed: Whether to keep failed demonstrations, too; otherwise another table replaces theirs.
         backend: Renderer; pictures differ a little between them.
         workers: Processes; the files are the same for any number of them.
     """

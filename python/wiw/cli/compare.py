@@ -19,15 +19,15 @@ def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -
       $ wiw compare runs/old /elsewhere/new --arm warp         # one
       $ wiw compare runs/a runs/b --arm warp --other mine      # mine of the second run minus warp of the first
 
-    Every episode of the one meets the same episode of the other, so runs of another task, seed, scenes or episodes are
-    refused: the message names the first field in which they differ. What else differs, such as the policy's weights or
-    the version of wiw, is told below the table.
+    Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes; otherwise the
+    message names the first field that differs. Other differences, such as the policy's weights or the version of wiw,
+    are listed below the table.
 
     Args:
-        first: Folder of a run, wherever it lies.
+        first: Folder of a run.
         second: Folder of the run that is compared with it.
-        arm: Of both runs, or of the first; all that both have if not given.
-        other: Of the second run, if it has another name there.
+        arm: Arm of both runs, or of the first; all common arms if not given.
+        other: Arm of the second run, if it has another name there.
     """
     from wiw.report.tables import print_summary
     from wiw.studies.compare import compare as compare_runs

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import shutil
+import textwrap
 import time
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -45,13 +47,14 @@ PARTS = (
         "scripted",
         ("none", "copy", "oracle"),
         4,
-        "A robot arm pushes buttons in the order that it is told: 4 episodes",
+        "A robot arm pushes buttons in a given order: 4 episodes",
         "wiw run manipulation --arms none,copy,armnet,oracle",
         {"tasks": "push_buttons"},
     ),
 )
 
 
+READY = "A report of 100 episodes, ready to read, is docs/report-imagenav.html in the source tree."
 WORKERS = 2
 """Processes that share the arms of a part."""
 
@@ -71,10 +74,19 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     begin = time.perf_counter()
     folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
     codes = [_run(part, folder / part.task) for part in PARTS]
-    print(f"\ntook    {time.perf_counter() - begin:.0f} s. More episodes say more:")
+    print(f"\ntook    {time.perf_counter() - begin:.0f} s\n")
+    _print_wrapped(f"Open these pages in a browser. {READY}")
+    for part in PARTS:
+        print(f"        {folder / part.task / 'report.html'}")
+    print("\nMore episodes say more:")
     for part in PARTS:
         print(f"        {part.more}")
     return max(codes)
+
+
+def _print_wrapped(text: str) -> None:
+    """Print a text on lines as wide as the terminal, broken between words."""
+    print(textwrap.fill(text, shutil.get_terminal_size().columns - 1, break_on_hyphens=False, break_long_words=False))
 
 
 def _run(part: Part, folder: Path) -> int:
@@ -85,13 +97,15 @@ def _run(part: Part, folder: Path) -> int:
     from wiw.studies.evaluate import evaluate
 
     arms = _arms(part.arms)
-    print(f"\n{part.about}, {len(arms)} world models.\n")
+    print()
+    _print_wrapped(f"{part.about}, {len(arms)} world models.")
+    print()
     task, agent = TaskRecipe(part.task, part.options), AgentRecipe(part.policy)
 
     def work() -> Any:
         return evaluate(task, agent, part.episodes, out=folder, workers=WORKERS, arms=arms, live=part.episodes)
 
-    return finish(stoppable(work, folder), report=True)
+    return finish(stoppable(work, folder), report=True, remark=f"This is a demonstration with few episodes. {READY}")
 
 
 def _arms(names: tuple[str, ...]) -> list[str]:

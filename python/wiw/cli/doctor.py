@@ -24,7 +24,7 @@ class Finding:
 
 
 def doctor() -> int:
-    """Say what this machine can do, line by line, with a remedy where something is missing.
+    """Report what this machine can do, line by line, with a remedy where something is missing.
 
     $ wiw doctor
     """
@@ -115,7 +115,7 @@ def _rendering() -> Iterator[Finding]:
 
 
 def _torch() -> Finding:
-    """Return whether torch is there, without importing it: that takes seconds."""
+    """Return whether torch is installed, without importing it, which takes seconds."""
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed; only learned world models need it (pip install 'wiw[torch]')")
     return Finding("torch", _version("torch") or "of unknown version")

@@ -31,20 +31,20 @@ def episodes(
     $ wiw run imagenav --episode-file house.json --world-model warp
     $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
 
-    Scenes that lie below the file's folder are named relative to it, so that the folder may be moved or shared.
+    Scenes inside the file's folder are named by relative paths, so that the folder can be moved or shared.
 
     Args:
         task: See `wiw list`.
         out: JSON; gzipped if the name ends in .gz.
         scenes: apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world;
             apartments:val if not given.
-        episodes: How many.
-        per_scene: Episodes in a scene before the next one's turn; the task's own number if not given.
-        seed: The episodes are a function of it and the scenes.
-        backend: Renderer, which sees to it that goals are out of sight; auto if not given.
+        episodes: Number of episodes.
+        per_scene: Episodes per scene; the task's own number if not given.
+        seed: Seed; with the scenes, it determines the episodes.
+        backend: Renderer, for checking that goals are out of sight; auto if not given.
         task_option: Another option of the task, such as categories=bed,sofa or, for scans, goal_instances=1; may be
             given again.
-        overwrite: Whether to replace a file that is there.
+        overwrite: Whether to replace an existing file.
     """
     from wiw.datasets.episodes import save
     from wiw.errors import ArgumentError, FileError

@@ -14,7 +14,7 @@ What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets"
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List what can be named: world models, policies, trackers, tasks, presets, metrics and VLMs.
+    """List everything with a name: world models, policies, trackers, tasks, presets, metrics and VLMs.
 
     $ wiw list
     $ wiw list world-models
@@ -24,7 +24,7 @@ def list_names(what: Positional[What] = "all", /) -> int:
     that is shown beside a heading.
 
     Args:
-        what: one kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
+        what: Kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
             machine.
     """
     from rich.console import Console
@@ -88,7 +88,7 @@ def _add_vlm_models(table: Any) -> None:
 
 
 def _first_line(registry: Any, name: str) -> str:
-    """Return the first line of a thing's description, or why it cannot be loaded."""
+    """Return the first line of an entry's description, or why it cannot be loaded."""
     try:
         thing = registry.find(name)
         text = str(getattr(thing, "about", "") or inspect.getdoc(thing) or "")

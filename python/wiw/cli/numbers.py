@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers on the command line: what is no number is refused in plain words."""
+"""Parse numbers on the command line, with plain messages for anything that is not a number."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NOUNS = {int: "a whole number", float: "a number"}
 
 
 def make_registry() -> ConstructorRegistry:
-    """Return how the commands read `int`, `float`, and these or None."""
+    """Return the coercion rules of the commands for `int`, `float`, and their optional forms."""
     registry = ConstructorRegistry()
     registry.primitive_rule(_read_number)
     return registry

@@ -16,7 +16,7 @@ Options = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="KEY=VALUE")]
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """Return what `--world-model-option` gives a world model.
+    """Return the options of a world model from `--world-model-option`.
 
     Raises:
         ArgumentError: options without a model to take them.
@@ -43,7 +43,7 @@ def policy_options(
 
 
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:
-    """Return what `--semantics-option` gives a source of semantics.
+    """Return the options of a source of semantics from `--semantics-option`.
 
     Raises:
         ArgumentError: options without a source to take them.

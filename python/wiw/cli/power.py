@@ -28,7 +28,7 @@ def power(
     chance: Number = 0.8,
     arms: Count = 1,
 ) -> int:
-    """How many episodes a run needs to show that one arm succeeds more often than another, or what it can show.
+    """Compute how many episodes a run needs to show that one arm succeeds more often than another, or what it can show.
 
       $ wiw power                        # for differences from 5 to 30 points
       $ wiw power 10                     # +10 points, e.g. from 20 to 30 %
@@ -36,8 +36,8 @@ def power(
       $ wiw power -5 --base 50         # an arm that is 5 points worse
       $ wiw power --scenes 40            # the least difference that 40 scenes of 5 episodes can show
 
-    Two arms of a run meet on the same episodes, so only those count in which one succeeds and the other does not: won
-    or lost. 30 % won and 20 % lost are as many points as 12 % won and 2 % lost, and far weaker evidence, so --losses
+    Arms are compared on the same episodes, so only episodes count in which one succeeds and the other fails: won or
+    lost. 30 % won and 20 % lost give the same difference as 12 % won and 2 % lost, but far weaker evidence, so --losses
     matters as much as the difference. Scenes count more than episodes: with a correlation above 0, more episodes of
     the same scenes soon stop helping.
 
@@ -45,14 +45,14 @@ def power(
     oracle 36 % won and 2 % lost; differences correlate within an apartment by -0.06 to 0.06.
 
     Args:
-        difference: In points of success rate; a table of usual ones if neither it nor --scenes is given.
-        scenes: Of the run; asks for the least difference that it can show.
+        difference: Percentage points of success rate; a table of usual values if neither it nor --scenes is given.
+        scenes: Number of scenes; computes the smallest difference that they can show.
         base: Success rate of the arm compared with, percent.
         losses: Percent of episodes that the better arm loses.
-        correlation: Between the differences of two episodes of a scene.
+        correlation: Correlation between the differences of two episodes of a scene.
         per_scene: Episodes in each scene.
-        chance: Of showing the difference if there is one.
-        arms: Compared with the same base, whose p values Holm adjusts.
+        chance: Power: the probability of showing the difference if there is one.
+        arms: Number of arms compared with the same base; their p values are Holm-adjusted.
     """
     from wiw.analysis.power import power as plan
 

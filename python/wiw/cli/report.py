@@ -14,17 +14,22 @@ def report(
     /,
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
+    episodes: Annotated[int | None, arg(metavar="N")] = None,
+    max_mb: Annotated[float | None, arg(metavar="N")] = None,
 ) -> int:
     """Print the tables of a run and write its HTML report: one self-contained file.
 
     $ wiw report runs/first
-    $ wiw report runs/first --out first.html
+    $ wiw report runs/first --out first.html --max-mb 1
 
     Also works during the run.
 
     Args:
         run: The run's folder.
         out: Where to write; report.html in the run's folder if not given.
+        episodes: How many to show with pictures, the most telling first; all that kept them (see `wiw run
+            --keep-images`) if not given.
+        max_mb: Most megabytes of the file: pictures are made smaller, then episodes left out, until it fits.
     """
     from wiw.report.tables import print_costs, print_fidelity
     from wiw.studies.run_log import load_run
@@ -33,5 +38,5 @@ def report(
     log.summary()
     print_costs(log)
     print_fidelity(log)
-    print(f"\nreport  {log.report(out)}")
+    print(f"\nreport  {log.report(out, episodes=episodes, max_mb=max_mb)}")
     return 0

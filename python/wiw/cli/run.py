@@ -44,7 +44,7 @@ def run(
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
 
-    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` goes on with it.
+    Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
     Args:
         task: See `wiw list`.
@@ -103,8 +103,8 @@ def resume(
     return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors, **changes), run), report)
 
 
-def finish(log: Any, report: bool) -> int:
-    """Print tables and errors, write the report; return 1 if the run is invalid."""
+def finish(log: Any, report: bool, remark: str = "") -> int:
+    """Print tables and errors, write the report, with a remark; return 1 if the run is invalid."""
     from wiw.report.tables import print_fidelity
 
     numbers = log.summary()
@@ -121,7 +121,7 @@ def finish(log: Any, report: bool) -> int:
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
     if report:
-        print(f"report  {log.report()}")
+        print(f"report  {log.report(remark=remark)}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0
 

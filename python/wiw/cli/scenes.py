@@ -17,7 +17,7 @@ def scenes(
     views: Annotated[int, arg(metavar="N")] = 2,
     backend: Literal["auto", "cpu", "gpu"] = "auto",
 ) -> int:
-    """Load scenes, say how large they are, and draw a sheet: each from above, and panoramas from inside.
+    """Load scenes, print their sizes, and draw a contact sheet: each scene from above, and panoramas from inside.
 
     $ wiw scenes apartments:val:4
     $ wiw scenes house.glb --out house.png
@@ -26,14 +26,14 @@ def scenes(
         spec: apartments:train|val|test[[:FIRST]:END], one with edits (apartments:val/3?state:floor_lamp_1=off), a mesh
             (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
         out: Where to write the sheet, a PNG.
-        views: Panoramas of each scene.
+        views: Panoramas per scene.
         backend: Renderer.
     """
     from PIL import Image
     from rich.console import Console
     from rich.table import Table
 
-    from wiw.files import whole_file
+    from wiw.files import atomic_file
     from wiw.scenes import resolve
     from wiw.viz.contact_sheet import contact_sheet
 
@@ -41,18 +41,19 @@ def scenes(
     if len(names) > LIMIT:
         print(f"{spec} names {len(names)} scenes; showing the first {LIMIT}")
         names = names[:LIMIT]
-    table = Table(box=None, pad_edge=False)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in ("scene", "size m", "triangles", "objects", "kinds", "rooms", "walk m2", "islands"):
-        table.add_column(
-            column, justify="left" if column == "scene" else "right", no_wrap=column in ("scene", "size m")
-        )
+        if column == "scene":
+            table.add_column(column, overflow="fold")
+        else:
+            table.add_column(column, justify="right", no_wrap=True, min_width=len(column))
     rows = []
     for name in names:
         place = _load(name, backend)
         table.add_row(*_facts(place))
         rows.append(place)
     Console().print(table)
-    with whole_file(out) as draft:
+    with atomic_file(out) as draft:
         kind = Image.registered_extensions().get(out.suffix.lower(), "PNG")
         contact_sheet(rows, views, backend).save(draft, format=kind)
     print(f"\nsheet  {out}")

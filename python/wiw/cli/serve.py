@@ -40,22 +40,22 @@ def serve(
     $ WIW_TOKEN=secret wiw serve my_model.py:MyModel --host 0.0.0.0
     $ WIW_TOKEN=secret wiw run imagenav --world-model remote:ws://gpu-machine:8765
 
-    Rows of all episodes of all clients become full batches of the model. A client whose server is killed waits until
-    it is back, as long as its deadline allows, and asks again what was not answered. SIGTERM or Ctrl-C finishes what
-    was taken and ends; a second one ends at once. `wiw check-model MODEL` tells beforehand whether the model keeps its
+    The server batches the rows of all episodes of all clients. If it is killed, clients wait for it to come back, as
+    long as their deadlines allow, and repeat unanswered requests. On SIGTERM or Ctrl-C it finishes the accepted rows
+    and ends; a second signal ends it at once. Run `wiw check-model MODEL` first to see whether the model keeps its
     contract; docs/serving.md has the protocol.
 
     Args:
         model: Name, path.py:Class or package.module:Class. See `wiw list`.
         world_model_option: An option of the model, such as weights=FOLDER or steps=30; may be given again.
-        host: Address to listen at; any but this machine's own asks for a token.
-        port: 0 takes a free one.
-        token: What clients must show; WIW_TOKEN if not given, which other users of the machine cannot see.
-        queue: Rows that may wait before clients are told to; eight full batches, and at least 64, if not given.
-        window: Share of a batch's time for which one that is not full waits for clients that are idle.
+        host: Address to listen on; any but the loopback address requires a token.
+        port: Port to listen on; 0 picks a free one.
+        token: Secret that clients must send; WIW_TOKEN if not given, which other users of the machine cannot see.
+        queue: Rows that may wait before clients are asked to retry; eight full batches, and at least 64, if not given.
+        window: How long a batch that is not full waits for idle clients, as a share of a batch's time.
         certificate: PEM file, for wss.
         key: PEM file of the certificate's key, if it is not in the same file.
-        grace: Most seconds for finishing what was taken.
+        grace: Time limit in seconds for finishing the accepted rows.
     """
     from wiw.registry import world_model
     from wiw.serving.server import Server, Settings
@@ -67,7 +67,7 @@ def serve(
 
 
 async def _live(server: Any, name: str) -> None:
-    """Serve until a signal comes, and say how it goes."""
+    """Serve until a signal arrives, and print status lines."""
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
     serving = asyncio.ensure_future(server.run(ready.set))

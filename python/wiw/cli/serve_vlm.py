@@ -14,7 +14,7 @@ def serve_vlm(
     port: Annotated[int, arg(metavar="N")] = 8000,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Serve a vision-language model to this machine, in the way of OpenAI and vLLM, for tests and trials.
+    """Serve a vision-language model on this machine, with the API of OpenAI and vLLM, for tests.
 
       $ wiw serve-vlm
       $ wiw serve-vlm --model my_script.py:answer --port 8001
@@ -22,10 +22,10 @@ def serve_vlm(
     Then, in another terminal:  wiw run ar --policy vlm --vlm http://localhost:8000/v1
 
     Args:
-        model: tiny, a model of random weights made on the spot; mock, which draws its answers; a folder or hub name for
-            transformers; or a function that is given each call and returns text or a probability for each first token.
-        port: On 127.0.0.1; 0 takes a free one.
-        seed: Of the random weights.
+        model: tiny, a model with random weights, built on the spot; mock, with random answers; a folder or hub name for
+            transformers; or a function that takes each call and returns text, or a probability for each first token.
+        port: Port on 127.0.0.1; 0 picks a free one.
+        seed: Seed of the random weights.
     """
     import tempfile
 

@@ -42,10 +42,10 @@ def end_process(code: int) -> NoReturn:
 
 
 @contextmanager
-def terminable() -> Iterator[None]:
+def raise_on_sigterm() -> Iterator[None]:
     """Raise `Terminated` at the first SIGTERM; end the process where the work does not get to it, as inside a model.
 
-    Python runs signal handlers between two of its own instructions, so a thread, told through a pipe, watches over it.
+    Python runs signal handlers only between its own instructions, so a thread, notified by a pipe, enforces the end.
     """
     watch, tell = os.pipe()
     os.set_blocking(tell, False)
@@ -84,7 +84,7 @@ def _guard(watch: int, done: threading.Event) -> None:
 
 
 def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") -> Any:
-    """Does the work on a run; when it is stopped, says which command goes on with it."""
+    """Run `work` on a run's folder; if it is stopped, print the command that resumes it."""
     from wiw.runs.store import store_path
 
     try:
@@ -97,9 +97,9 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
 
 @contextmanager
 def announce_resume() -> Iterator[None]:
-    """Run work that keeps what it has finished; when it is stopped, say that the same command goes on with it."""
+    """Run work that keeps finished parts; if it is stopped, print that the same command resumes it."""
     try:
         yield
     except (KeyboardInterrupt, Terminated):
-        print("\nstopped. The same command goes on with what is kept", file=sys.stderr)
+        print("\nstopped. Repeat the command to resume; finished parts are kept", file=sys.stderr)
         raise

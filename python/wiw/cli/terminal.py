@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Text from elsewhere (servers, files, models) on the user's terminal."""
+"""Make untrusted text (from servers, files, models) safe to print on the user's terminal."""
 
 from __future__ import annotations
 
@@ -14,5 +14,5 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 
 
 def printable(text: object) -> str:
-    """Return a text without escape sequences and control characters, so that it can only be read."""
+    """Return a text without escape sequences and control characters."""
     return _CONTROLS.sub("", _ESCAPES.sub("", str(text)))

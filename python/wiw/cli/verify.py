@@ -16,17 +16,17 @@ def verify(
     episodes: Annotated[int, arg(metavar="K")] = 3,
     seed: Annotated[int, arg(metavar="N")] = 0,
 ) -> int:
-    """Run some episodes of a run again, in all its arms, and compare what is decided and measured with the record.
+    """Rerun some episodes of a run, in all its arms, and compare every decision and measurement with the record.
 
     $ wiw verify runs/first
     $ wiw verify runs/first --episodes 10 --seed 1
 
-    Says which decision differs first, and in what. Exit code 0 if nothing does, 1 otherwise.
+    Names the first decision that differs, and how. Exit code 0 if nothing differs, 1 otherwise.
 
     Args:
         run: The run's folder.
-        episodes: How many, drawn at random; all if the run has fewer.
-        seed: Of that draw.
+        episodes: Number of episodes, drawn at random; all if the run has fewer.
+        seed: Seed of that draw.
     """
     from wiw.runs.verify import verify as check
 

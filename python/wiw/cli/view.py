@@ -15,14 +15,14 @@ def view(
     *,
     out: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Write pages to walk through a run: all episodes with filters, and every decision of each on a timeline.
+    """Write HTML pages to browse a run: all episodes with filters, and a timeline of each episode's decisions.
 
     $ wiw view runs/first
     $ wiw view runs/first --out pages
 
-    A page shows what the agent saw, what it imagined for each plan, beside what would really have been seen where the
-    run knows it, scores, choice, cost, and the way on the map. Pictures are there for the episodes that keep them:
-    `wiw run --keep-images all` keeps those of every decision. Also works while the run is going on.
+    A page shows the agent's observation, the imagined frames of each plan (beside the true ones, if the run measured
+    fidelity), scores, choice, cost, and the path on the map. Pictures exist for the episodes that keep them;
+    `wiw run --keep-images all` keeps those of every decision. Also works during the run.
 
     Args:
         run: The run's folder.

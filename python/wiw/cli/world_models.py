@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `wiw list world-models` says of each: what it takes and gives, its weights, what it lacks on this machine."""
+"""The table of `wiw list world-models`: inputs, outputs, weights, and what each model lacks on this machine."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Active Recognition episodes: things hardly seen at the start, and clearly from somewhere within the budget.
+"""Active Recognition episodes: targets hardly visible at the start, and clearly visible from within the budget.
 
 A thing is hardly seen when most of it is hidden, or when it is so far away or so foreshortened that little is to be
 seen, a small part of what a good view shows; both are measured in rendered instance ids (`wiw.datasets.visibility`).
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
-from wiw.datasets.visibility import COARSE, measure_sizes, measure_unhidden_sizes
+from wiw.datasets.visibility import COARSE, measure_sizes, measure_unoccluded_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
 from wiw.types import Episode
@@ -110,7 +110,7 @@ class EpisodeRules:
 
 @dataclass(frozen=True)
 class Survey:
-    """How large each instance looks from each place of one scene."""
+    """The apparent size of each instance from each sampled place of one scene."""
 
     points: NDArray[np.float64]
     """float64 [N, 3], on the floor."""
@@ -251,7 +251,7 @@ def _starts(
     points = survey.points[near[np.argsort(core.uniform(key, len(near)))][: rules.places]]
     sizes = measure_sizes(world, points)[:, instance]
     points, sizes = points[sizes >= rules.seen], sizes[sizes >= rules.seen]
-    shares = np.minimum(1.0, sizes / np.maximum(measure_unhidden_sizes(world, points, instance), 1e-9))
+    shares = np.minimum(1.0, sizes / np.maximum(measure_unoccluded_sizes(world, points, instance), 1e-9))
     # The hidden ones first; the others have to be far or foreshortened, which only the best view tells.
     for i in np.argsort(shares > rules.hidden, kind="stable")[: rules.attempts]:
         yield points[i], float(sizes[i]), float(shares[i])
@@ -279,7 +279,7 @@ def _best_view(
     if not len(largest):
         return None
     sizes = measure_sizes(world, ends[largest])[:, instance]
-    shares = sizes / np.maximum(measure_unhidden_sizes(world, ends[largest], instance), 1e-9)
+    shares = sizes / np.maximum(measure_unoccluded_sizes(world, ends[largest], instance), 1e-9)
     fit = np.flatnonzero((shares >= rules.clear) & (sizes >= rules.large))
     if not len(fit):
         return None
@@ -307,7 +307,7 @@ def measure_clarity(
     """Return how well an instance is seen, 0 to 1: its visible share, times its size up to `rules.enough`."""
     points = np.asarray(place, np.float64)[None]
     size = float(measure_sizes(world, points)[0, instance])
-    whole = float(measure_unhidden_sizes(world, points, instance)[0]) if size else 0.0
+    whole = float(measure_unoccluded_sizes(world, points, instance)[0]) if size else 0.0
     return min(1.0, size / whole) * min(1.0, size / rules.enough) if whole else 0.0
 
 
@@ -360,7 +360,7 @@ def load(
         if episode.info["category"] not in named:
             raise FileError(
                 f"{path}: episode {i}: info.category '{episode.info['category']}' is none of the categories "
-                f"{', '.join(named)}; mend the file, or name it too (categories=[...])"
+                f"{', '.join(named)}; correct the file, or name it too (categories=[...])"
             )
     return found, tuple(named)
 

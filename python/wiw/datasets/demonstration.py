@@ -20,7 +20,7 @@ DEPTH_UNITS = 5000
 
 @dataclass(frozen=True)
 class Demonstration:
-    """How an expert did what it was told, in T frames evenly spread over time; frame 0 is before anything was done.
+    """An expert's execution of an instruction, in T frames evenly spaced in time; frame 0 precedes all actions.
 
     Pictures are decoded when they are first asked for.
     """
@@ -39,7 +39,7 @@ class Demonstration:
     poses: NDArray[np.float64]
     """float64 [T, 7]: where the gripper is."""
     actions: NDArray[np.float64]
-    """float64 [T, 7]: the pose that it is told to go to."""
+    """float64 [T, 7]: the commanded pose."""
     keys: NDArray[np.int32]
     """int32 [T]: number of the action under way, from 1; 0 in frame 0."""
     ended: NDArray[np.bool_]

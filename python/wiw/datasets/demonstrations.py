@@ -36,7 +36,7 @@ Format = Literal["jpeg", "png"]
 
 @dataclass(frozen=True)
 class FrontCamera:
-    """Where pictures were taken from. It looks along its -z, +y is up; the world's z is up."""
+    """The camera that took the images. It looks along its -z, +y is up; the world's z is up."""
 
     intrinsics: NDArray[np.float64]
     """float64 [3, 3]: a point (x, y, z) before it is seen at K (x, -y, -z) / -z, in pixels right and down."""

@@ -42,7 +42,7 @@ def _item(episode: Episode, folder: Path) -> dict[str, Any]:
 
 
 def load(path: str | Path, scenes: str | Path = "") -> list[Episode]:
-    """Read an episode file: one that `save` wrote, habitat-lab's navigation episodes, or World-in-World's.
+    """Read an episode file: one written by `save`, or habitat-lab's or World-in-World's.
 
     `scenes` is the folder that scene paths are relative to; if not given, the folder of a file that `save` wrote, and
     the present one for the other formats. Lengths that a file does not give are NaN until the task has measured them.
@@ -106,7 +106,8 @@ def read_json(path: str | Path) -> Any:
             )
         return parse_json(raw)
     except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise FileError(f"{path}: {error}") from error
+        cause = (error.strerror or str(error)) if isinstance(error, OSError) else str(error)  # strerror: no path again
+        raise FileError(f"{path}: {cause}") from error
 
 
 def _episode(item: Any, where: str) -> Episode:

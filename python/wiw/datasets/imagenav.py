@@ -75,7 +75,7 @@ def _episode(world: World, index: int, seed: int, rules: EpisodeRules) -> Episod
         if ideal > rules.budget:
             broken["budget"] += 1
             continue
-        if in_sight(world, start, goal):
+        if is_in_view(world, start, goal):
             broken["the goal in sight of the start"] += 1
             continue
         goal_yaw = _best_view(world, goal, 2 * np.pi * draw[1:], rules)
@@ -109,8 +109,8 @@ def ideal_primitives(path: NDArray[np.float64], yaw: float, step: float = 0.2, t
     return int(np.round(turns / turn).sum() + np.ceil(np.linalg.norm(legs, axis=1).sum() / step))
 
 
-def in_sight(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
-    """Return whether the goal camera's place is seen from the start camera's, by the depth along the ray between."""
+def is_in_view(world: World, start: NDArray[np.float64], goal: NDArray[np.float64], margin: float = 0.3) -> bool:
+    """Return whether the goal camera's position is visible from the start camera's, by the depth along the ray."""
     eye, place = (np.add(p, [0.0, CAMERA_HEIGHT, 0.0]) for p in (start, goal))
     way = place - eye
     pose = camera_pose(start, float(np.arctan2(-way[0], -way[2])))

@@ -12,7 +12,7 @@ import numpy as np
 
 from wiw.datasets.demonstration import Demonstration
 from wiw.errors import DependencyError, FileError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 FORMAT = 1
 KEY = b"wiw"
@@ -66,7 +66,7 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
     depth = demonstrations[0].encoded_depths is not None
     schema = _schema(depth, facts)
     how = {"use_dictionary": list(REPEATED), "compression": _packing(depth), "write_page_checksum": True}
-    with whole_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
+    with atomic_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
         for each in demonstrations:
             file.write_table(_table(each, schema), row_group_size=len(each))
 
@@ -147,7 +147,7 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
 
 
 def _features(types: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the library `datasets` is told of columns, so that it decodes pictures by itself."""
+    """Return column metadata for the library `datasets`, so that it decodes pictures by itself."""
     import pyarrow as pa
 
     def feature(kind: Any) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of a thing is seen from a place, measured by rendering instance ids: as seen, and with all else away."""
+"""Visibility of objects from a place, by rendering instance ids with and without occluders."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def measure_sizes(world: World, points: NDArray[np.float64], size: Size = SIZE) 
     return counted
 
 
-def measure_unhidden_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
-    """Return the steradians that an instance would fill if nothing else were there, from N places: float64 [N]."""
+def measure_unoccluded_sizes(world: World, points: NDArray[np.float64], instance: int) -> NDArray[np.float64]:
+    """Return the steradians that an instance would fill without occluders, from N places: float64 [N]."""
     if not len(points):
         return np.zeros(0)
     with _lift(world, instance):
@@ -39,10 +39,10 @@ def measure_unhidden_sizes(world: World, points: NDArray[np.float64], instance: 
     return ((ids == instance) * _weights(SIZE)).sum(axis=(1, 2))
 
 
-def visible_share(world: World, point: NDArray[np.float64], instance: int) -> float:
-    """Return how much of an instance is seen from a place, 0 to 1 of what it would show if it were alone."""
+def visible_fraction(world: World, point: NDArray[np.float64], instance: int) -> float:
+    """Return the visible fraction of an instance from a place: 1 without occlusion."""
     places = np.asarray(point, np.float64)[None]
-    whole = float(measure_unhidden_sizes(world, places, instance)[0])
+    whole = float(measure_unoccluded_sizes(world, places, instance)[0])
     return min(1.0, float(measure_sizes(world, places)[0, instance]) / whole) if whole else 0.0
 
 
@@ -59,7 +59,7 @@ def _weights(size: Size) -> NDArray[np.float64]:
 
 @contextmanager
 def _lift(world: World, instance: int) -> Iterator[None]:
-    """Hold the instance high above the scene, where nothing hides it."""
+    """Move the instance high above the scene, where nothing occludes it."""
     home = np.asarray(world.scene.instances[instance - 1]["T_world_instance"], np.float64)
     away = home.copy()
     away[1, 3] += LIFT

@@ -22,7 +22,7 @@ SLACK = 1.0
 
 @dataclass(frozen=True)
 class World:
-    """One scene, ready to be seen and walked in."""
+    """One scene with its renderer and navigation mesh."""
 
     name: str
     scene: Scene

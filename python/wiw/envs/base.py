@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Env`: what the closed loop asks of an environment, whatever the task and whatever its plans are made of."""
+"""`Env`: the interface of environments that the closed loop drives, for any task and any plan space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from wiw.types import Answer, Episode, Goal, Key, TextAnswer, Truth
 
 @dataclass(frozen=True)
 class Segment:
-    """The outcome of carrying out the actions of one decision."""
+    """The outcome of executing one decision's actions."""
 
     observation: Any
     """The view at its end, such as a `wiw.types.Observation`."""
@@ -34,18 +34,18 @@ class Segment:
 
 
 class Guide(ABC):
-    """The truth about plans from where an environment stands.
+    """Ground truth about plans from an environment's present state.
 
-    Only the loop hands a guide on, to stages that an experiment tells the truth; no policy and no world model gets one.
+    Only the loop passes guides on, to stages that an experiment gives the ground truth; policies and models get none.
     """
 
     @abstractmethod
-    def worth(self, plan: NDArray[Any]) -> float:
+    def evaluate_plan(self, plan: NDArray[Any]) -> float:
         """Return how good a plan truly is: the best progress after any of its actions, the higher the better."""
 
     @abstractmethod
-    def plan(self, length: int) -> NDArray[Any]:
-        """Return a plan of at most `length` actions that truly leads on."""
+    def suggest_plan(self, length: int) -> NDArray[Any]:
+        """Return a plan of at most `length` actions that makes progress in the real environment."""
 
 
 class Env(ABC):
@@ -92,11 +92,11 @@ class Env(ABC):
         return {}
 
     def fork(self) -> Any:
-        """Return a copy of the simulator as it stands, which the world model `oracle` runs ahead."""
+        """Return a copy of the simulator in its present state, which the world model `oracle` simulates ahead."""
         raise self._lacks("has no simulator to copy, which world model 'oracle' runs ahead", "fork")
 
     def guide(self) -> Guide:
-        """Return the truth about plans from here, which `wiw blame` tells stages of the loop."""
+        """Return the ground truth about plans from here, which `wiw blame` gives to stages of the loop."""
         raise self._lacks("does not tell what plans are truly worth, which `wiw blame` asks", "guide")
 
     def semantic(self) -> NDArray[np.uint32]:

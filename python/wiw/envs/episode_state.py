@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One navigation episode in progress, as the single and the vector environment both keep it, and what judges it."""
+"""The state of one navigation episode, for the single and the vector environment, and the task's side of it."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class NavigationSpec(ABC):
         """Return the metrics of an episode."""
 
     def is_sure(self, state: EpisodeState) -> bool:
-        """Return whether the answers given so far end the episode."""
+        """Return whether the answers so far are confident enough to end the episode."""
         return False
 
     def waits(self, state: EpisodeState) -> bool:
@@ -93,11 +93,11 @@ class NavigationSpec(ABC):
         return {}
 
     def find_destination(self, state: EpisodeState) -> NDArray[np.float64]:
-        """Return where an agent that knew the scene would go."""
+        """Return the destination of an agent that knows the scene."""
         return state.goal_position
 
     def measure_progress(self, state: EpisodeState, fork: Any, primitives_left: float) -> float:
-        """Return how good it would be to stand where a fork of the simulator stands, the higher the better.
+        """Return the progress at the present state of a fork of the simulator, the higher the better.
 
         `primitives_left` counts those of the shortest path from there to the destination; here the fewer, the better.
         """
@@ -207,7 +207,7 @@ def draw_episode(task: NavigationSpec, random: np.random.Generator) -> int:
 
 
 def wrap_episode(task: NavigationSpec, index: int) -> int:
-    """Return the number of an episode, counted round where the last one is passed.
+    """Return the number of an episode, modulo the number of episodes.
 
     Raises:
         ArgumentError: a negative number.
@@ -237,7 +237,7 @@ def image_names(task: NavigationSpec, depth: bool) -> list[str]:
 def make_observation(
     task: NavigationSpec, images: dict[str, Any], odometry: NDArray[np.float64], state: EpisodeState
 ) -> Observation:
-    """Return what the agent is given of what the simulator shows."""
+    """Return the agent's observation, from the simulator's images."""
     if task.pointing is not None:
         images = task.pointing.split(images, int(state.episode.info["target"]))
     return Observation(**images, odometry=odometry)

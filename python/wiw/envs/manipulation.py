@@ -27,7 +27,7 @@ LEAST, MOST = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7
 
 
 class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
-    """An arm at a table that is told in words what to do.
+    """A robot arm at a table, with an instruction in words.
 
     Actions are absolute poses float64 [7] of the gripper: x, y, z in metres, roll, pitch, yaw, and how open it is. A
     way that leads into the table or out of reach is gone as far as it is free, and recorded. Success is rewarded by 1.

@@ -15,7 +15,7 @@ from wiw.types import Episode
 
 
 class ManipulationSpec(ABC):
-    """Tables, when what is asked for is done, and what is left to do."""
+    """The tables of episodes, their success condition, and the remaining expert actions."""
 
     seed: int
     robot: Robot
@@ -36,8 +36,8 @@ class ManipulationSpec(ABC):
 
     @abstractmethod
     def measure_progress(self, table: Table, bench: Workbench) -> float:
-        """Return how good it would be if a table stood as a fork of it does, the higher the better."""
+        """Return the progress at the present state of a fork of a table, the higher the better."""
 
     @abstractmethod
     def plan_expert(self, table: Table, bench: Workbench) -> NDArray[np.float64]:
-        """Return what is left to do for who knows what is asked, float64 [K, 7]; nothing where nothing helps."""
+        """Return the remaining poses of an expert that knows the target, float64 [K, 7]; empty where nothing helps."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The truth about plans of an agent that walks: what one is worth, and which one leads on."""
+"""Ground truth about navigation plans: how good a plan is, and which plan leads to the goal."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class ShortestPath:
         off = np.arctan2(-ahead[0], -ahead[2]) - fork.yaw
         return metres / STRIDE + abs(float(np.remainder(off + np.pi, 2 * np.pi) - np.pi)) / TURN
 
-    def plan(self, fork: Any, length: int) -> NDArray[np.int8]:
+    def find_plan(self, fork: Any, length: int) -> NDArray[np.int8]:
         """Return the path as primitives, int8 [length], straight run by straight run; at its end turns on the spot."""
         here, plan = fork.fork(), list[int]()
         while len(plan) < length:
@@ -87,7 +87,7 @@ class ShortestPath:
 
 @dataclass(frozen=True)
 class NavigationGuide(Guide):
-    """The truth about plans of primitives."""
+    """Ground truth about plans of primitives."""
 
     task: NavigationSpec
     state: EpisodeState
@@ -95,14 +95,14 @@ class NavigationGuide(Guide):
     """Of the simulator."""
     path: ShortestPath
 
-    def worth(self, plan: Sequence[int] | NDArray[np.int8]) -> float:
-        """Return the furthest that a plan gets, by the task's progress after each of its primitives."""
+    def evaluate_plan(self, plan: Sequence[int] | NDArray[np.int8]) -> float:
+        """Return the most progress that a plan makes, by the task's progress after each of its primitives."""
         probe, found = self.fork.fork(), []
         for action in plan:
             probe.step(int(action))
             found.append(self.task.measure_progress(self.state, probe, self.path.count_primitives(probe)))
         return max(found)
 
-    def plan(self, length: int) -> NDArray[np.int8]:
+    def suggest_plan(self, length: int) -> NDArray[np.int8]:
         """Return the plan of an agent that knows the scene, int8 [length]."""
-        return self.path.plan(self.fork, length)
+        return self.path.find_plan(self.fork, length)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pointing a thing out: instance ids of the simulator become a mask and boxes, and go no further."""
+"""Pointing out a target: the simulator's instance ids become a mask and boxes, and go no further."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IDS = ["panorama_ids", "front_ids"]
 
 @dataclass(frozen=True)
 class Pointing:
-    """How a task has its target boxed, and what happens when the target is lost."""
+    """How a task's target is boxed, and whether the episode ends when it is lost."""
 
     scale: float = 1.0
     """Of the box about its centre."""
@@ -28,7 +28,7 @@ class Pointing:
     """Whether the episode goes on where neither panorama nor front view shows the target."""
 
     def target(self, panorama_ids: NDArray[np.uint32], front_ids: NDArray[np.uint32], instance: int) -> Target:
-        """Return the instance as the agent is shown it."""
+        """Return the instance as the agent sees it."""
         mask = panorama_ids == instance
         return Target(mask, self._box(mask, wraps=True), self._box(front_ids == instance, wraps=False))
 

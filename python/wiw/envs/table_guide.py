@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The truth about plans of poses: what one is worth, and which one leads on."""
+"""Ground truth about plans of gripper poses: how good a plan is, and which plan leads to the goal."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from wiw.tabletop.workbench import Workbench
 
 @dataclass(frozen=True)
 class TableGuide(Guide):
-    """The truth about plans from where a table stands."""
+    """Ground truth about plans from the present state of a table."""
 
     task: ManipulationSpec
     table: Table
     bench: Workbench
     """A fork of the table's."""
 
-    def worth(self, plan: NDArray[np.float64]) -> float:
-        """Return the furthest that a plan gets, by the task's progress after each of its poses."""
+    def evaluate_plan(self, plan: NDArray[np.float64]) -> float:
+        """Return the most progress that a plan makes, by the task's progress after each of its poses."""
         probe, found = self.bench.fork(), []
         for pose in plan:
             probe.move_to(pose)
             found.append(self.task.measure_progress(self.table, probe))
         return max(found)
 
-    def plan(self, length: int) -> NDArray[np.float64]:
-        """Return what an expert would do next, float64 [K, 7], 1 <= K <= length; to stay where nothing helps."""
+    def suggest_plan(self, length: int) -> NDArray[np.float64]:
+        """Return the expert's next poses, float64 [K, 7], 1 <= K <= length; the present pose where nothing helps."""
         plan = self.task.plan_expert(self.table, self.bench)[:length]
         return plan if len(plan) else self.bench.pose[None]

@@ -26,7 +26,7 @@ from wiw.loop.clock import Clock
 from wiw.loop.contract import check_scores
 from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.model_imaginer import ModelImaginer
-from wiw.loop.observers import Futures, Observer
+from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.metrics import Lpips, psnr, ssim
 from wiw.policies.base import FrameSpec, Situation
@@ -38,7 +38,7 @@ PERSPECTIVE = (256, 256)
 
 
 class FidelityObserver(Observer, Privileged):
-    """Replays every plan in the simulator and lets the reviser score the true futures as well.
+    """Replays every plan in the simulator and lets the reviser score the true rollouts as well.
 
     Args:
         lpips: folder of the weights of LPIPS ("auto": `~/.cache/wiw/weights`), to measure fidelity by it as well.
@@ -56,15 +56,15 @@ class FidelityObserver(Observer, Privileged):
         """Take the environments that plans are replayed in."""
         self._environments = environments
 
-    def watch(self, futures: Futures) -> None:
-        """Imagine the same plans truly, and score them with copies of the reviser's memories."""
-        with futures.clock("replay"):
-            places = [place for place, own in enumerate(futures.imagined.rollouts) if own is not None]
+    def watch(self, batch: ScoringBatch) -> None:
+        """Replay the plans in the simulator, and score the true rollouts with copies of the reviser's memories."""
+        with batch.clock("replay"):
+            places = [place for place, own in enumerate(batch.imagined.rollouts) if own is not None]
             if places:
-                self._seen |= _replay(self._environments, futures, places, self._lpips)
+                self._seen |= _replay(self._environments, batch, places, self._lpips)
 
     def annotate(self, decision: Decision) -> Decision:
-        """Add how true the imagination of a decision was."""
+        """Add the fidelity of a decision's imagination."""
         truth = None if decision.key is None else self._seen.pop(decision.key, None)
         if truth is None or decision.rollouts is None or decision.scores is None:
             return decision
@@ -79,14 +79,14 @@ class _Truth:
 
 
 def _replay(
-    environments: LiveEnvironments, futures: Futures, places: Sequence[int], lpips: Lpips | None
+    environments: LiveEnvironments, batch: ScoringBatch, places: Sequence[int], lpips: Lpips | None
 ) -> dict[Key, _Truth]:
-    """Return truth beside imagination for each episode of which something was imagined."""
-    imagined = [futures.imagined.rollouts[place] or () for place in places]
-    plans = [futures.plans[place] for place in places]
-    queries = [futures.queries[place] for place in places]
+    """Return the true rollouts and scores of each episode that has imagined rollouts."""
+    imagined = [batch.imagined.rollouts[place] or () for place in places]
+    plans = [batch.plans[place] for place in places]
+    queries = [batch.queries[place] for place in places]
     request = Request(
-        futures.space,
+        batch.space,
         [query.key for query in queries],
         [query.observation for query in queries],
         [ModelInput(query.observation) for query in queries],
@@ -95,16 +95,16 @@ def _replay(
         _view_of(imagined[0][0]),
         Clock(),
     )
-    oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=futures.reviser.space), math.inf))
+    oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=batch.reviser.space), math.inf))
     oracle.grant(environments)
     true = oracle.imagine(request)
-    situations = [_copy_memory(futures.situations[place]) for place in places]
+    situations = [_copy_memory(batch.situations[place]) for place in places]
     rollouts = [own or () for own in true.rollouts]
-    scores = check_scores(futures.reviser, futures.reviser.score(situations, plans, rollouts), plans)
+    scores = check_scores(batch.reviser, batch.reviser.score(situations, plans, rollouts), plans)
     distances: Sequence[Any] = [None] * len(places)
     if lpips is not None:
-        view = FrameSpec("front" if futures.imagined.view == "perspective" else "surround", PERSPECTIVE)
-        shown, truths = futures.imagined.show(view), true.show(view)
+        view = FrameSpec("front" if batch.imagined.view == "perspective" else "surround", PERSPECTIVE)
+        shown, truths = batch.imagined.show(view), true.show(view)
         distances = _distances(lpips, [shown[place] for place in places], truths)
     found = zip(queries, rollouts, scores, distances, strict=True)
     return {query.key: _Truth(own, score, distance) for query, own, score, distance in found}
@@ -127,7 +127,7 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
 
 
 def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Return Kendall's tau-b of two scorings of the same plans; NaN where one of them tells nothing apart."""
+    """Return Kendall's tau-b of two scorings of the same plans; NaN where all scores of one of them are equal."""
     from scipy.stats import kendalltau
 
     if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:

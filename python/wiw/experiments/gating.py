@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.loop.imagination import Imagination, ImaginerWrapper, NothingImagined, Request
+from wiw.loop.imagination import Imagination, ImaginerWrapper, NoImagination, Request
 from wiw.loop.model_imaginer import as_imaginer
 from wiw.policies.base import FrameSpec
 from wiw.types import Key, Rollout
@@ -48,15 +48,15 @@ class Gated(ImaginerWrapper):
         """Imagine the plans of the episodes whose decisions consult the model."""
         places = [place for place, key in enumerate(request.keys) if self.consults(key)]
         if not places:
-            return NothingImagined(len(request.keys))
-        return PartlyImagined(super().imagine(select(request, places)), places, len(request.keys))
+            return NoImagination(len(request.keys))
+        return PartialImagination(super().imagine(select(request, places)), places, len(request.keys))
 
     def describe(self) -> dict[str, Any]:
         """Describe the model, and the share where it is less than all."""
         return super().describe() | ({} if self.fraction == 1 else {"imagine_fraction": self.fraction})
 
 
-class PartlyImagined(Imagination):
+class PartialImagination(Imagination):
     """The imagination of some episodes of a request."""
 
     def __init__(self, inner: Imagination, places: Sequence[int], episodes: int) -> None:

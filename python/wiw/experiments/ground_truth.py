@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stages of the loop that are given the ground truth, one or several, to find out which of them a failure is due to.
+"""Give stages of the loop the ground truth, to find out which of them causes a failure.
 
 imagination: the oracle stands in for the world model, or for the lack of one.
 scoring: plans are judged by how far they truly get, and the best one is followed; policies still score and remember.
@@ -36,7 +36,7 @@ def sort_stages(stages: Collection[str]) -> tuple[str, ...]:
 
 
 class _Guided(PolicyWrapper, Privileged):
-    """A policy with an environment's guide at hand."""
+    """A policy with access to the environments' guides."""
 
     stage: ClassVar[str]
     """Which of `STAGES` is given the truth."""
@@ -60,7 +60,7 @@ class _Guided(PolicyWrapper, Privileged):
 
 
 class TruePlans(_Guided):
-    """A policy among whose proposals there is a true plan."""
+    """A policy whose proposals include the ground-truth plan."""
 
     stage = "proposals"
 
@@ -68,13 +68,13 @@ class TruePlans(_Guided):
         """Propose the true plan before the policy's own, at most `candidates` in all."""
         proposals = super().propose(situations, candidates, horizon)
         return [
-            _put_first(self._guide(situation.key).plan(horizon), plans, candidates)
+            _put_first(self._guide(situation.key).suggest_plan(horizon), plans, candidates)
             for situation, plans in zip(situations, proposals, strict=True)
         ]
 
 
 class TrueScores(_Guided):
-    """A reviser that knows how far each plan truly gets, and follows the best."""
+    """A reviser that knows the true progress of each plan, and follows the best."""
 
     stage = "scoring"
 
@@ -98,7 +98,7 @@ class TrueScores(_Guided):
 
     def _worths(self, key: Key, plans: Sequence[Proposal]) -> NDArray[np.float64]:
         guide = self._guide(key)
-        return np.array([guide.worth(plan.actions) for plan in plans], np.float64)
+        return np.array([guide.evaluate_plan(plan.actions) for plan in plans], np.float64)
 
 
 def _put_first(actions: NDArray[Any], plans: Sequence[Proposal], candidates: int) -> list[Proposal]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Placebos at equal compute: the world model works as hard as ever, and what it imagines says nothing of the plan.
+"""Placebos at equal compute: the world model does as much work, but its rollouts do not depend on the plan.
 
 "shuffled" imagines plans made of the same primitives in another order and shows their futures as the plans' own.
 "swapped" imagines the very plans, but from the first observation of another episode. A world model whose score a
@@ -31,7 +31,7 @@ _PURPOSE = 0x706C6163
 
 
 class Placebo(ImaginerWrapper):
-    """A world model that is asked as much, for something else than the plans.
+    """A world model that gets as many requests, but not for the actual plans.
 
     Args:
         model: a world model, or an imaginer.
@@ -48,7 +48,7 @@ class Placebo(ImaginerWrapper):
 
 
 class ShuffledPlacebo(Placebo):
-    """Imagines plans made of the same primitives in another order, and shows their futures as the plans' own."""
+    """Imagines plans of the same primitives in shuffled order, and returns their rollouts as those of the plans."""
 
     kind = "shuffled"
 
@@ -65,18 +65,18 @@ class ShuffledPlacebo(Placebo):
         return super().imagine(replace(request, plans=plans))
 
 
-class FirstMoments(Protocol):
-    """Where a swapped placebo gets the first moment of another episode."""
+class FirstObservations(Protocol):
+    """Source of another episode's first observation, for swapped placebos."""
 
     def of(self, key: Key) -> ModelInput:
-        """Return the first moment of an episode that is not the key's own, the same one at each of its decisions."""
+        """Return the first observation of another episode, the same one at each decision of the key's episode."""
 
     def forget(self, key: Key) -> None:
-        """Drop what is kept for an episode that has ended."""
+        """Drop the state of an episode that has ended."""
 
 
 class SwappedPlacebo(Placebo):
-    """Imagines the very plans, but from the first observation of another episode.
+    """Imagines the plans from the first observation of another episode.
 
     Args:
         model: a world model, or an imaginer.
@@ -85,16 +85,16 @@ class SwappedPlacebo(Placebo):
 
     kind = "swapped"
 
-    def __init__(self, model: Any, moments: FirstMoments) -> None:
+    def __init__(self, model: Any, moments: FirstObservations) -> None:
         super().__init__(model)
         self._moments = moments
 
     def imagine(self, request: Request) -> Imagination:
-        """Imagine the plans from elsewhere; real views, those of leading turns, stay the episodes' own."""
+        """Imagine the plans in another episode; real views after leading turns stay the episode's own."""
         return super().imagine(replace(request, inputs=[self._moments.of(key) for key in request.keys]))
 
     def forget(self, key: Key) -> None:
-        """Drop the moment that is kept for an episode."""
+        """Drop the observation stored for an episode."""
         super().forget(key)
         self._moments.forget(key)
 
@@ -103,7 +103,7 @@ NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made o
 
 
 def shuffle(plans: Sequence[Proposal], key: Key, spec: planner.ModelSpec) -> list[Proposal]:
-    """Put the primitives of all plans in another order, drawn by the decision's key, and deal them at equal lengths.
+    """Shuffle the primitives over all plans, by the decision's key; each plan keeps its length.
 
     Stops stay where they are: nothing follows them. Leading turns, equal plans and common beginnings cost a model
     nothing, and an order may have more or fewer of them. Of `DRAWS` orders the first is taken that asks for as many

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Semantics for world models that read what each pixel is."""
+"""Semantic labels for world models that take them as input."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def find_source(semantics: Any) -> Semantics | str:
 
 
 class Labelled(ImaginerWrapper):
-    """A world model that is told what each pixel of the panorama is.
+    """A world model that is given the semantic label of each pixel of the panorama.
 
     Args:
         model: a world model, or an imaginer.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop's inside: propose, imagine, revise (paper, "Unified Strategy for Closed-Loop Online Planning")."""
+"""The inner loop: propose, imagine, revise (paper, "Unified Strategy for Closed-Loop Online Planning")."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from wiw.loop.agent_spec import AgentSpec
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig, set_numbers
 from wiw.loop.decision_pass import DecisionPass
 from wiw.loop.memory import Query, read_observation
 from wiw.loop.observers import Observer
-from wiw.loop.parts import Parts
 from wiw.loop.privileged import ForkedEnvironment, LiveEnvironments
 from wiw.policies.base import Policy
 from wiw.types import Decision, Goal, Key
@@ -50,13 +50,13 @@ class Agent(BaseAgent):
         observers: Sequence[Observer] = (),
         **numbers: Any,
     ) -> None:
-        self.parts = Parts(policy, model, reviser, set_numbers(config or AgentConfig(), numbers), tuple(observers))
-        self.components = self.parts.build()
-        self.config = self.components.config
+        self.spec = AgentSpec(policy, model, reviser, set_numbers(config or AgentConfig(), numbers), tuple(observers))
+        self.parts = self.spec.build()
+        self.config = self.parts.config
 
     def decide_batch(self, queries: Sequence[Query]) -> list[Decision]:
         """Decide once for each live episode; model and reviser see all candidates of all of them at once."""
-        step = DecisionPass(self.components, queries)
+        step = DecisionPass(self.parts, queries)
         search = step.propose()
         futures = step.imagine(search)
         scores = step.score(search, futures)
@@ -88,50 +88,50 @@ class Agent(BaseAgent):
     @property
     def policy(self) -> Policy:
         """The policy that proposes."""
-        return self.components.policy
+        return self.parts.policy
 
     @property
     def model(self) -> WorldModel | None:
         """The world model that is asked; None without one."""
-        return self.components.imaginer.model
+        return self.parts.imaginer.model
 
     @property
     def reviser(self) -> Policy:
         """The policy that scores and decides."""
-        return self.components.reviser
+        return self.parts.reviser
 
     @property
     def needs(self) -> tuple[str, ...]:  # type: ignore[override]
         """Inputs that observations must carry beyond images: "depth"."""
-        return self.components.needs
+        return self.parts.needs
 
     def count_spent(self) -> Counter[str]:
         """Return what the agent's model and policies have been asked for so far."""
-        return self.components.count_spent()
+        return self.parts.count_spent()
 
     def grant(self, environments: LiveEnvironments) -> None:
         """Give the privileged parts the environments that episodes are run in."""
-        self.components.grant(environments)
+        self.parts.grant(environments)
 
     def forget(self, key: Key) -> None:
         """Drop what is kept of an episode that has ended."""
-        self.components.memories.forget(key)
-        self.components.imaginer.forget(key)
+        self.parts.memories.forget(key)
+        self.parts.imaginer.forget(key)
 
     def replace(self, **changes: Any) -> Agent:
         """Return the same agent with other parts or numbers, e.g. `agent.replace(model="oracle")`."""
         names = {name: changes.pop(name) for name in ("policy", "model", "reviser", "observers") if name in changes}
-        parts = replace(self.parts, **names)
-        config = set_numbers(changes.pop("config", parts.config), changes)
-        return Agent(parts.policy, parts.model, parts.reviser, config, observers=parts.observers)
+        spec = replace(self.spec, **names)
+        config = set_numbers(changes.pop("config", spec.config), changes)
+        return Agent(spec.policy, spec.model, spec.reviser, config, observers=spec.observers)
 
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity for the run's manifest."""
         return {
             "policy": self.policy.describe(),
             "revision": self.reviser.describe(),
-            **self.components.imaginer.describe(),
-            **self.parts.config.describe(),
+            **self.parts.imaginer.describe(),
+            **self.spec.config.describe(),
         }
 
     def __repr__(self) -> str:

@@ -29,12 +29,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, asks_to_stop
+from wiw.errors import ArgumentError, ConstructionError, ContractError, RolloutError, is_stop_request
 from wiw.loop.limits import DEADLINE
 from wiw.loop.model_wrapper import ModelWrapper
 from wiw.registry import WORLD_MODELS, world_model
 from wiw.types import Conditioning, Control
-from wiw.world_models.base import WorldModel, check_rollout, patience
+from wiw.world_models.base import WorldModel, answer_deadline, check_rollout
 
 TRIES = 3
 PAUSES = (0.2, 1.0)
@@ -42,7 +42,7 @@ PAUSES = (0.2, 1.0)
 
 
 class Attempted(ModelWrapper):
-    """A world model whose answers are held to the contract and to a deadline.
+    """A world model whose rollouts are checked against the contract and limited by a deadline.
 
     Args:
         model: what is asked.
@@ -56,7 +56,7 @@ class Attempted(ModelWrapper):
         super().__init__(model)
         self.deadline = deadline
         self._tally: Counter[str] = Counter()
-        self._helper: _Helper | None = None
+        self._thread: _WorkerThread | None = None
 
     def __reduce__(self) -> Any:
         return Attempted, (self.model, self.deadline)
@@ -73,22 +73,22 @@ class Attempted(ModelWrapper):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Ask the model until it answers as agreed.
+        """Call the model until it gives a valid rollout.
 
         Raises:
             RolloutError: every try failed. An answer that breaks the contract in the same way twice is not asked for a
                 third time.
         """
-        said: list[str] = []
+        errors: list[str] = []
         for attempt in range(TRIES):
             self._count(controls)
             try:
                 return self.once(observations, controls, seeds)
             except Exception as error:
-                said.append(_describe_error(error))
-                in_vain = isinstance(error, ContractError) and said.count(said[-1]) > 1
-                if attempt + 1 == TRIES or in_vain:
-                    raise self._failure(error, said) from error
+                errors.append(_describe_error(error))
+                repeated = isinstance(error, ContractError) and errors.count(errors[-1]) > 1
+                if attempt + 1 == TRIES or repeated:
+                    raise self._build_error(error, errors) from error
                 self._tally["retries"] += 1
                 time.sleep(PAUSES[attempt])
         raise AssertionError("unreachable")
@@ -96,34 +96,36 @@ class Attempted(ModelWrapper):
     def once(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Ask in a single try that counts nowhere.
+        """Call the model once, without retries and without counting.
 
         Raises:
             LateError: no answer within the deadline.
             ContractError: the answer breaks the contract.
             ExitError: the model tried to end the process; and whatever else the model raises.
         """
-        return self._ask(lambda: _contain(lambda: check_rollout(self.model, observations, controls, seeds)))
+        return self._ask(lambda: _catch_exit(lambda: check_rollout(self.model, observations, controls, seeds)))
 
     def _count(self, controls: Sequence[Control]) -> None:
         self._tally["calls"] += 1
         self._tally["rows"] += len(controls)
         self._tally["frames"] += sum(max(0, control.length - control.shared) for control in controls)
 
-    def _failure(self, error: Exception, said: Sequence[str]) -> RolloutError:
+    def _build_error(self, error: Exception, errors: Sequence[str]) -> RolloutError:
         kind = error.kind if isinstance(error, ContractError | RolloutError | LateError | ExitError) else "raised"
         name = type(self.model.unwrapped).__name__
-        return RolloutError(f"{name} gave no usable answer in {len(said)} tries; the last: {said[-1]}", kind)
+        return RolloutError(
+            f"{name} gave no usable answer in {len(errors)} attempts; the last error: {errors[-1]}", kind
+        )
 
     def _ask(self, work: Callable[[], NDArray[np.uint8]]) -> NDArray[np.uint8]:
         if self.deadline > threading.TIMEOUT_MAX or "simulator" in self.model.accepts.needs:
             return work()
-        if self._helper is not None and not self._helper.idle(self.deadline):
-            self._helper = None
-        if self._helper is None:
-            self._helper = _Helper()
-        with patience(self.deadline):
-            return self._helper.do(work, self.deadline)
+        if self._thread is not None and not self._thread.wait_until_idle(self.deadline):
+            self._thread = None
+        if self._thread is None:
+            self._thread = _WorkerThread()
+        with answer_deadline(self.deadline):
+            return self._thread.call(work, self.deadline)
 
 
 def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldModel | None:
@@ -144,7 +146,7 @@ def make_model(what: Any, deadline: float = DEADLINE, **options: Any) -> WorldMo
         made: WorldModel | None = make()
         return made
     try:
-        made = _Helper().do(make, deadline)
+        made = _WorkerThread().call(make, deadline)
     except LateError as error:
         name = what if isinstance(what, str) else getattr(what, "__qualname__", repr(what))
         raise ConstructionError(
@@ -167,24 +169,24 @@ class ExitError(Exception):
     kind = "raised"
 
 
-def _contain(work: Callable[[], Any]) -> Any:
-    """Return what the work returns; a model's attempt to end the process becomes an `ExitError`."""
+def _catch_exit(work: Callable[[], Any]) -> Any:
+    """Call `work`; turn a model's attempt to end the process into an `ExitError`."""
     try:
         return work()
     except BaseException as error:
-        if isinstance(error, Exception) or asks_to_stop(error):
+        if isinstance(error, Exception) or is_stop_request(error):
             raise
         raise ExitError(
             f"{error!r}, as if to end the process; a model that cannot answer raises an Exception"
         ) from error
 
 
-class _Errand:
-    """One piece of work and what came of it."""
+class _WorkItem:
+    """A function to call, and its result."""
 
     def __init__(self, work: Callable[[], Any]) -> None:
         self.work: Callable[[], Any] | None = work
-        self.context, self.torch = copy_context(), _torch_state()
+        self.context, self.torch = copy_context(), _read_torch_state()
         self.ended = threading.Event()
         self.value: Any = None
         self.error: BaseException | None = None
@@ -192,7 +194,7 @@ class _Errand:
     def run(self) -> None:
         assert self.work is not None
         try:
-            with _as_in(self.torch):
+            with _apply_torch_state(self.torch):
                 self.value = self.context.run(self.work)
         except BaseException as error:
             self.error = error
@@ -200,34 +202,34 @@ class _Errand:
         self.ended.set()
 
 
-class _Helper:
-    """A thread that works for another one; the same one each time, for thread-local state of the model's libraries."""
+class _WorkerThread:
+    """A thread that makes calls for another one; always the same thread, as libraries keep thread-local state."""
 
     def __init__(self) -> None:
-        self._errands: queue.SimpleQueue[_Errand | None] = queue.SimpleQueue()
-        self._last: _Errand | None = None
-        threading.Thread(target=_serve, args=(self._errands,), daemon=True, name="wiw world model").start()
-        weakref.finalize(self, self._errands.put, None)
+        self._items: queue.SimpleQueue[_WorkItem | None] = queue.SimpleQueue()
+        self._last: _WorkItem | None = None
+        threading.Thread(target=_serve, args=(self._items,), daemon=True, name="wiw world model").start()
+        weakref.finalize(self, self._items.put, None)
 
-    def idle(self, seconds: float) -> bool:
-        """Return whether the thread is free, or becomes so in time."""
+    def wait_until_idle(self, seconds: float) -> bool:
+        """Return whether the thread is idle within so many seconds."""
         return self._last is None or self._last.ended.wait(seconds)
 
-    def do(self, work: Callable[[], Any], seconds: float) -> Any:
-        errand = self._last = _Errand(work)
-        self._errands.put(errand)
-        if not errand.ended.wait(seconds):
+    def call(self, work: Callable[[], Any], seconds: float) -> Any:
+        item = self._last = _WorkItem(work)
+        self._items.put(item)
+        if not item.ended.wait(seconds):
             raise LateError(f"no answer within {seconds:g} s (deadline); the call was abandoned")
         self._last = None
-        if errand.error is not None:
-            raise errand.error
-        return errand.value
+        if item.error is not None:
+            raise item.error
+        return item.value
 
 
-def _serve(errands: queue.SimpleQueue[_Errand | None]) -> None:
-    while (errand := errands.get()) is not None:
-        errand.run()
-        del errand  # else its frames would stay until the next one comes
+def _serve(items: queue.SimpleQueue[_WorkItem | None]) -> None:
+    while (item := items.get()) is not None:
+        item.run()
+        del item  # else its frames would stay until the next one comes
 
 
 def _describe_error(error: Exception) -> str:
@@ -235,8 +237,8 @@ def _describe_error(error: Exception) -> str:
     return text if isinstance(error, ContractError | LateError | ExitError) else f"{type(error).__name__}: {text}"
 
 
-def _torch_state() -> tuple[bool, bool, int | None] | None:
-    """Return what torch keeps for each thread: gradients, inference mode, GPU."""
+def _read_torch_state() -> tuple[bool, bool, int | None] | None:
+    """Return torch's thread-local state: gradients, inference mode, GPU."""
     torch = sys.modules.get("torch")
     if torch is None:
         return None
@@ -245,8 +247,8 @@ def _torch_state() -> tuple[bool, bool, int | None] | None:
 
 
 @contextmanager
-def _as_in(state: tuple[bool, bool, int | None] | None) -> Iterator[None]:
-    """Apply the asking thread's torch state, in the helper's."""
+def _apply_torch_state(state: tuple[bool, bool, int | None] | None) -> Iterator[None]:
+    """Apply the caller's torch state in the worker thread."""
     with ExitStack() as stack:
         if state is not None:
             torch, (gradients, inference, gpu) = sys.modules["torch"], state

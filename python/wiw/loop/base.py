@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run needs of an agent, whatever its method."""
+"""The interface of agents that runs rely on, whatever the method."""
 
 from __future__ import annotations
 

@@ -34,8 +34,8 @@ _RUNNING: ContextVar[tuple[Clock, str] | None] = ContextVar("wiw_running_stage",
 
 
 @contextmanager
-def time_apart(stage: str) -> Iterator[None]:
-    """Add the block's wall time to a stage of its own instead of the one that is being timed, if any is."""
+def time_separately(stage: str) -> Iterator[None]:
+    """Add the block's wall time to `stage` instead of the stage that is being timed, if any."""
     begin = time.perf_counter()
     try:
         yield

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the loop holds policies and world models to; `wiw.loop.attempts` does the same for frames."""
+"""Contract checks of policies and world models; `wiw.loop.attempts` checks frames."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from wiw.world_models.oracle import Oracle
 
 
 class PlanChecker(Protocol):
-    """The part of a plan space that is needed here."""
+    """The part of a plan space that the checks need."""
 
     def check_plan(self, source: str, actions: Any, longest: int) -> NDArray[Any]:
         """See `wiw.loop.plan_space.PlanSpace.check_plan`."""
 
 
 def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
-    """Hold observations to the depth that an agent with these `needs` reads.
+    """Check that observations have depth where an agent with these `needs` reads it.
 
     Raises:
         ArgumentError: an observation has none.
@@ -35,8 +35,8 @@ def check_depth(needs: Collection[str], observations: Sequence[Any]) -> None:
         )
 
 
-def check_kind(model: WorldModel, space: str, words: str) -> None:
-    """See that a model which follows actions follows those that plans are made of.
+def check_plan_space(model: WorldModel, space: str, words: str) -> None:
+    """Check that an action-conditioned model takes the actions that plans are made of.
 
     Raises:
         ArgumentError: it follows others.
@@ -49,7 +49,7 @@ def check_kind(model: WorldModel, space: str, words: str) -> None:
 
 
 def check_needs(model: WorldModel) -> None:
-    """See that the simulator is handed to the oracle alone.
+    """Check that no model but the oracle needs the simulator.
 
     Raises:
         ArgumentError: another model asks for it.
@@ -63,7 +63,7 @@ def check_needs(model: WorldModel) -> None:
 
 
 def check_proposals(policy: Policy, space: PlanChecker, proposals: Any, episodes: int, most: int, horizon: int) -> None:
-    """Hold `propose` to 1 to `most` plans of 1 to `horizon` actions for each episode.
+    """Check that `propose` returned 1 to `most` plans of 1 to `horizon` actions for each episode.
 
     Raises:
         ContractError: another count, length or action.
@@ -74,7 +74,7 @@ def check_proposals(policy: Policy, space: PlanChecker, proposals: Any, episodes
 def check_continuations(
     policy: Policy, space: PlanChecker, continuations: Any, places: int, most: int, horizon: int
 ) -> None:
-    """Hold `extend` to at most `most` plans of 1 to `horizon` actions for each place; none leaves a plan as it is.
+    """Check that `extend` returned up to `most` plans of 1 to `horizon` actions per place; no plans leave one as it is.
 
     Raises:
         ContractError: another count, length or action.

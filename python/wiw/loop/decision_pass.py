@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One pass of the loop over all live episodes: its steps, each held to its contract and timed."""
+"""One pass of the loop over all live episodes: its steps, each checked against its contract and timed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from wiw.loop.config import AgentConfig
 from wiw.loop.contract import check_answers, check_depth, check_proposals, check_scores
-from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NothingImagined, Request
+from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
 from wiw.loop.ledger import Ledger
 from wiw.loop.memory import EpisodeMemories, Query
-from wiw.loop.observers import Futures, Observer
+from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.plan_space import PlanSpace
 from wiw.loop.privileged import LiveEnvironments, Privileged
 from wiw.loop.search import Search
@@ -25,8 +25,8 @@ from wiw.types import Answer, Decision, Proposal, TextAnswer
 
 
 @dataclass(frozen=True)
-class Components:
-    """The parts of an agent, looked up and ready to decide."""
+class AgentParts:
+    """The parts of an agent, built and checked."""
 
     policy: Policy
     imaginer: Imaginer
@@ -61,7 +61,7 @@ class Components:
 class DecisionPass:
     """The steps between a batch of queries and a decision for each."""
 
-    def __init__(self, parts: Components, queries: Sequence[Query]) -> None:
+    def __init__(self, parts: AgentParts, queries: Sequence[Query]) -> None:
         self._parts, self._queries = parts, queries
         check_depth(parts.needs, [query.observation for query in queries])
         self._ledger = Ledger(parts.count_spent, len(queries))
@@ -92,7 +92,7 @@ class DecisionPass:
     def imagine(self, search: Search) -> Imagination:
         """Let the world model imagine every plan of every episode."""
         if self._parts.imaginer.model is None:
-            return NothingImagined(len(self._queries))
+            return NoImagination(len(self._queries))
         request = Request(
             self._parts.space,
             [query.key for query in self._queries],
@@ -111,9 +111,11 @@ class DecisionPass:
         """Let the reviser score every plan by its imagined future."""
         reviser, clock = self._parts.reviser, self._ledger.clock
         if search.level == self._parts.config.depth:
-            shown = Futures(reviser, self._parts.space, self._queries, self._revising, search.plans, futures, clock)
+            batch = ScoringBatch(
+                reviser, self._parts.space, self._queries, self._revising, search.plans, futures, clock
+            )
             for observer in self._parts.observers:
-                observer.watch(shown)
+                observer.watch(batch)
         with clock("revise"):
             scores = reviser.score_or_prefer(self._revising, search.plans, futures.rollouts)
             return check_scores(reviser, scores, search.plans)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, ContractError
-from wiw.loop.contract import check_kind, check_needs
+from wiw.loop.contract import check_needs, check_plan_space
 from wiw.loop.imagination import Imagination, Request
 from wiw.loop.imagine_poses import imagine_poses
 from wiw.loop.plan_space import PlanSpace
@@ -36,7 +36,7 @@ class GripperPoses(PlanSpace):
     def check_model(self, model: WorldModel, longest: int) -> None:
         """See `PlanSpace.check_model`: the model must show what happens in a front view, from a fixed camera."""
         accepts, name = model.accepts, type(model.unwrapped).__name__
-        check_kind(model, GRIPPER_POSES, self.words)
+        check_plan_space(model, GRIPPER_POSES, self.words)
         if accepts.control not in ("image", "text", "action"):
             raise ArgumentError(f"{name} follows a {accepts.control} of the camera, but poses of a gripper move none")
         if accepts.view != "perspective":

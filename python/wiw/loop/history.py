@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What world models with a memory are shown: the latest observations of each live episode.
+"""Histories for world models with a memory: the latest observations of each live episode.
 
 Each decision adds the one observation that the agent makes for it. An episode's frames are a function of its own past
 alone, whatever other episodes are live and in which order they are decided for.
@@ -139,7 +139,7 @@ class RowHistories:
         self._actions = [plans[owner][len(plans[owner]) - length :] for owner, length in rows]
 
     def before(self, part: Any, answers: Sequence[NDArray[np.uint8]]) -> History:
-        """Return what the rows of a call have seen when it begins, imagined frames of earlier calls included."""
+        """Return the histories of a call's rows, imagined frames of earlier calls included."""
         return stack_histories([self._frames(int(row), part.first, answers) for row in part.rows], self._most)
 
     def _frames(self, row: int, first: int, answers: Sequence[NDArray[np.uint8]]) -> Sequence[Frame]:

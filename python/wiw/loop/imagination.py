@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the agent asks to imagine its plans, and what it gets.
+"""Requests to imagine plans, and their results.
 
 An `Imaginer` is a world model as the loop asks it: `ModelImaginer` asks the model for the very plans from the very
 observations. Experiments wrap one to ask for something else (`wiw.experiments`).
@@ -25,7 +25,7 @@ from wiw.world_models.base import Accepts, WorldModel
 
 @dataclass(frozen=True)
 class ModelInput:
-    """Inputs of a world model for one episode; they need not be the episode's own (`wiw.experiments.placebos`)."""
+    """Inputs of a world model for one episode; placebos may take them from another episode."""
 
     observation: Any
     """`Observation` or `ArmObservation`."""
@@ -79,8 +79,8 @@ class Imagination(ABC):
         raise NotImplementedError(f"{type(self).__name__} has no places at the ends of plans")
 
 
-class NothingImagined(Imagination):
-    """The answer without a world model."""
+class NoImagination(Imagination):
+    """The result where nothing is imagined: no rollouts."""
 
     def __init__(self, episodes: int) -> None:
         self.rollouts: list[None] = [None] * episodes
@@ -129,7 +129,7 @@ class Imaginer(ABC):
         return self.model is not None
 
     def describe(self) -> dict[str, Any]:
-        """JSON-able identity for the run's manifest: the model's, under "model", and what is changed of it."""
+        """Return a JSON-able identity for the run's manifest: the model's, under "model", and what changes it."""
         return {"model": None if self.model is None else self.model.describe()}
 
     def forget(self, key: Key) -> None:  # noqa: B027 - most keep nothing
@@ -143,11 +143,11 @@ class NoModel(Imaginer):
 
     def imagine(self, request: Request) -> Imagination:
         """Return no rollouts."""
-        return NothingImagined(len(request.keys))
+        return NoImagination(len(request.keys))
 
 
 class ImaginerWrapper(Imaginer, Privileged):
-    """Base of what changes the requests of another imaginer."""
+    """Base of imaginers that change the requests to another one."""
 
     def __init__(self, inner: Imaginer) -> None:
         self.inner = inner

@@ -103,7 +103,7 @@ def _show(
 
 
 def make_model_spec(accepts: Accepts) -> Any:
-    """Return what the planner must know of a model."""
+    """Return the model's properties that the planner needs."""
     return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
 
 

@@ -45,7 +45,7 @@ class ImaginedPoses(Imagination):
 
 @dataclass(frozen=True)
 class _Row:
-    """One future that a model is asked for, and the plans that it answers."""
+    """One rollout to request, and the plans that it serves."""
 
     episode: int
     plan: NDArray[np.float64]
@@ -74,7 +74,7 @@ def imagine_poses(model: WorldModel, request: Request) -> ImaginedPoses:
 
 
 def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int]]]:
-    """Return the futures to be asked for, and the place among them of each episode's plans."""
+    """Return the rollouts to request, and for each episode's plans their indices among them."""
     rows: list[_Row] = []
     places: list[list[int]] = []
     for episode, (plans, numbers) in enumerate(zip(request.plans, request.origins, strict=True)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a decision cost: wall time by stage, and what models and policies were asked for."""
+"""The cost of decisions: wall time by stage, and the requests to models and policies."""
 
 from __future__ import annotations
 

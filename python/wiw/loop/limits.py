@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every agent of a run is built with beyond its identity; none of it changes what an agent decides."""
+"""Limits that every agent of a run is built with; none of them changes an agent's decisions."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NO_DEADLINE = 1e12
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits of an agent's world model, and how true its imagination was.
+    """Limits of an agent's world model, and whether fidelity is measured.
 
     Raises:
         ArgumentError: a number out of range.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is kept of each live episode between its decisions."""
+"""The memories of live episodes between their decisions."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class EpisodeMemories:
         return proposing, revising
 
     def record(self, key: Key, actions: NDArray[Any]) -> None:
-        """Keep what is about to be carried out."""
+        """Record the actions that are about to be executed."""
         self._by_episode[key.seed, key.episode].executed += actions.tolist()
 
     def forget(self, key: Key) -> None:

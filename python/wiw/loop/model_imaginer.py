@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Asks a world model for the very plans, from what it is given to see."""
+"""Ask a world model to imagine the given plans from the given observations."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ from wiw.types import Decision, Proposal
 
 
 @dataclass(frozen=True)
-class Futures:
-    """The futures that the reviser is about to score."""
+class ScoringBatch:
+    """Plans and their rollouts that the reviser is about to score, for all live episodes."""
 
     reviser: Policy
     space: PlanSpace
@@ -30,12 +30,12 @@ class Futures:
 
 
 class Observer(ABC):
-    """Sees every batch of decisions twice: before the futures are scored, and once it is decided."""
+    """Sees every batch of decisions twice: before its rollouts are scored, and after the decisions."""
 
     @abstractmethod
-    def watch(self, futures: Futures) -> None:
-        """Look at the futures that are chosen from."""
+    def watch(self, batch: ScoringBatch) -> None:
+        """Inspect the rollouts of the last level, from which the reviser chooses."""
 
     @abstractmethod
     def annotate(self, decision: Decision) -> Decision:
-        """Return the decision with what was measured."""
+        """Return the decision with measurements added."""

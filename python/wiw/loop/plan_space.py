@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What plans are made of: how such plans are checked, how they are imagined, and which world models can do it."""
+"""Plan spaces: the actions of plans, how plans are checked and imagined, and which world models can do it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class PlanSpace(ABC):
 
     @abstractmethod
     def check_model(self, model: WorldModel, longest: int) -> None:
-        """See that a world model can imagine plans of up to `longest` actions.
+        """Check that a world model can imagine plans of up to `longest` actions.
 
         Raises:
             ArgumentError: it cannot; says why.
@@ -51,7 +51,7 @@ class PlanSpace(ABC):
         """Imagine all plans of a request."""
 
     def check_search(self, model: WorldModel, policy: Any, depth: int) -> None:
-        """See that plans of this space can be extended from where they are imagined to end.
+        """Check that plans of this space can be extended from their imagined ends.
 
         Raises:
             ArgumentError: they cannot.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, ContractError
-from wiw.loop.contract import check_kind, check_needs
+from wiw.loop.contract import check_needs, check_plan_space
 from wiw.loop.imagination import Imagination, Request
 from wiw.loop.imagine import imagine_primitives
 from wiw.loop.plan_space import PlanSpace
@@ -37,7 +37,7 @@ class Primitives(PlanSpace):
     def check_model(self, model: WorldModel, longest: int) -> None:
         """See `PlanSpace.check_model`; a model that needs more than an image cannot go on from an imagined frame."""
         accepts, name = model.accepts, type(model.unwrapped).__name__
-        check_kind(model, PRIMITIVES, self.words)
+        check_plan_space(model, PRIMITIVES, self.words)
         check_needs(model)
         lacking = [need for need in accepts.needs if need != "history"]  # imagined frames make a history
         if lacking and accepts.frames and longest > accepts.frames - 1:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one door to the simulator, for what an experiment may know and an agent may not.
+"""Access to the live environments, for experiments that need privileged information; agents have none.
 
 A `Query` carries what an agent perceives. The oracle, stages that are given the ground truth, and measurements of
 fidelity are `Privileged`: before an episode's first decision they are granted its live environment, by its key. No
@@ -53,7 +53,7 @@ class Privileged(ABC):
 
 
 class ForkedEnvironment:
-    """Stands in for a live environment where only a fork of it is at hand."""
+    """Stands in for a live environment where only a fork of it is available."""
 
     def __init__(self, simulator: Any) -> None:
         self._simulator = simulator

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rollouts on disk, so that the same question is put to a world model once.
+"""A disk cache of rollouts, so that the same request is computed once.
 
 An entry is named by everything its frames depend on: the model (`WorldModel.fingerprint`: class, declared version,
 options, weights), the bytes of the observation and its history, the control and the seed. A model without a version is
@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.loop.clock import time_apart
+from wiw.loop.clock import time_separately
 from wiw.loop.limits import BUDGET_GB
 from wiw.loop.model_wrapper import ModelWrapper
 from wiw.types import Conditioning, Control
@@ -66,7 +66,7 @@ class RolloutCache:
         self._writing = True
 
     def get(self, key: str, first: int, frames: NDArray[np.uint8]) -> bool:
-        """Fill `frames` [K, H, W, 3] with frames `first`... of an entry; False where there is none that will do."""
+        """Fill `frames` [K, H, W, 3] with frames `first`... of an entry; False where none matches."""
         path = self._path(key)
         try:
             with path.open("rb", buffering=0) as file:
@@ -84,7 +84,7 @@ class RolloutCache:
         return found
 
     def put(self, key: str, first: int, frames: NDArray[np.uint8]) -> None:
-        """Keep frames `first`... of a row; where that fails a warning says so, and no more is written."""
+        """Store frames `first`... of a row; if that fails, log a warning and stop writing."""
         data = np.ascontiguousarray(frames)
         size = _HEADER.size + data.nbytes
         if not self._writing or size > self.budget:
@@ -102,7 +102,7 @@ class RolloutCache:
             with suppress(OSError):
                 draft.unlink(missing_ok=True)
             self._writing = False
-            _log.warning("rollouts are not kept any more: %s; make room or name another folder with --cache", error)
+            _log.warning("rollouts are no longer cached: %s; free disk space or set another folder by --cache", error)
             return
         self._written += size
         if self._known is None or self._known + self._written > self.budget or self._written > self.budget // 20:
@@ -132,7 +132,7 @@ class RolloutCache:
         return True
 
     def _trim(self) -> None:
-        """Look how large the folder is, and make it a tenth smaller than its budget where it has outgrown it."""
+        """Where the folder exceeds its budget, delete the oldest entries until it is a tenth below."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / ".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -177,11 +177,11 @@ class Cached(ModelWrapper):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return frames as `WorldModel.rollout` promises them; those that nobody reads may be left unwritten."""
+        """Return frames as `WorldModel.rollout` promises them; those that are never read may be left unwritten."""
         keys = [_key(self._identity, observations, row, control, seeds) for row, control in enumerate(controls)]
         own = [(1 + control.shared, 1 + control.length) for control in controls]
         frames = np.empty((len(controls), 1 + len(controls[0].actions), *self.accepts.size, _CHANNELS), np.uint8)
-        with time_apart("cache"):
+        with time_separately("cache"):
             frames[:, 0] = observations.image
             missing = [
                 row
@@ -191,7 +191,7 @@ class Cached(ModelWrapper):
         self._cached_rows += len(controls) - len(missing)
         if missing:
             fresh = self.model.rollout(_rows(observations, missing), [controls[row] for row in missing], seeds[missing])
-            with time_apart("cache"):
+            with time_separately("cache"):
                 for answer, row in zip(fresh, missing, strict=True):
                     first, end = own[row]
                     self.cache.put(keys[row], first, answer[first:end])

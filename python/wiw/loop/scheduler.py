@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The closed loop's outside: keeps many episodes live so that every model call carries a whole batch."""
+"""The outer loop: keeps many episodes live, so that every model call carries a whole batch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from wiw.errors import ArgumentError, ContractError, JudgeError, RolloutError, VlmError, asks_to_stop
+from wiw.errors import ArgumentError, ContractError, JudgeError, RolloutError, VlmError, is_stop_request
 from wiw.loop.agent import Agent
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
@@ -26,16 +26,16 @@ class Sink(Protocol):
     def episode(self, result: EpisodeResult) -> None:
         """Record that an episode has ended, or its infrastructure has failed."""
 
-    def again(self, episodes: Sequence[int]) -> None:
-        """Note that these episodes begin anew; what was reported of them does not count."""
+    def record_restart(self, episodes: Sequence[int]) -> None:
+        """Discard what was reported of these episodes: they start again."""
 
     def record_lost(self, spent: Mapping[str, float]) -> None:
         """Record that a decision has failed; what was asked for it, and its "seconds"."""
 
 
 @dataclass
-class Trial:
-    """One live episode."""
+class LiveEpisode:
+    """One episode in progress."""
 
     index: int
     episode: Episode
@@ -47,7 +47,7 @@ class Trial:
     done: bool = field(default=False)
 
     def query(self) -> Query:
-        """Return what the agent is asked."""
+        """Return the episode's query to the agent."""
         return Query(self.observation, self.env.goal, self.key.at(self.decisions))
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
@@ -82,30 +82,30 @@ def run_episodes(
     depend on what else was live. A policy's broken contract or a wrong argument would hit every episode alike, so it is
     raised; so is what the sink raises.
     """
-    waiting, trials, suspects = deque(episodes), list[Trial](), deque[tuple[int, Episode]]()
+    waiting, running, suspects = deque(episodes), list[LiveEpisode](), deque[tuple[int, Episode]]()
     envs = [task.environment(depth="depth" in agent.needs) for _ in range(min(live, len(episodes)))]
     environments = LiveEnvironments()
     agent.grant(environments)
     try:
-        while waiting or trials or suspects:
+        while waiting or running or suspects:
             while waiting and envs:
-                trials += _start(waiting.popleft(), envs, seed, sink)
-            if not trials and not waiting and suspects:
-                trials += _start(suspects.popleft(), envs, seed, sink)
-            for trial in trials:
-                environments.add(trial.key, trial.env)
-            suspects += _advance(agent, trials, sink)
-            for trial in [trial for trial in trials if trial.done]:
-                trials.remove(trial)
-                envs.append(trial.env)
-                environments.remove(trial.key)
-                agent.forget(trial.key)
+                running += _start(waiting.popleft(), envs, seed, sink)
+            if not running and not waiting and suspects:
+                running += _start(suspects.popleft(), envs, seed, sink)
+            for each in running:
+                environments.add(each.key, each.env)
+            suspects += _advance(agent, running, sink)
+            for each in [each for each in running if each.done]:
+                running.remove(each)
+                envs.append(each.env)
+                environments.remove(each.key)
+                agent.forget(each.key)
     finally:
-        for env in [*envs, *(trial.env for trial in trials)]:
+        for env in [*envs, *(each.env for each in running)]:
             env.close()
 
 
-def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) -> list[Trial]:
+def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) -> list[LiveEpisode]:
     """Begin an episode in one of the free environments; return it, unless it could not begin."""
     index, episode = item
     begin = time.perf_counter()
@@ -113,46 +113,46 @@ def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) ->
     try:
         observation = env.begin(episode)
     except BaseException as error:  # whatever went wrong, the run goes on and the record says so
-        if asks_to_stop(error):
+        if is_stop_request(error):
             raise
         envs.append(env)
         sink.episode(_build_error_result(index, episode, begin, "environment", error))
         return []
-    return [Trial(index, episode, env, Key(seed, index), observation, begin)]
+    return [LiveEpisode(index, episode, env, Key(seed, index), observation, begin)]
 
 
-def _advance(agent: Agent, trials: list[Trial], sink: Sink) -> list[tuple[int, Episode]]:
+def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple[int, Episode]]:
     """Decide once for every live episode; return those that have to be run again, one at a time."""
-    if not trials:
+    if not running:
         return []
     before, begin = agent.count_spent(), time.perf_counter()
     try:
-        decisions = agent.decide_batch([trial.query() for trial in trials])
+        decisions = agent.decide_batch([each.query() for each in running])
     except (ArgumentError, ContractError):
         raise
     except BaseException as error:
-        if asks_to_stop(error):
+        if is_stop_request(error):
             raise
         kind = _kind(error)
         sink.record_lost({**(agent.count_spent() - before), "seconds": time.perf_counter() - begin})
-        for trial in trials:
-            trial.done = True
-        if len(trials) > 1:
-            sink.again([trial.index for trial in trials])
-            return [(trial.index, trial.episode) for trial in trials]
-        sink.episode(_build_error_result(trials[0].index, trials[0].episode, trials[0].begin, kind, error))
+        for each in running:
+            each.done = True
+        if len(running) > 1:
+            sink.record_restart([each.index for each in running])
+            return [(each.index, each.episode) for each in running]
+        sink.episode(_build_error_result(running[0].index, running[0].episode, running[0].begin, kind, error))
         return []
-    for trial, decision in zip(trials, decisions, strict=True):
+    for each, decision in zip(running, decisions, strict=True):
         try:
-            record = trial.carry_out(decision)
-            result = _build_result(trial) if trial.done else None
+            record = each.carry_out(decision)
+            result = _build_result(each) if each.done else None
         except BaseException as error:
-            if asks_to_stop(error):
+            if is_stop_request(error):
                 raise
-            trial.done = True
+            each.done = True
             sink.record_lost({**decision.spent, "seconds": sum(decision.seconds.values())})
             kind = f"judge/{error.kind}" if isinstance(error, JudgeError | VlmError) else "environment"
-            sink.episode(_build_error_result(trial.index, trial.episode, trial.begin, kind, error))
+            sink.episode(_build_error_result(each.index, each.episode, each.begin, kind, error))
             continue
         sink.decision(record)
         if result is not None:
@@ -166,11 +166,11 @@ def _kind(error: BaseException) -> str:
     return f"vlm/{error.kind}" if isinstance(error, VlmError) else "agent"
 
 
-def _build_result(trial: Trial) -> EpisodeResult:
-    metrics = {**trial.env.result(), "decisions": float(trial.decisions)}
-    details, seconds = dict(trial.env.details()), time.perf_counter() - trial.begin
-    episode = trial.episode
-    return EpisodeResult(trial.index, episode.episode_id, episode.scene, "done", metrics, seconds, details=details)
+def _build_result(live: LiveEpisode) -> EpisodeResult:
+    metrics = {**live.env.result(), "decisions": float(live.decisions)}
+    details, seconds = dict(live.env.details()), time.perf_counter() - live.begin
+    episode = live.episode
+    return EpisodeResult(live.index, episode.episode_id, episode.scene, "done", metrics, seconds, details=details)
 
 
 def _build_error_result(index: int, episode: Episode, begin: float, kind: str, error: BaseException) -> EpisodeResult:

@@ -88,7 +88,7 @@ class Search:
     def _at_ends(
         self, situations: Sequence[Situation], futures: Imagination, going: Sequence[tuple[int, int]]
     ) -> list[Situation]:
-        """Return the episodes as they would stand at the ends of the (episode, candidate) plans `going`."""
+        """Return the episodes' situations at the ends of the (episode, candidate) plans `going`."""
         panoramas, fronts = futures.ends(going)
         ends = []
         for (episode, candidate), panorama, front in zip(going, panoramas, fronts, strict=True):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """LPIPS, the perceptual distance of Zhang et al. 2018, version 0.1 on AlexNet's features.
 
-Two published files make it what papers call LPIPS; they are told by their SHA-256. Where they are not there is no
+Two published files make it what papers call LPIPS; they are identified by their SHA-256. Where they are not there is no
 number: nothing stands in for them.
 """
 

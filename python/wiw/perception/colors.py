@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, FileError, WeightsError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 COLORS = (
     "white", "grey", "black", "brown", "beige", "red", "orange", "yellow", "green", "turquoise", "blue", "purple",
@@ -90,7 +90,7 @@ class ColorNamer:
         """
         values: dict[str, Any] = {"colors": list(COLORS)}
         values |= {name: np.asarray(value).round(5).tolist() for name, value in asdict(self).items()}
-        with whole_file(path) as draft:
+        with atomic_file(path) as draft:
             try:
                 draft.write_text(json.dumps(values) + "\n")
             except OSError as error:

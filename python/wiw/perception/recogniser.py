@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, BackendError, FileError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.networks import single_thread
 from wiw.perception.calibration import softmax
 from wiw.perception.glimpses import Glimpses, join_glimpses
@@ -106,7 +106,7 @@ class Recogniser:
         }
         weights = {name: value.half().contiguous() for name, value in select_float_state(self.network).items()}
         metadata = {"format": FORMAT, "header": json.dumps(header, sort_keys=True)}
-        with whole_file(Path(path)) as draft:
+        with atomic_file(Path(path)) as draft:
             draft.write_bytes(save(weights, metadata))
 
     def __call__(self, sets: Sequence[Glimpses], choices: Sequence[str] | None = None) -> NDArray[np.float64]:

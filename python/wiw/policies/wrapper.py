@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of policies that change what another one says."""
+"""Base of policies that change the answers of another one."""
 
 from __future__ import annotations
 

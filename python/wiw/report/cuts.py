@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored pictures, cropped, scaled and compressed for a page."""
+"""Crop, scale and compress stored images for pages; `scale` makes them smaller still."""
 
 from __future__ import annotations
 
@@ -21,32 +21,33 @@ GAP = 3
 """Pixels between the frames of a strip."""
 
 
-def panorama(jpeg: bytes, width: int, quality: int) -> bytes:
+def panorama(jpeg: bytes, width: int, quality: int, scale: float = 1.0) -> bytes:
     """Return the band of a panorama that pages show, at most `width` pixels wide."""
     band = part(decode_jpeg(jpeg), BAND, (0, 1))
-    return _shrink(band, width / band.shape[1], quality)
+    return _shrink(band, scale * min(1, width / band.shape[1]), quality)
 
 
-def front(jpeg: bytes, side: int, quality: int) -> bytes:
+def front(jpeg: bytes, side: int, quality: int, scale: float = 1.0) -> bytes:
     """Return a camera image, at most `side` pixels wide."""
     image = decode_jpeg(jpeg)
-    return _shrink(image, side / image.shape[1], quality)
+    return _shrink(image, scale * min(1, side / image.shape[1]), quality)
 
 
-def strip(jpeg: bytes, count: int, height: int, quality: int) -> bytes:
+def strip(jpeg: bytes, count: int, height: int, quality: int, scale: float = 1.0) -> bytes:
     """Return frames side by side, at most `height` pixels high; of panoramas only the part in front of the agent."""
     tiles = np.split(decode_jpeg(jpeg), count, axis=1)
     if tiles[0].shape[1] > 1.6 * tiles[0].shape[0]:
         tiles = [part(tile, BAND, FRONT) for tile in tiles]
     gap = np.full((len(tiles[0]), GAP, 3), 255, np.uint8)
     spaced = np.concatenate([own for tile in tiles for own in (tile, gap)][:-1], axis=1)
-    return _shrink(spaced, height / len(spaced), quality)
+    return _shrink(spaced, scale * min(1, height / len(spaced)), quality)
 
 
-def frames(jpeg: bytes, count: int, height: int, quality: int, whole: bool) -> bytes:
+def frames(jpeg: bytes, count: int, height: int, quality: int, whole: bool, scale: float = 1.0) -> bytes:
     """Return frames side by side without gaps, at most `height` pixels high, or only the last one."""
     image = decode_jpeg(jpeg)
-    return _shrink(image if whole else image[:, -image.shape[1] // count :], height / len(image), quality)
+    shown = image if whole else image[:, -image.shape[1] // count :]
+    return _shrink(shown, scale * min(1, height / len(image)), quality)
 
 
 def shrink_map(webp: bytes, side: int) -> bytes:

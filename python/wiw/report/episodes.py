@@ -19,21 +19,29 @@ from wiw.report.maps import (
     start_and_goal,
     trail,
 )
-from wiw.report.plans import of_poses, plan_views
+from wiw.report.plans import is_pose_row, plan_views
 from wiw.report.stage import Stage, stage_of
 from wiw.report.steps import step
 from wiw.report.story import Album, Attempt, Picture, Step, Story
 from wiw.runs.pictures import choose_pictured_episodes
+from wiw.runs.run import Run
 from wiw.runs.store import RunStore
 from wiw.types import Episode, Wording
 
 
-def read_stories(store: RunStore, arms: Sequence[str], album: Album) -> tuple[list[Story], dict[str, Picture]]:
-    """Return the ended episodes among those chosen for pictures, and the scene maps by id."""
+def read_stories(
+    store: RunStore, arms: Sequence[str], album: Album, most: int | None = None
+) -> tuple[list[Story], dict[str, Picture]]:
+    """Return the ended episodes among those chosen for pictures, `most` at most, and the scene maps by id."""
     outcomes = outcomes_by_episode(store, arms)
     episodes, maps = store.episodes(), dict[str, Picture]()
-    kept = [index for index in choose_pictured_episodes(store) if outcomes.get(index)]
+    kept = [index for index in choose_pictured_episodes(store) if outcomes.get(index)][:most]
     return [read_story(store, index, episodes[index], outcomes[index], maps, album) for index in kept], maps
+
+
+def title(run: Run) -> str:
+    """Return task and folder of a run, or one of them where they have the same name."""
+    return " · ".join(dict.fromkeys((str(run.store.config["task"].get("task", "run")), run.path.name)))
 
 
 def outcomes_by_episode(store: RunStore, arms: Sequence[str]) -> dict[int, dict[str, Mapping[str, Any]]]:
@@ -59,7 +67,7 @@ def read_story(
     """Return one episode; add its scene's map to `maps`."""
     decisions = {arm: store.decisions(arm, index) for arm in outcomes}
     rows = [row for own in decisions.values() for row in own]
-    poses = any(of_poses(row) for row in rows)
+    poses = any(is_pose_row(row) for row in rows)
     frame, picture = (None, None) if poses else _map(store, episode, rows, maps, album)
     shots = dict[str, Picture]()
     attempts = tuple(
@@ -68,7 +76,11 @@ def read_story(
     )
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
     ends = start_and_goal(frame, episode) if frame is not None else None
-    shown = album.draw(f"{index}-goal", partial(cuts.front, goal, album.goal_side, album.quality)) if goal else None
+    shown = (
+        album.draw(f"{index}-goal", partial(cuts.front, goal, album.goal_side, album.quality, album.scale))
+        if goal
+        else None
+    )
     return Story(index, episode, shown, picture, frame, ends, attempts, wording(store), poses, shots)
 
 

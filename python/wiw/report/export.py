@@ -13,7 +13,7 @@ from typing import Any
 
 from wiw.analysis.summary import arm_table
 from wiw.errors import ArgumentError
-from wiw.files import whole_file, whole_folder
+from wiw.files import atomic_file, atomic_folder
 from wiw.runs.rows import to_json
 from wiw.runs.run import Run
 
@@ -93,7 +93,7 @@ def export_rerun(run: Run, file: Path) -> Path:
     _require("rerun", "Rerun recordings")
     from wiw.report.recording import record
 
-    with whole_file(file) as draft:
+    with atomic_file(file) as draft:
         record(run, draft)
     return file
 
@@ -108,7 +108,7 @@ def _require(module: str, what: str) -> None:
 
 def _export(run: Run, folder: Path, suffix: str, write: Callable[[Path, Table], None]) -> list[Path]:
     made = tables(run)
-    with whole_folder(folder) as draft:
+    with atomic_folder(folder) as draft:
         for name, table in made.items():
             write(draft / f"{name}.{suffix}", table)
     return [folder / f"{name}.{suffix}" for name in made]

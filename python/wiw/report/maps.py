@@ -48,7 +48,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Trail:
-    """One arm's way."""
+    """One arm's path."""
 
     arm: str
     points: str

@@ -16,32 +16,77 @@ from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
-from wiw.files import whole_file
+from wiw.errors import ArgumentError
+from wiw.files import atomic_file
 from wiw.report import plots
-from wiw.report.episodes import read_stories, wording
+from wiw.report.episodes import read_stories, title, wording
 from wiw.report.story import Album
 from wiw.report.templating import environment, format_signed
+from wiw.runs.pictures import choose_pictured_episodes
 from wiw.runs.run import Run
 from wiw.types import Wording
 
+SCALES = (1.0, 0.85, 0.7, 0.6)
+"""Sizes of pictures that are tried for a report of limited size; below the last, frames are hard to make out."""
 
-def write_report(run: Run, path: Path) -> Path:
+
+def write_report(
+    run: Run, path: Path, *, episodes: int | None = None, max_mb: float | None = None, remark: str = ""
+) -> Path:
     """Write a run's report and return its path.
 
+    Args:
+        run: to be reported.
+        path: of the file.
+        episodes: how many to show with pictures; all that kept them if not given.
+        max_mb: most megabytes (10^6 bytes) of the file; pictures are made smaller, then episodes left out, until it
+            fits.
+        remark: sentence that the page shows below the result.
+
     Raises:
+        ArgumentError: a number out of range, or less than the tables and plots take.
         FileError: the file cannot be written; what was there before is kept.
     """
-    page = render(run)
-    with whole_file(path) as draft:
+    if episodes is not None and episodes < 0:
+        raise ArgumentError(f"report: expected episodes of at least 0, got {episodes}")
+    page = render(run, episodes, remark=remark) if max_mb is None else _render_within(run, episodes, max_mb, remark)
+    with atomic_file(path) as draft:
         draft.write_text(page, encoding="utf-8")
     return path
 
 
-def render(run: Run) -> str:
-    """Return a run's report as self-contained HTML. All text from the run is escaped."""
+def _render_within(run: Run, episodes: int | None, max_mb: float, remark: str) -> str:
+    """Return the report with as many episodes, and then as large pictures, as `max_mb` megabytes hold."""
+
+    def fits(page: str) -> bool:
+        return len(page.encode()) <= max_mb * 10**6
+
+    pictured = len(choose_pictured_episodes(run.store))
+    for count in range(pictured if episodes is None else min(episodes, pictured), 0, -1):
+        smallest = render(run, count, SCALES[-1], remark)
+        if fits(smallest):
+            return next(filter(fits, (render(run, count, scale, remark) for scale in SCALES[:-1])), smallest)
+    bare = render(run, 0, remark=remark)
+    if not fits(bare):
+        size = len(bare.encode()) / 10**6
+        raise ArgumentError(
+            f"report: its tables and plots alone take {size:.2f} MB; expected max_mb of more, got {max_mb}"
+        )
+    return bare
+
+
+def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: str = "") -> str:
+    """Return a run's report as self-contained HTML. All text from the run is escaped.
+
+    Args:
+        run: to be reported.
+        episodes: how many to show with pictures; all that kept them if not given.
+        scale: of the pictures of decisions.
+        remark: sentence that the page shows below the result.
+    """
     summary, config, info = summarise_run(run), run.store.config, run.store.info
-    album = Album()
-    shown, maps = read_stories(run.store, run.arms, album)
+    album = Album(scale)
+    shown, maps = read_stories(run.store, run.arms, album, episodes)
     truths, ledger, blamed = fidelity(run), costs(run), read_blame(run.store)
     measured, paid = choose_columns(truths), cost_columns(ledger)
     return (
@@ -49,12 +94,13 @@ def render(run: Run) -> str:
         .get_template("page.html.j2")
         .render(
             **_common(summary),
-            title=f"{config['task'].get('task', 'run')} · {run.path.name}",
+            title=title(run),
             task=config["task"],
             created=run.store.created,
             version=run.store.wiw_version,
             words=wording(run.store),
             whole=Album.whole,
+            remark=remark,
             sentence=sentence(summary, wording(run.store)),
             plots=_plots(run, summary, truths, blamed),
             stories=shown,
@@ -103,7 +149,7 @@ def _describe_gain(difference: Difference | None) -> str:
     interval = f"95 % interval {format_signed(found.low)} to {format_signed(found.high)}"
     if found.excludes_zero:
         return f", {against} ({interval})."
-    return f", {against}; the interval includes 0 ({interval})."
+    return f", {against} ({interval}, which includes 0: no evidence of a difference)."
 
 
 def _describe_actions(difference: Difference | None, words: Wording) -> str:
@@ -135,7 +181,7 @@ def _common(summary: Summary) -> dict[str, Any]:
 
 
 def _utility_ends(summary: Summary) -> tuple[float, float]:
-    """Return the ends of the utility scale: 0 to 1, or as far as any arm; intervals are cut at -1 and 2."""
+    """Return the ends of the utility scale: at least [0, 1], and wide enough for all arms within [-1, 2]."""
     shown = [found for found in summary.utilities if found.is_defined]
     low = min([0.0, *(max(-1.0, found.low) for found in shown), *(found.value for found in shown)])
     return low, max([1.0, *(min(2.0, found.high) for found in shown), *(found.value for found in shown)])
@@ -171,6 +217,8 @@ def _plots(
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
     if any(ways.values()):
         about = "Do longer paths need the world model more?"
+        if plots.shows_single_outcomes(ways):
+            about += f" A circle per episode; filled: {words.won}, hollow: {words.lost}."
         found.append(("Success by distance", about, plots.success_by_distance(ways, words)))
     if budget:
         about = "Share of episodes that have succeeded after a number of decisions."

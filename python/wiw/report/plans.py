@@ -34,18 +34,18 @@ class Primitives:
 
     def observation(self, jpeg: bytes, album: Album) -> bytes:
         """Return the observation as WebP bytes for the album."""
-        return cuts.panorama(jpeg, album.panorama_width, album.quality)
+        return cuts.panorama(jpeg, album.panorama_width, album.quality, album.scale)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
         """Return an imagined or true future as WebP bytes for the album."""
-        return cuts.strip(jpeg, frames, album.frame_height, album.quality)
+        return cuts.strip(jpeg, frames, album.frame_height, album.quality, album.scale)
 
 
 class Numbers(Primitives):
-    """Plans of a space of the user's own, shown as the numbers that they are."""
+    """Plans of a custom plan space, shown as numbers."""
 
     def text(self, plan: Sequence[Any]) -> str:
-        """A plan as numbers."""
+        """Return a plan as numbers."""
         return numbers(plan)
 
 
@@ -71,11 +71,11 @@ class Poses:
 
     def observation(self, jpeg: bytes, album: Album) -> bytes:
         """Return the camera image as WebP bytes for the album."""
-        return cuts.front(jpeg, album.front_side, album.quality)
+        return cuts.front(jpeg, album.front_side, album.quality, album.scale)
 
     def strip(self, jpeg: bytes, frames: int, album: Album) -> bytes:
         """Return an imagined or true future as WebP bytes: every frame without a gap, or the last one."""
-        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole)
+        return cuts.frames(jpeg, frames, album.end_side, album.quality, album.whole, album.scale)
 
 
 def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> list[Primitives | Poses]:
@@ -83,21 +83,21 @@ def plan_views(decisions: Iterable[Mapping[str, Any]], stage: Stage | None) -> l
     found: list[Primitives | Poses] = []
     shut = False
     for row in decisions:
-        if not of_poses(row):
-            found.append(Primitives() if of_primitives(row["actions"]) else Numbers())
+        if not is_pose_row(row):
+            found.append(Primitives() if is_primitive_plan(row["actions"]) else Numbers())
             continue
         found.append(Poses(stage, (row["before_x"], row["before_y"], row["before_z"]), shut))
         shut = row["executed"][-1][6] < SHUT if row["executed"] else shut
     return found
 
 
-def of_poses(row: Mapping[str, Any]) -> bool:
+def is_pose_row(row: Mapping[str, Any]) -> bool:
     """Return whether a decision plans poses of a gripper, vectors of 7 numbers."""
     first = row["actions"][0]
     return isinstance(first, list) and len(first) == 7
 
 
-def of_primitives(plan: Sequence[Any]) -> bool:
+def is_primitive_plan(plan: Sequence[Any]) -> bool:
     """Return whether a plan is made of primitives, whole numbers."""
     return isinstance(plan[0], int)
 

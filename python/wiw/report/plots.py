@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -114,7 +116,15 @@ def blame_by_arm(found: Blame) -> Markup:
         axes.barh(range(len(lines)), counts, left=left, height=0.55, color=color, label=verdict)
         for y, (start, count) in enumerate(zip(left, counts, strict=True)):
             if count:
-                axes.text(start + count / 2, y, f"{count:.0f}", ha="center", va="center", color="white", fontsize=9)
+                axes.text(
+                    start + count / 2,
+                    y,
+                    f"{count:.0f}",
+                    ha="center",
+                    va="center",
+                    color=_readable_on(color),
+                    fontsize=9,
+                )
         left += counts
     axes.set_yticks(range(len(lines)), [_fold(line.arm) for line in lines])
     axes.set_ylim(-0.6, len(lines) - 0.4)
@@ -129,8 +139,8 @@ def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     """Plot success by path length: single episodes where there are few, else rates in bins of equal counts."""
     colors = arm_colors(list(outcomes))
     figure, axes = _figure()
-    if max((len(rows) for rows in outcomes.values()), default=0) < FEW:
-        _outcome_dots(axes, outcomes, colors, words)
+    if shows_single_outcomes(outcomes):
+        _outcome_dots(axes, outcomes, colors)
     else:
         _draw_binned_rates(axes, outcomes, colors)
     axes.set_xlim(left=0)
@@ -139,14 +149,18 @@ def success_by_distance(outcomes: Outcomes, words: Wording) -> Markup:
     return _svg(figure, "success-by-distance")
 
 
-def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str], words: Wording) -> None:
+def shows_single_outcomes(outcomes: Outcomes) -> bool:
+    """Return whether there are so few episodes that `success_by_distance` shows each instead of rates."""
+    return max((len(rows) for rows in outcomes.values()), default=0) < FEW
+
+
+def _outcome_dots(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
     for y, (arm, rows) in enumerate(reversed(list(outcomes.items()))):
         for row in rows:
             filled = colors[arm] if row["metrics"].get("success") else "none"
-            axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9)
+            axes.plot(row["geodesic"], y, "o", ms=9, mfc=filled, mec=colors[arm], mew=1.6, alpha=0.9, clip_on=False)
     axes.set_yticks(range(len(outcomes)), [_fold(arm) for arm in reversed(list(outcomes))])
     axes.set_ylim(-0.6, len(outcomes) - 0.4)
-    axes.figure.suptitle(f"filled: {words.won}, hollow: {words.lost}", x=1, ha="right", fontsize=8, color=INK)
 
 
 def _draw_binned_rates(axes: Axes, outcomes: Outcomes, colors: Mapping[str, str]) -> None:
@@ -191,6 +205,13 @@ def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Mar
     return _svg(figure, "decisions-to-success")
 
 
+def _readable_on(color: str) -> str:
+    """Return black or white, whichever stands out more from a colour."""
+    linear = [((c + 0.055) / 1.055) ** 2.4 for c in to_rgb(color)]
+    luminance = float(np.dot(linear, (0.2126, 0.7152, 0.0722)))
+    return "white" if 1.05 / (luminance + 0.05) >= 4.5 else "black"
+
+
 def _fold(arm: str) -> str:
     """Return an arm's name on lines of at most `LONGEST_LINE` characters, broken after -, + and : where it can be."""
     lines = [""]
@@ -216,8 +237,10 @@ def _figure() -> tuple[Figure, Axes]:
 
 
 def _legend(axes: Axes) -> None:
-    longest = max((len(text) for text in axes.get_legend_handles_labels()[1]), default=0)
-    columns = 4 if longest < 11 else 2 if longest < 20 else 1  # as many as fit the drawing's width
+    texts = axes.get_legend_handles_labels()[1]
+    longest = max(map(len, texts), default=0)
+    widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
+    columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
     axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
 
 
@@ -226,4 +249,5 @@ def _svg(figure: Figure, name: str) -> Markup:
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": name, "font.family": "sans-serif"}):
         figure.savefig(buffer, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
     drawing = buffer.getvalue().replace(INK, "currentColor")
-    return Markup(drawing[drawing.index("<svg") :])  # matplotlib escapes the text it draws
+    drawing = re.sub(r"<metadata>.*?</metadata>|font-family: [^;]*; ", "", drawing[drawing.index("<svg") :], flags=re.S)
+    return Markup(drawing)  # matplotlib escapes the text it draws

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw._core import core
-from wiw.files import whole_folder
-from wiw.report.episodes import outcomes_by_episode, read_story, wording
+from wiw.files import atomic_folder
+from wiw.report.episodes import outcomes_by_episode, read_story, title, wording
 from wiw.report.plots import arm_colors
 from wiw.report.story import Album, Picture, Story, final_answer, place, where
 from wiw.report.templating import environment
@@ -23,8 +23,8 @@ from wiw.runs.run import Run
 from wiw.types import Episode, Wording
 
 
-class Beside(Album):
-    """Pictures as files in a folder, each written once, made by the threads of a pool."""
+class PictureFolder(Album):
+    """An album whose pictures are files in a folder, each written once, by a pool of threads."""
 
     panorama_width, frame_height, quality = 1024, 132, 60
     front_side, end_side, goal_side, map_side, whole = 480, 160, 480, 1100, True
@@ -129,8 +129,8 @@ def write_view(run: Run, folder: Path) -> Site:
     Raises:
         FileError: the folder holds something that is no view, or cannot be written.
     """
-    with whole_folder(folder, replace=is_view) as draft, ThreadPoolExecutor(core.num_threads()) as pool:
-        album = Beside(draft / "images", pool)
+    with atomic_folder(folder, replace=is_view) as draft, ThreadPoolExecutor(core.num_threads()) as pool:
+        album = PictureFolder(draft / "images", pool)
         pages = draft / "episodes"
         pages.mkdir()
         outcomes = outcomes_by_episode(run.store, run.arms)
@@ -170,12 +170,12 @@ def _episode(story: Story, maps: Mapping[str, Picture], values: Mapping[str, Any
 def _common(run: Run) -> dict[str, Any]:
     task = run.store.config["task"]
     return {
-        "title": f"{task.get('task', 'run')} · {run.path.name}",
+        "title": title(run),
         "arms": run.arms,
         "colors": arm_colors(run.arms),
         "radius": task.get("radius"),
         "place": place,
-        "whole": Beside.whole,
+        "whole": PictureFolder.whole,
         "words": wording(run.store),
         "choices": task.get("categories", ()),
     }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plans of a gripper: drawn on what a fixed camera shows, and in signs."""
+"""Plans of a gripper: drawn on a fixed camera's image, and as symbols."""
 
 from __future__ import annotations
 

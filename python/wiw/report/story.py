@@ -43,8 +43,10 @@ class Album:
     whole = False
     """Whether imagined futures of a gripper are shown frame by frame, or only their last frames."""
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float = 1.0) -> None:
+        """Store pictures, except maps, at `scale` of their size; pages show them as large as others."""
         self._pictures: dict[bytes, Picture] = {}
+        self.scale = scale
 
     @property
     def pictures(self) -> list[Picture]:
@@ -66,7 +68,7 @@ class Album:
         data = make()
         key = hashlib.sha256(data).digest()
         if key not in self._pictures:
-            width, height = Image.open(io.BytesIO(data)).size
+            width, height = (round(side / self.scale) for side in Image.open(io.BytesIO(data)).size)
             self._pictures[key] = Picture(self.put(name, "webp", data), f"p{len(self._pictures)}", width, height)
         return self._pictures[key]
 

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How templates of pages are filled: everything is escaped, and a name that is missing is an error."""
+"""Fill the pages' templates: everything is escaped, and a missing name is an error."""
 
 from __future__ import annotations
 
 import math
+from datetime import datetime, timezone
 from functools import cache
 from importlib.resources import files
 
@@ -27,19 +28,30 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {"column": column_title, "p": show_p, "signed": format_signed, "how": _how, "number": _number}
-    made.filters["asset"] = _read_asset
+    made.filters |= {"asset": _read_asset, "minute": _minute, "counted": _count_noun}
     made.tests |= {"binding": _binding, "known": _is_known}
     return made
 
 
 def format_signed(value: float) -> str:
-    """E.g. "+21.3" or "\u22124.0", with a true minus sign."""
+    """Return, e.g., "+21.3" or "\u22124.0", with a true minus sign."""
     return f"{value:+.1f}".replace("-", "\u2212")
 
 
 def _number(value: float) -> str:
     """Return two digits, with a true minus sign."""
     return f"{value:.2f}".replace("-", "\u2212")
+
+
+def _minute(time: str) -> str:
+    """Return e.g. "2026-11-22 18:06 UTC" of a time in ISO format."""
+    return datetime.fromisoformat(time).astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _count_noun(nouns: str, count: float) -> str:
+    """Return e.g. "1 consultation" or "3 real frames" of a count named "consultations" or "real_frames"."""
+    noun = nouns.replace("_", " ")
+    return f"{count:g} {noun.removesuffix('s') if count == 1 else noun}"
 
 
 def _how(estimate: Estimate) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Composes an agent: what experiments and limits a run puts around a policy and a world model."""
+"""Compose an agent: wrap a policy and a world model in a run's experiments and limits."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
 from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
 from wiw.experiments.semantics import SIMULATOR, Labelled
 from wiw.loop.agent import Agent
+from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.attempts import Attempted, make_model
 from wiw.loop.imagination import Imaginer, ModelInput
 from wiw.loop.limits import DEADLINE, Limits
 from wiw.loop.model_imaginer import ModelImaginer
-from wiw.loop.parts import Parts, space_option
 from wiw.loop.rollout_cache import cache_rollouts
 from wiw.registry import WORLD_MODELS
 from wiw.types import PRIMITIVES, Episode, Key
@@ -47,29 +47,29 @@ class Experiment:
     """Source of semantics for models that need it."""
 
 
-def compose(parts: Parts, experiment: Experiment, limits: Limits, context: RunContext) -> Agent:
+def compose(spec: AgentSpec, experiment: Experiment, limits: Limits, context: RunContext) -> Agent:
     """Return the agent that a run evaluates.
 
     Raises:
         ArgumentError: an experiment without a world model, or one that does not fit the plans.
     """
     stages = sort_stages(experiment.ground_truth)
-    config = parts.config.resolve(context.task.defaults)
-    policy = Parts(parts.policy, None, None, config, ()).build().policy
+    config = spec.config.resolve(context.task.defaults)
+    policy = AgentSpec(spec.policy, None, None, config, ()).build().policy
     placebo = None if "imagination" in stages else experiment.placebo
-    model = make_for_space("oracle" if "imagination" in stages else parts.model, policy.space, limits.deadline)
+    model = make_for_space("oracle" if "imagination" in stages else spec.model, policy.space, limits.deadline)
     imaginer = _wrap_model(model, policy.space, placebo, experiment, limits, context)
-    reviser = parts.reviser
+    reviser = spec.reviser
     if reviser is None and not policy.can_revise:
         reviser = context.task.defaults.get("revision")
     if "scoring" in stages or "proposals" in stages:
-        reviser = Parts(policy, imaginer, reviser, config, ()).build().reviser
+        reviser = AgentSpec(policy, imaginer, reviser, config, ()).build().reviser
     if "scoring" in stages:
         reviser = TrueScores(reviser)
     if "proposals" in stages:
         policy = TruePlans(policy)
     measured = [FidelityObserver(limits.lpips)] if limits.measures_fidelity else []
-    observers = [*parts.observers, *measured]
+    observers = [*spec.observers, *measured]
     return Agent(policy, imaginer, reviser, config, observers=observers)
 
 
@@ -120,7 +120,7 @@ def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContex
 
 
 class NextEpisodes:
-    """First moments of the run's next episode, counted round, for swapped placebos.
+    """First observations of the run's next episode (cyclic), for swapped placebos.
 
     Raises:
         ArgumentError: the run has a single episode.
@@ -139,14 +139,14 @@ class NextEpisodes:
         self._moments: dict[tuple[int, int], ModelInput] = {}
 
     def of(self, key: Key) -> ModelInput:
-        """Return the first moment of the next episode."""
+        """Return the first observation of the next episode."""
         name = key.seed, key.episode
         if name not in self._moments:
             self._moments[name] = self._begin((key.episode + 1) % len(self._context.episodes))
         return self._moments[name]
 
     def forget(self, key: Key) -> None:
-        """Drop the moment that is kept for an episode."""
+        """Drop the observation stored for an episode."""
         self._moments.pop((key.seed, key.episode), None)
 
     def _begin(self, index: int) -> ModelInput:

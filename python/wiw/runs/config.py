@@ -25,21 +25,21 @@ class RunConfig(Limits):
     """
 
     episodes: Annotated[int | None, arg(metavar="N")] = None
-    """How many; if not given, as many as the task says: all of an episode file, else 20; for manipulation 50 of each of
+    """Number of episodes; the task's own if not given: all of an episode file, else 20; for manipulation 50 of each of
     its tasks."""
     seed: Annotated[int | None, arg(metavar="N")] = None
-    """All randomness is a function of it; the task's own, 0, if not given."""
+    """Seed of all randomness; the task's own, 0, if not given."""
     out: Annotated[Path | str | None, arg(metavar="DIR")] = None
     """Folder of the run; runs/TASK-TIME if not given."""
     workers: Annotated[int, arg(metavar="N")] = 1
-    """Processes; results do not depend on it. More than one needs a task and an agent that can be pickled, or names."""
+    """Processes; results do not depend on it. More than one needs names, or a task and agent that can be pickled."""
     live: Annotated[int, arg(metavar="N")] = 4
     """Episodes kept live at a time in a process, so that model calls are batched."""
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
     """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
     0.2 MB per decision."""
     resume: bool = False
-    """Whether to go on with the run in `out` where it was stopped."""
+    """Whether to resume the run in `out`."""
     progress: bool = True
     """Whether to show progress bars."""
 
@@ -105,7 +105,7 @@ def read_resume_settings(settings: Mapping[str, Any]) -> ResumeConfig:
 def take_settings(
     config: RunConfig | None, settings: Mapping[str, Any], episodes: int | None = None
 ) -> tuple[RunConfig, dict[str, Any]]:
-    """Return the config with the settings that are its own in place of its values, and the other settings."""
+    """Split settings into those of `RunConfig`, which replace the config's values, and the others."""
     names = {field.name for field in fields(RunConfig)}
     own = {name: value for name, value in settings.items() if name in names}
     own |= {} if episodes is None else {"episodes": episodes}

@@ -10,18 +10,18 @@ from typing import Any
 from wiw.errors import Error, InfrastructureError, StoreError
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
-from wiw.runs.progress import Tracker, make_board
+from wiw.runs.progress import ArmProgress, Tracker, make_board
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, RestartRow
 from wiw.runs.scene_map import draw_scene_maps
 from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
-from wiw.runs.workers import Job, Plan, Row, run_here, run_in_workers
+from wiw.runs.workers import Job, Row, WorkerSpec, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
 
 
 def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
-    """Return how a run's task and agents are made again.
+    """Return the recipes of a run's task and agents.
 
     Raises:
         StoreError: the run was begun with objects that existed only in memory.
@@ -45,7 +45,7 @@ def sources_of(task: Any, agents: Mapping[str, Any]) -> dict[str, str]:
 
 
 def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -> None:
-    """Hold a run to the user's own source files that it was begun with; closes the store where they have changed.
+    """Check that the user's own source files are those the run began with; close the store where they have changed.
 
     Raises:
         StoreError: a file has changed since.
@@ -58,7 +58,7 @@ def require_own_sources(store: RunStore, task: Any, agents: Mapping[str, Any]) -
 
 
 def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: bool = False) -> None:
-    """See that the episodes that a run has left are run with what the others were run with."""
+    """Check that a run's remaining episodes will use the same scenes and source files as the others."""
     episodes = store.episodes()
     try:
         require_scenes(task, store, [episodes[i] for arm in arms for i in store.pending(arm, retry_errors)])
@@ -68,7 +68,7 @@ def require_left(task: Any, store: RunStore, arms: Iterable[str], retry_errors: 
 
 
 def require_scenes(task: Any, store: RunStore, episodes: Iterable[Episode]) -> None:
-    """Check that episodes of a run are run with what the others were run with.
+    """Check that the scenes of these episodes are the ones that the run began with.
 
     Raises:
         FileError: a scene is not there.
@@ -87,11 +87,11 @@ def run_pending(
     workers: int,
     progress: bool,
 ) -> None:
-    """Run these episodes of each arm and close the store."""
+    """Run the pending episodes of each arm and close the store."""
     info = store.info
     episodes = store.episodes()
     pictures = frozenset(info["pictures"])
-    plan = Plan(
+    spec = WorkerSpec(
         task, agents, store.config["seed"], info["live"], pictures, info["limits"], episodes, info.get("sources", {})
     )
     board = make_board(progress and any(pending.values()))
@@ -99,8 +99,8 @@ def run_pending(
         for arm, indices in pending.items():
             store.discard(arm, indices)
         built = task.build()
-        desk = _Desk(store, Tracker({arm: len(indices) for arm, indices in pending.items()}, built.decisions, board))
-        _run_jobs(plan, episodes, pending, desk, workers)
+        writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
+        _run_jobs(spec, episodes, pending, writer, workers)
         drop_spare_pictures(store)
         draw_scene_maps(store, built)
         film_episodes(store, built)
@@ -109,9 +109,22 @@ def run_pending(
         store.close()
 
 
-def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[int]], desk: _Desk, workers: int) -> None:
+def _count_ended(store: RunStore, pending: Mapping[str, list[int]]) -> dict[str, ArmProgress]:
+    """Return how far each arm is, so that a run that goes on counts from where it was stopped."""
+    found = {arm: ArmProgress(len(indices)) for arm, indices in pending.items()}
+    for row in store.outcomes():
+        if row["arm"] in found:
+            found[row["arm"]].count(row["status"], row["metrics"])
+    for progress in found.values():
+        progress.total += progress.ended
+    return found
+
+
+def _run_jobs(
+    spec: WorkerSpec, episodes: list[Episode], pending: Mapping[str, list[int]], writer: _StoreWriter, workers: int
+) -> None:
     sizes = {
-        arm: len(left) if workers == 1 else max(plan.live, math.ceil(len(left) / (3 * workers)))
+        arm: len(left) if workers == 1 else max(spec.live, math.ceil(len(left) / (3 * workers)))
         for arm, left in pending.items()
     }
     jobs = [
@@ -120,23 +133,23 @@ def _run_jobs(plan: Plan, episodes: list[Episode], pending: Mapping[str, list[in
         for first in range(0, len(left), max(1, sizes[arm]))
     ]
     if workers == 1 or len(jobs) == 0:
-        run_here(plan, jobs, desk)
+        run_here(spec, jobs, writer)
     else:
-        run_in_workers(plan, jobs, desk, workers)
+        run_in_workers(spec, jobs, writer, workers)
 
 
 SAME_ERRORS = 5
-"""Failures by the same exception at the beginning of an arm that stop a run."""
+"""Number of equal errors at the beginning of an arm that stop a run."""
 
 
-class _Desk:
-    """Writes rows to the store and tells the bars."""
+class _StoreWriter:
+    """Writes rows to the store and updates the progress bars."""
 
     def __init__(self, store: RunStore, tracker: Tracker) -> None:
         self._store, self._tracker = store, tracker
         self._known: set[str] = set()
         self._first_errors: dict[str, list[str] | None] = {}
-        """By arm: last lines of its failures; None once an episode has gone through."""
+        """By arm: last lines of its errors; None once an episode has ended without one."""
 
     def write(self, row: Row) -> None:
         if isinstance(row, AgentRow):
@@ -144,7 +157,7 @@ class _Desk:
                 self._store.write_agent(row)
             self._known.add(row.arm)
             return
-        if isinstance(row, AgainRow):
+        if isinstance(row, RestartRow):
             self.discard(row.arm, row.episodes)
             return
         if isinstance(row, LostRow):
@@ -155,7 +168,7 @@ class _Desk:
             self._tracker.decision(row.arm, row.episode)
         else:
             self._tracker.episode(row.arm, row.result)
-            self._watch(row.arm, row.result)
+            self._check_repeated_errors(row.arm, row.result)
 
     def discard(self, arm: str, episodes: Iterable[int]) -> None:
         episodes = list(episodes)
@@ -163,8 +176,8 @@ class _Desk:
         for episode in episodes:
             self._tracker.forget(arm, episode)
 
-    def _watch(self, arm: str, result: EpisodeResult) -> None:
-        """Stop a run whose arm begins with nothing but the same failure: a mistake in the set-up, not bad luck."""
+    def _check_repeated_errors(self, arm: str, result: EpisodeResult) -> None:
+        """Stop a run whose arm begins with the same error several times: a mistake in the set-up, not bad luck."""
         if result.status == "done":
             self._first_errors[arm] = None
         errors = self._first_errors.setdefault(arm, [])

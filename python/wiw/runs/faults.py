@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of SQLite as messages that say what is wrong with a run store and what to do."""
+"""Turn SQLite's errors into messages that say what is wrong with a run store and what to do."""
 
 from __future__ import annotations
 

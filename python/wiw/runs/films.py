@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Episodes at a table in motion, for the report: what was carried out is carried out again, and filmed.
+"""Films of manipulation episodes for the report: recorded actions are executed again and filmed.
 
 Physics are a function of the state, so a film shows what truly happened. The store keeps it, as a report has no
 simulator.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""On what a run was made: enough to tell two machines apart."""
+"""Describe the platform of a run: enough to tell two machines apart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def describe_platform() -> dict[str, Any]:
-    """JSON-able: Python, packages, processor, cores, instruction set."""
+    """Return JSON-able facts: Python, packages, processor, cores, instruction set."""
     from wiw._core import core
 
     return {

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from datetime import timedelta
 from typing import Any, Protocol
 
 from wiw.types import EpisodeResult
@@ -16,13 +17,19 @@ class ArmProgress:
     """Progress of one arm, and its success rate so far."""
 
     total: int
-    """Episodes to run."""
-    decisions_each: int
+    """Episodes of the arm, those included that ended before this process began."""
+    decisions_each: int = 1
     """Most decisions an episode may take; ends early where the goal is reached."""
     ended: int = 0
     errors: int = 0
     successes: float = 0.0
     decisions: int = 0
+
+    def count(self, status: str, metrics: Mapping[str, float]) -> None:
+        """Count an episode that has ended."""
+        self.ended += 1
+        self.errors += status == "error"
+        self.successes += metrics.get("success", 0.0)
 
     @property
     def share(self) -> float:
@@ -52,8 +59,8 @@ class Board(Protocol):
 class Tracker:
     """Counts decisions and episodes of a run and updates the board."""
 
-    def __init__(self, totals: Mapping[str, int], decisions_each: int, board: Board) -> None:
-        self._arms = {arm: ArmProgress(total, decisions_each) for arm, total in totals.items()}
+    def __init__(self, arms: Mapping[str, ArmProgress], decisions_each: int, board: Board) -> None:
+        self._arms = {arm: replace(progress, decisions_each=decisions_each) for arm, progress in arms.items()}
         self._running: dict[tuple[str, int], int] = {}
         self._board = board
         for arm, progress in self._arms.items():
@@ -73,9 +80,7 @@ class Tracker:
         """Count an episode that has ended."""
         self.forget(arm, result.episode)
         progress = self._arms[arm]
-        progress.ended += 1
-        progress.errors += result.status == "error"
-        progress.successes += result.metrics.get("success", 0.0)
+        progress.count(result.status, result.metrics)
         self._board.show(arm, progress)
 
 
@@ -109,6 +114,7 @@ class TerminalBoard:
         )
         self._tasks: dict[str, Any] = {}
         self._quarters: dict[str, int] = {}
+        self._begun: dict[str, tuple[float, int]] = {}
         self._bars.start()
 
     def show(self, arm: str, progress: ArmProgress) -> None:
@@ -124,9 +130,22 @@ class TerminalBoard:
 
     def _line(self, arm: str, progress: ArmProgress) -> None:
         quarter = 4 * progress.ended // max(1, progress.total)
-        if quarter > self._quarters.get(arm, 0):
+        if arm not in self._quarters:
             self._quarters[arm] = quarter
-            self._console.print(f"{arm}: {progress.text}", highlight=False)
+        if arm not in self._begun and progress.decisions:
+            self._begun[arm] = time.monotonic(), progress.ended
+        if quarter > self._quarters[arm]:
+            self._quarters[arm] = quarter
+            self._console.print(f"{arm}: {progress.text}{self._describe_time_left(arm, progress)}", highlight=False)
+
+    def _describe_time_left(self, arm: str, progress: ArmProgress) -> str:
+        """Return e.g. ", about 0:12:30 left" for the arm; empty at its end."""
+        begin, before = self._begun.get(arm, (0.0, progress.ended))
+        left = progress.total - progress.ended
+        if not left or progress.ended == before:
+            return ""
+        seconds = left * (time.monotonic() - begin) / (progress.ended - before)
+        return f", about {timedelta(seconds=round(seconds))} left"
 
     def close(self) -> None:
         """Leave the bars as they are."""

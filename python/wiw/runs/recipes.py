@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How tasks and agents are made again: in worker processes, and when a run is resumed."""
+"""Recipes that rebuild tasks and agents: in worker processes, and when a run is resumed."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
+from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
 from wiw.loop.config import AgentConfig
 from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
-from wiw.loop.parts import Parts, space_option
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
@@ -99,7 +99,9 @@ class AgentRecipe(AgentConfig):
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
         policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
-        return compose(Parts(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context)
+        return compose(
+            AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
+        )
 
     @property
     def config(self) -> AgentConfig:
@@ -114,7 +116,7 @@ class AgentRecipe(AgentConfig):
         return replace(self, model=None if none else model, model_options={})
 
     def as_placebo(self, kind: str, model: Any = None) -> AgentRecipe:
-        """Return the same agent, whose world model (or another one) imagines something else than the plans."""
+        """Return the same agent with a placebo of its world model (or of another one)."""
         own = PLACEBO_MODEL if self.model is None else self.model
         return replace(self.with_model(own if model is None else model), placebo=kind)
 
@@ -182,7 +184,7 @@ class AgentRecipe(AgentConfig):
                 found.require(task)
 
     def replaying(self, run: Path) -> AgentRecipe:
-        """Return the same agent with the answers that a run has recorded in the place of its language model."""
+        """Return the same agent with a run's recorded answers in place of its language model."""
         replay = {"vlm": f"replay:{run}", "cache": "off"}
         named: dict[str, Mapping[str, Any]] = {name: {} for name in (self.policy, self.reviser) if name == "vlm"}
         options = {
@@ -218,7 +220,7 @@ def _unwrap(part: Any) -> Any:
 
 
 def _describe(part: Any) -> Any:
-    """Return a part's name, or what an object says of itself."""
+    """Return a part's name, or an object's own description."""
     if isinstance(part, Policy | WorldModel | Imaginer):
         return part.describe()
     return part.__name__ if isinstance(part, type) else part
@@ -253,7 +255,7 @@ class AgentInMemory:
         return self.agent
 
     def describe(self) -> dict[str, Any]:
-        """Return what the agent says of itself."""
+        """Return the agent's own description."""
         return dict(self.agent.describe())
 
     def require(self, task: Mapping[str, Any]) -> None:
@@ -305,8 +307,8 @@ def agent_recipe(agent: Any) -> AgentRecipe | AgentInMemory:
     if isinstance(agent, AgentRecipe):
         return agent
     if type(agent) is Agent:  # a subclass may decide otherwise, and is taken as it is
-        parts = agent.parts
-        return AgentRecipe(parts.policy, parts.model, parts.reviser, observers=parts.observers, **parts.config.numbers)
+        spec = agent.spec
+        return AgentRecipe(spec.policy, spec.model, spec.reviser, observers=spec.observers, **spec.config.numbers)
     if isinstance(agent, BaseAgent):
         return AgentInMemory(agent)
     raise ArgumentError(f"expected a wiw.Agent, an AgentRecipe or a BaseAgent, got {type(agent).__name__}")

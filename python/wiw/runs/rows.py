@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a decision goes into the run store: one row of plain values, and pictures as JPEG for chosen episodes."""
+"""Rows of the run store: a decision as plain values, and its images as JPEG for selected episodes."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class OutcomeRow:
 
 
 @dataclass(frozen=True)
-class AgainRow:
-    """These episodes of an arm begin anew; their rows so far do not count."""
+class RestartRow:
+    """Notice that episodes of an arm start again; their rows so far are discarded."""
 
     arm: str
     episodes: tuple[int, ...]

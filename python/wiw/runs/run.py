@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A run on disk as its readers see it: arms, episodes and decisions."""
+"""Read a run on disk: arms, episodes and decisions."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes from above, for the report: what a camera far over the open roof sees, kept in the run store.
+"""Scene maps for the report: pictures from high above, without the roof, kept in the run store.
 
 The store keeps the picture and where world points lie in it, so that a report needs no scene.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the values of a run store look like, so that one that somebody has edited is an error that names the place."""
+"""The expected shapes of a run store's values, so that a store edited by hand raises an error that names the place."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def parse_column(column: str, text: Any, where: str) -> Any:
 
 
 def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]], where: str) -> None:
-    """Hold a row to the declared types of its columns, which SQLite does not.
+    """Check a row against the declared types of its columns, which SQLite does not.
 
     Raises:
         StoreError: a value is of another type; names `where` and the column.
@@ -111,7 +111,7 @@ def check_types(row: Mapping[str, Any], declared: Mapping[str, tuple[type, ...]]
 
 
 def check_decision(row: Mapping[str, Any], where: str) -> None:
-    """Hold the columns of a decision to each other: one score and one list of frames for each proposal.
+    """Check that a decision's columns agree: one score and one list of frames for each proposal.
 
     Raises:
         StoreError: they do not fit; names `where`.

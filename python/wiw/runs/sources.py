@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's own source files that a run depends on, so that one run never mixes two versions of a model or policy."""
+"""The user's source files that a run depends on, so that one run never mixes two versions of a model or policy."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def source_digests(part: Any) -> dict[str, str]:
 
 
 def require_sources(run: Path, begun_with: Mapping[str, str] | None, now: Mapping[str, str]) -> None:
-    """Hold a run to the source files that it was begun with; a run that does not say which is left alone.
+    """Check that a run's source files are those it began with; a run without a record of them passes.
 
     Raises:
         StoreError: a file has changed, come or gone.
@@ -62,7 +62,7 @@ def require_sources(run: Path, begun_with: Mapping[str, str] | None, now: Mappin
 
 
 def require_unchanged(begun_with: Mapping[str, str]) -> None:
-    """Hold a run that is going on to its source files: an agent that is built later reads them again.
+    """Check that a running run's source files have not changed: agents that are built later read them again.
 
     Raises:
         StoreError: a file has changed or gone.
@@ -137,7 +137,7 @@ def _roots(file: Path) -> list[Path]:
 
 
 def _modules(roots: list[Path], name: str) -> Iterator[Path]:
-    """The files that importing a dotted name runs: packages on the way, the module; the last may be no module."""
+    """Return the files that an import of a dotted name runs: packages and module; the last part may be no module."""
     parts = name.split(".")
     for root in roots:
         for count in range(1, len(parts) + 1):

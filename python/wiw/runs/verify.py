@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs some episodes of a run again and compares everything that was decided and measured with what the run recorded.
+"""Rerun some episodes of a run and compare every decision and measurement with the record.
 
-What a language model said then, it is taken to say again. Timings are left out, and so is a rollout cache, which would
+Recorded answers of a language model are replayed. Timings are left out, and so is a rollout cache, which would
 answer with what is to be checked, and LPIPS, whose last digits depend on threads and device.
 """
 
@@ -18,9 +18,9 @@ from typing import Any
 
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.execute import recipes_of, require_own_sources, require_scenes
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, to_json
 from wiw.runs.store import DECISION_JSON, RunStore
-from wiw.runs.workers import Job, Plan, Runner
+from wiw.runs.workers import Job, Runner, WorkerSpec
 
 UNLIKE = ("seconds", "calls", "spent", "arm", "episode", "decision")
 """Columns of a decision that are not compared: timings, what depends on retries and caches, and the row's own name."""
@@ -46,7 +46,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Verification:
-    """The answer of `wiw.verify`; prints as one line per episode."""
+    """The result of `wiw.verify`; prints as one line per episode."""
 
     run: Path
     checks: tuple[Check, ...]
@@ -110,8 +110,8 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
     limits = {**info.get("limits", {}), "cache": "off", "lpips": None}
     agents = {arm: recipe.replaying(store.path) for arm, recipe in agents.items()}
     pictures = frozenset(info["pictures"])
-    plan = Plan(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
-    runner, found = Runner(plan), dict[tuple[str, int], Facts]()
+    spec = WorkerSpec(task, agents, store.config["seed"], info["live"], pictures, limits, all_episodes)
+    runner, found = Runner(spec), dict[tuple[str, int], Facts]()
     for arm in agents:
         indices = sorted(index for name, index in keys if name == arm)
         if indices:
@@ -122,16 +122,16 @@ def _run_again(store: RunStore, keys: set[tuple[str, int]]) -> dict[tuple[str, i
 
 
 class _Collected:
-    """Stands where the store is written in a run."""
+    """Collects rows in memory, in place of a run store."""
 
     def __init__(self) -> None:
         self._agent: Facts = []
         self._episodes: dict[int, Facts] = {}
 
-    def __call__(self, row: AgentRow | AgainRow | DecisionRow | LostRow | OutcomeRow) -> None:
+    def __call__(self, row: AgentRow | RestartRow | DecisionRow | LostRow | OutcomeRow) -> None:
         if isinstance(row, AgentRow):
             self._agent = [("agent", json.loads(to_json(row.agent)))]
-        elif isinstance(row, AgainRow):
+        elif isinstance(row, RestartRow):
             for index in row.episodes:
                 self._episodes.pop(index, None)
         elif isinstance(row, DecisionRow):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where episodes are run: in this process, or in several that report to it.
+"""Run episodes in this process, or in several worker processes that report to it.
 
 Workers are spawned, never forked: a forked child hangs in an OpenGL context it did not make. Each asks for one job at a
 time and sends rows back; this process alone writes them. A worker that dies takes no episode with it: what it had not
@@ -23,14 +23,14 @@ from typing import Any, Protocol
 from wiw.errors import Error, InfrastructureError
 from wiw.loop.limits import Limits
 from wiw.runs.compose import RunContext
-from wiw.runs.rows import AgainRow, AgentRow, DecisionRow, LostRow, OutcomeRow, decision_row
+from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, RestartRow, decision_row
 from wiw.runs.sources import require_unchanged
 from wiw.types import DecisionRecord, Episode, EpisodeResult
 
-Row = AgainRow | AgentRow | DecisionRow | LostRow | OutcomeRow
+Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
-class Desk(Protocol):
+class ReportReceiver(Protocol):
     """The receiver of the workers' reports."""
 
     def write(self, row: Row) -> None:
@@ -41,8 +41,8 @@ class Desk(Protocol):
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Everything a process must know to run any job."""
+class WorkerSpec:
+    """Everything that a worker process needs to run any job."""
 
     task: Any
     """Recipe."""
@@ -56,7 +56,7 @@ class Plan:
     limits: Mapping[str, Any] = field(default_factory=dict)
     """What every agent is built with beyond its recipe; see `AgentRecipe.build`."""
     episodes: Sequence[Episode] = ()
-    """All episodes of the run, for agents that are shown another one's."""
+    """All episodes of the run, for placebos, which use the observations of other episodes."""
     sources: Mapping[str, str] = field(default_factory=dict)
     """Digests of the user's own source files, which every agent is built of."""
 
@@ -71,22 +71,22 @@ class Job:
 
 
 class RowSink:
-    """Turns what the loop reports into rows."""
+    """Converts the loop's records into rows of the store."""
 
-    def __init__(self, job: Job, plan: Plan, send: Any) -> None:
-        self._job, self._plan, self._send = job, plan, send
+    def __init__(self, job: Job, spec: WorkerSpec, send: Any) -> None:
+        self._job, self._spec, self._send = job, spec, send
 
     def decision(self, record: DecisionRecord) -> None:
         """Record a decision that was taken and carried out."""
-        self._send(decision_row(self._job.arm, record, record.episode in self._plan.pictures))
+        self._send(decision_row(self._job.arm, record, record.episode in self._spec.pictures))
 
     def episode(self, result: EpisodeResult) -> None:
         """Record that an episode has ended."""
         self._send(OutcomeRow(self._job.arm, result))
 
-    def again(self, episodes: Sequence[int]) -> None:
+    def record_restart(self, episodes: Sequence[int]) -> None:
         """Note that these episodes begin anew."""
-        self._send(AgainRow(self._job.arm, tuple(episodes)))
+        self._send(RestartRow(self._job.arm, tuple(episodes)))
 
     def record_lost(self, spent: Mapping[str, float]) -> None:
         """Record that a decision has failed."""
@@ -96,9 +96,9 @@ class RowSink:
 class Runner:
     """Runs jobs in the present process. Only the agent of the current arm is kept: models may fill the memory."""
 
-    def __init__(self, plan: Plan) -> None:
-        self._plan = plan
-        self._task = plan.task.build()
+    def __init__(self, spec: WorkerSpec) -> None:
+        self._spec = spec
+        self._task = spec.task.build()
         self._arm: str | None = None
         self._agent: Any = None
 
@@ -108,47 +108,47 @@ class Runner:
 
         if self._arm != job.arm:
             self._agent = None
-            self._agent = self._plan.agents[job.arm].build(
-                RunContext(self._task, self._plan.episodes), Limits(**self._plan.limits)
+            self._agent = self._spec.agents[job.arm].build(
+                RunContext(self._task, self._spec.episodes), Limits(**self._spec.limits)
             )
-            require_unchanged(self._plan.sources)
+            require_unchanged(self._spec.sources)
             self._arm = job.arm
             send(AgentRow(job.arm, self._agent.describe()))
-        sink = RowSink(job, self._plan, send)
+        sink = RowSink(job, self._spec, send)
         run_episodes(
             self._task,
             self._agent,
             job.episodes,
-            seed=self._plan.seed,
-            live=self._plan.live,
+            seed=self._spec.seed,
+            live=self._spec.live,
             sink=sink,
         )
 
 
-def run_here(plan: Plan, jobs: Iterable[Job], desk: Desk) -> None:
+def run_here(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiver) -> None:
     """Run all jobs in this process."""
-    runner = Runner(plan)
+    runner = Runner(spec)
     for job in jobs:
-        runner.run(job, desk.write)
+        runner.run(job, receiver.write)
 
 
-def run_in_workers(plan: Plan, jobs: Iterable[Job], desk: Desk, workers: int) -> None:
+def run_in_workers(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiver, workers: int) -> None:
     """Run all jobs in `workers` processes.
 
     Raises:
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
-    crew = _Crew(_pickle_plan(plan), deque(jobs), desk, workers)
+    pool = _WorkerPool(_pickle_spec(spec), deque(jobs), receiver, workers)
     try:
-        crew.run()
+        pool.run()
     finally:
-        crew.stop()
+        pool.stop()
 
 
-def _pickle_plan(plan: Plan) -> bytes:
+def _pickle_spec(spec: WorkerSpec) -> bytes:
     try:
-        return pickle.dumps(plan)
+        return pickle.dumps(spec)
     except Exception as error:
         raise InfrastructureError(
             f"task or agent cannot be sent to worker processes ({error}); give names instead of objects "
@@ -165,11 +165,11 @@ class _Worker:
     unfinished: dict[int, Episode] = field(default_factory=dict)
 
 
-class _Crew:
-    """The parent's side: hands out jobs, receives rows, replaces the dead."""
+class _WorkerPool:
+    """The parent's side: assigns jobs to workers, receives their rows, and replaces workers that died."""
 
-    def __init__(self, plan: bytes, jobs: deque[Job], desk: Desk, size: int) -> None:
-        self._plan, self._jobs, self._desk = plan, jobs, desk
+    def __init__(self, spec: bytes, jobs: deque[Job], receiver: ReportReceiver, size: int) -> None:
+        self._spec, self._jobs, self._receiver = spec, jobs, receiver
         self._size = min(size, len(jobs))
         self._workers: list[_Worker] = []
 
@@ -178,7 +178,7 @@ class _Crew:
             for worker in [worker for worker in self._workers if worker.ready and worker.job is None]:
                 self._assign(worker)
             while len(self._workers) < self._size and self._jobs:
-                self._workers.append(_start(self._plan, self._size))
+                self._workers.append(_start(self._spec, self._size))
             by_pipe = {worker.pipe: worker for worker in self._workers}
             for pipe in wait(list(by_pipe)):
                 self._receive(by_pipe[pipe])  # type: ignore[index]
@@ -197,14 +197,14 @@ class _Crew:
         try:
             message = worker.pipe.recv()
         except (EOFError, OSError):
-            self._bury(worker)
+            self._replace_dead_worker(worker)
             return
         if isinstance(message, BaseException):
             raise message
         if message is None:
             worker.ready, worker.job = True, None
             return
-        self._desk.write(message)
+        self._receiver.write(message)
         if isinstance(message, OutcomeRow):
             worker.unfinished.pop(message.result.episode, None)
 
@@ -216,10 +216,10 @@ class _Crew:
         try:
             worker.pipe.send(worker.job)
         except OSError:
-            self._bury(worker)
+            self._replace_dead_worker(worker)
 
-    def _bury(self, worker: _Worker) -> None:
-        """Run again what a dead worker left, or record it as failed.
+    def _replace_dead_worker(self, worker: _Worker) -> None:
+        """Run the unfinished episodes of a dead worker again, or record them as errors.
 
         Raises:
             InfrastructureError: the worker died before it asked for a job, as any other in its place would.
@@ -227,7 +227,7 @@ class _Crew:
         self._workers.remove(worker)
         worker.pipe.close()
         worker.process.join()
-        cause = _cause_of_death(worker.process.exitcode)
+        cause = _describe_exit(worker.process.exitcode)
         if not worker.ready:
             raise InfrastructureError(
                 f"a worker process could not start ({cause}): the task could not be built there; a script that "
@@ -235,36 +235,36 @@ class _Crew:
             )
         if worker.job is None:
             return
-        self._desk.discard(worker.job.arm, list(worker.unfinished))
+        self._receiver.discard(worker.job.arm, list(worker.unfinished))
         for index, episode in worker.unfinished.items():
             if worker.job.attempt == 0:
                 self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
             else:
                 error = f"the worker process died twice on this episode, last: {cause}"
                 result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
-                self._desk.write(OutcomeRow(worker.job.arm, result))
+                self._receiver.write(OutcomeRow(worker.job.arm, result))
 
 
-def _cause_of_death(exit_code: int) -> str:
+def _describe_exit(exit_code: int) -> str:
     if exit_code >= 0:
         return f"exit code {exit_code}"
     name = signal.Signals(-exit_code).name
     return f"{name}, perhaps for lack of memory" if name == "SIGKILL" else name
 
 
-def _start(plan: bytes, workers: int) -> _Worker:
+def _start(spec: bytes, workers: int) -> _Worker:
     context = get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_work, args=(theirs,), daemon=True)
-    with _threads_shared(workers):
+    process = context.Process(target=_run_worker, args=(theirs,), daemon=True)
+    with _share_threads(workers):
         process.start()
     theirs.close()
-    ours.send_bytes(plan)
+    ours.send_bytes(spec)
     return _Worker(process, ours)
 
 
 @contextmanager
-def _threads_shared(workers: int) -> Iterator[None]:
+def _share_threads(workers: int) -> Iterator[None]:
     """Give each worker its share of the cores, through variables that it reads when it starts."""
     share = str(max(1, len(os.sched_getaffinity(0)) // workers))
     added = [name for name in ("WIW_NUM_THREADS", "OMP_NUM_THREADS") if name not in os.environ]
@@ -276,8 +276,8 @@ def _threads_shared(workers: int) -> Iterator[None]:
             del os.environ[name]
 
 
-def _work(pipe: Connection) -> None:
-    """Live as a worker: None means "give me a job"; an end of the pipe means that the parent has gone.
+def _run_worker(pipe: Connection) -> None:
+    """Run the worker's loop: it sends None to request a job; a closed pipe means that the parent has ended.
 
     It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
     """
@@ -300,13 +300,13 @@ def _serve(pipe: Connection) -> None:
     cv2.setNumThreads(int(os.environ.get("WIW_NUM_THREADS", "1")))
     data = pipe.recv_bytes()
     try:
-        plan = pickle.loads(data)  # made by the parent process
+        spec = pickle.loads(data)  # made by the parent process
     except Exception as error:
         raise InfrastructureError(
             f"task or agent cannot be built again in a worker process ({error}); define its class in a file and give "
             "path.py:Class or package.module:Class, or use workers=1"
         ) from error
-    runner = Runner(plan)
+    runner = Runner(spec)
     while True:
         pipe.send(None)
         runner.run(pipe.recv(), pipe.send)

@@ -117,7 +117,7 @@ def apartment(seed: int, split: str = "val", cache: bool = True, *, edits: Seque
         _log.info("%s made in %.1f s", scene.name, time.perf_counter() - started)
         return scene
 
-    identity = ["apartment", store.build_digest(), split, int(seed), *edits]
+    identity: list[str | int] = ["apartment", store.build_digest(), split, int(seed), *edits]
     return store.load_generated(identity, make) if cache else make()
 
 
@@ -158,7 +158,7 @@ def is_generated(spec: str) -> bool:
 def absolute(spec: str | PathLike[str]) -> str:
     """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
     spec = fspath(spec)
-    return spec if is_generated(spec) else str(Path(spec).expanduser().absolute())
+    return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
 
 
 def resolve(spec: str | PathLike[str]) -> list[str]:
@@ -191,6 +191,12 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     if mark:
         raise ArgumentError(f"scene spec '{spec}': edits belong to a single apartment; expected {_FORMS}.")
     return [f"apartments:{split}/{i}" for i in range(int(first or 0), int(end or SPLIT_SIZE))]
+
+
+def _resembles_generated(spec: str) -> bool:
+    """Return whether a spec is no file and looks like a misspelt `apartments:`, to be refused as it was typed."""
+    kind, colon, _ = spec.partition(":")
+    return bool(colon and did_you_mean(kind, ["apartments"])) and not Path(spec).expanduser().exists()
 
 
 def _parse_edits(spec: str, edits: str) -> list[str]:

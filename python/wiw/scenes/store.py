@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Imported and generated scenes on disk, mapped instead of made again.
+"""A disk cache of imported and generated scenes, which are memory-mapped instead of rebuilt.
 
 A scene file is named by the content of everything it was made from: the files read, the options and the importer's
 version. Beside it a small manifest remembers, for one source and its options, which files were read and which were
@@ -90,7 +90,7 @@ def temporary(build: Callable[[Path], Any]) -> _core.scene.Scene:
 
 
 def load_generated(identity: Iterable[str | int], make: Callable[[], _core.scene.Scene]) -> _core.scene.Scene:
-    """A scene that is a function of `identity` (generator, its version, seed, ...) alone: mapped, or made and kept.
+    """Return a scene that depends on `identity` (generator, version, seed, ...) alone: mapped, or generated.
 
     Processes that ask for the same scene at the same time make it once. Where it cannot be kept, for want of room or
     of permission, a warning says so and the scene is in memory only.

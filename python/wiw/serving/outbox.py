@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What still has to be sent to one client, so that one that does not read fills no memory."""
+"""The send queue of one client, bounded so that a client that does not read cannot fill the memory."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Callable
 from typing import Any
 
 UNSENT_BYTES = 256 * 2**20
-"""Of a client's messages that wait; an answer beyond that is not queued, and the client is told to ask again."""
+"""Of a client's messages that wait; an answer beyond that is not queued, and the client must ask again."""
 
 
 class Outbox:
-    """Sends a client's messages one after another: the next is handed over once the one before has left.
+    """Sends a client's messages one after another: each is handed over after the one before has been sent.
 
     Args:
         client: a `websockets` connection.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rows that wait for the model, and which of them make the next batch."""
+"""The queue of rows that wait for the model, and the choice of the next batch."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Queue:
         self._jobs: list[Job] = []
         self._coming: dict[Hashable, int] = {}
         """Rows that each client has announced."""
-        self._owed: Counter[Hashable] = Counter()
+        self._unanswered: Counter[Hashable] = Counter()
         """Rows of each client that wait or are computed."""
         self._latest = -math.inf
         self._ending = False
@@ -67,7 +67,7 @@ class Queue:
         """Remove a client that has gone. Return the jobs that nobody wants any more."""
         with self._changed:
             self._coming.pop(client, None)
-            self._owed.pop(client, None)
+            self._unanswered.pop(client, None)
             for job in self._jobs:
                 job.askers.discard(client)
             orphans = [job for job in self._jobs if not job.askers]
@@ -82,7 +82,7 @@ class Queue:
             full = len(self._jobs) >= self.most
             if not full:
                 self._latest = self._clock()
-                self._owed[client] += 1
+                self._unanswered[client] += 1
                 self._jobs.append(job)
             self._changed.notify()
             return not full
@@ -94,15 +94,15 @@ class Queue:
             self._changed.notify()
 
     def share(self, client: Hashable) -> None:
-        """Note that a client asks what another one has asked already."""
+        """Note that a client asks for a row that another one has already asked for."""
         with self._changed:
-            self._owed[client] += 1
+            self._unanswered[client] += 1
 
     def count_answer(self, client: Hashable) -> None:
         """Count one more answer for a client."""
         with self._changed:
-            if client in self._owed:
-                self._owed[client] -= 1
+            if client in self._unanswered:
+                self._unanswered[client] -= 1
 
     def take_expired(self) -> list[Job]:
         """Take out the jobs whose clients wait no more."""
@@ -133,7 +133,7 @@ class Queue:
             self._changed.notify()
 
     def due(self) -> tuple[list[Job], float]:
-        """Return the batch as far as it is there, and the seconds until it is taken as it is."""
+        """Return the batch so far, and the seconds until it is taken even if it is not full."""
         now = self._clock()
         waiting = [job for job in self._jobs if job.expires > now]
         if not waiting:
@@ -144,6 +144,6 @@ class Queue:
             return batch, 0.0
         if any(self._coming.values()):
             return batch, self._latest + ANNOUNCED - now
-        if all(self._owed[client] > 0 for client in self._coming):
+        if all(self._unanswered[client] > 0 for client in self._coming):
             return batch, 0.0
         return batch, first.arrived + min(LONGEST, self.window * self.batch_seconds) - now

@@ -26,7 +26,7 @@ from websockets.http11 import Request, Response
 
 from wiw.errors import ArgumentError, InfrastructureError, RemoteError
 from wiw.runs.sources import source_digests
-from wiw.serving.known import Known
+from wiw.serving.answer_cache import AnswerCache
 from wiw.serving.outbox import Outbox
 from wiw.serving.queue import Job, Queue
 from wiw.serving.worker import Outcome, Worker
@@ -61,14 +61,14 @@ class Settings:
     """Where and how a model is served.
 
     Args:
-        host: address to listen at.
-        port: 0 takes a free one.
-        token: what clients must show; needed where others than this machine can reach `host`.
+        host: address to listen on.
+        port: port to listen on; 0 picks a free one.
+        token: secret that clients must send; required unless `host` is a loopback address.
         queue: rows that may wait; None means eight full batches, and at least 64 rows.
-        window: share of a batch's time for which one that is not full waits for clients that are idle.
+        window: how long a batch that is not full waits for idle clients, as a share of a batch's time.
         certificate: PEM file, for wss.
         key: PEM file of its key, where that is not in `certificate`.
-        grace: seconds for finishing what was taken when the server is told to end.
+        grace: seconds for finishing the accepted rows once the server is to end.
 
     Raises:
         ArgumentError: a number out of range, a host beyond this machine without a token, a key without a certificate.
@@ -141,11 +141,11 @@ class Server:
         self.queue = Queue(batch, self.settings.queue or max(8 * batch, 64), self.settings.window)
         self.worker = Worker(model, self.queue, self._report)
         self.refused = 0
-        """Messages and connections that were not as agreed."""
+        """Number of messages and connections that violated the protocol."""
         self._welcome = _welcome(model, AHEAD * batch)
         self._jobs: dict[bytes, Job] = {}
-        self._known = Known(KNOWN_BYTES)
-        self._owed: Counter[ServerConnection] = Counter()
+        self._recent_answers = AnswerCache(KNOWN_BYTES)
+        self._unanswered: Counter[ServerConnection] = Counter()
         """Rows of each client that wait, are computed, or whose answers have not left."""
         self._outboxes: dict[ServerConnection, Outbox] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -155,7 +155,7 @@ class Server:
     @property
     def clients(self) -> int:
         """Number of connected clients."""
-        return len(self._owed)
+        return len(self._unanswered)
 
     @property
     def pending_rows(self) -> int:
@@ -187,7 +187,7 @@ class Server:
             self.address = f"{'ws' if self.settings.certificate is None else 'wss'}://{host}:{port}"
             self.worker.start()
             ready()
-            ticking = asyncio.ensure_future(self._tick())
+            ticking = asyncio.ensure_future(self._watch_timeouts())
             await self._ending.wait()
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._finish_rows(), self.settings.grace)
@@ -195,14 +195,14 @@ class Server:
             self.queue.end()
 
     def end(self) -> None:
-        """Take nothing more, finish, and let `run` return. To be called from the loop's thread."""
+        """Accept nothing more, finish, and let `run` return. Call it from the loop's thread."""
         self._ending.set()
 
     # -- connections ---------------------------------------------------------------------------------------------------
 
     async def _listen(self) -> Listener:
         return await serve(
-            self._meet,
+            self._serve_client,
             self.settings.host,
             self.settings.port,
             ssl=self.settings.tls,
@@ -220,7 +220,7 @@ class Server:
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the refusal of a client; None lets it in."""
-        if len(self._owed) >= CLIENTS:
+        if len(self._unanswered) >= CLIENTS:
             return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, f"{CLIENTS} clients are connected already\n")
         token = self.settings.token
         shown = request.headers.get_all("Authorization")
@@ -229,9 +229,9 @@ class Server:
             return connection.respond(HTTPStatus.UNAUTHORIZED, "the token is missing or wrong\n")
         return None
 
-    async def _meet(self, client: ServerConnection) -> None:
+    async def _serve_client(self, client: ServerConnection) -> None:
         """Serve one client, from its first message to its last."""
-        self._owed[client] = 0
+        self._unanswered[client] = 0
         self.queue.join(client)
         outbox = self._outboxes[client] = Outbox(client, self._welcome.in_flight)
         sending = asyncio.ensure_future(outbox.run())
@@ -242,56 +242,56 @@ class Server:
             await client.send(encode(self._welcome))
             async for data in client:
                 await outbox.room()  # what is not read from the client waits on its own machine
-                self._hear(client, outbox, decode(data))
+                self._handle_ask(client, outbox, decode(data))
         except RemoteError as error:
             self.refused += 1
-            await self._dismiss(client, error)
+            await self._refuse_client(client, error)
         except (ConnectionClosed, asyncio.TimeoutError):
             pass
         finally:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
-            del self._owed[client], self._outboxes[client]
+            del self._unanswered[client], self._outboxes[client]
             for job in self.queue.leave(client):
                 del self._jobs[job.id]
             for job in self._jobs.values():
                 job.askers.discard(client)
 
-    async def _dismiss(self, client: ServerConnection, error: RemoteError) -> None:
+    async def _refuse_client(self, client: ServerConnection, error: RemoteError) -> None:
         with contextlib.suppress(ConnectionClosed):
             await client.send(encode(Refusal(b"", error.kind, str(error))))
             await client.close(POLICY_VIOLATION, error.kind)
 
-    async def _send_away(self, client: ServerConnection, outbox: Outbox) -> None:
+    async def _disconnect_client(self, client: ServerConnection, outbox: Outbox) -> None:
         reason = f"{len(outbox)} answers, {outbox.unsent_bytes} bytes, were not read for {UNREAD:g} s"
         with contextlib.suppress(ConnectionClosed, asyncio.TimeoutError):
             await asyncio.wait_for(client.close(POLICY_VIOLATION, reason), CLOSING)
         client.transport.abort()  # the farewell waits behind what is not read
 
-    def _hear(self, client: ServerConnection, outbox: Outbox, said: Message) -> None:
-        if not isinstance(said, Ask):
-            raise RemoteError(f"expected an ask, got {type(said).__name__}", "message")
-        if said.id != row_id(said.row):
+    def _handle_ask(self, client: ServerConnection, outbox: Outbox, message: Message) -> None:
+        if not isinstance(message, Ask):
+            raise RemoteError(f"expected an ask, got {type(message).__name__}", "message")
+        if message.id != row_id(message.row):
             raise RemoteError("ask.id is not the digest of ask.row", "message")
-        answer, reason = self._known.get(said.id), self._cannot(client)
-        taken = answer is None and not reason and self._take(client, said)
-        self.queue.announce(client, said.rest)
+        answer, reason = self._recent_answers.get(message.id), self._explain_refusal(client)
+        taken = answer is None and not reason and self._queue_row(client, message)
+        self.queue.announce(client, message.rest)
         if answer is not None:
             outbox.put(answer)
         elif not taken:
-            outbox.put(encode(Wait(said.id, self._pause(), reason or "the queue is full")))
+            outbox.put(encode(Wait(message.id, self._estimate_wait(), reason or "the queue is full")))
 
-    def _cannot(self, client: ServerConnection) -> str:
-        """Return why no row of this client is taken now; empty where one is."""
+    def _explain_refusal(self, client: ServerConnection) -> str:
+        """Return why no row of this client is accepted now; empty if one is."""
         if self._ending.is_set():
             return "the server is ending"
-        return "too many rows unanswered" if self._owed[client] >= self._welcome.in_flight else ""
+        return "too many rows unanswered" if self._unanswered[client] >= self._welcome.in_flight else ""
 
-    def _pause(self) -> float:
-        """Return the seconds in which there may be room: half a batch."""
+    def _estimate_wait(self) -> float:
+        """Estimate the seconds until there is room: half a batch."""
         return min(2.0, max(0.05, self.queue.batch_seconds / 2))
 
-    def _take(self, client: ServerConnection, ask: Ask) -> bool:
+    def _queue_row(self, client: ServerConnection, ask: Ask) -> bool:
         """Queue a row, unless it is queued or computed already; False where the queue is full."""
         job = self._jobs.get(ask.id)
         now = time.monotonic()
@@ -313,46 +313,46 @@ class Server:
             self.queue.share(client)
             job.expires = max(job.expires, now + ask.seconds)
         job.askers.add(client)
-        self._owed[client] += 1
+        self._unanswered[client] += 1
         return True
 
     # -- answers -------------------------------------------------------------------------------------------------------
 
     def _report(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
-        """Report outcomes from the model's thread; the encoding is left to another, for the model is to go on."""
+        """Report outcomes from the model's thread; another thread encodes them, so that the model can continue."""
         assert self._loop is not None
         with contextlib.suppress(RuntimeError):  # the server has ended
-            self._loop.call_soon_threadsafe(lambda: self._start(self._answer(jobs, outcomes)))
+            self._loop.call_soon_threadsafe(lambda: self._start_task(self._encode_answers(jobs, outcomes)))
 
-    async def _answer(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
+    async def _encode_answers(self, jobs: Sequence[Job], outcomes: Sequence[Outcome]) -> None:
         for job, outcome in zip(jobs, outcomes, strict=True):
             if isinstance(outcome, Refusal):
-                self._settle(job, encode(Refusal(job.id, outcome.kind, outcome.text)))
+                self._send_answer(job, encode(Refusal(job.id, outcome.kind, outcome.text)))
             else:
                 answer = await asyncio.to_thread(encode, Answer(job.id, outcome))
-                self._known.put(job.id, answer)
-                self._settle(job, answer)
+                self._recent_answers.put(job.id, answer)
+                self._send_answer(job, answer)
 
-    def _settle(self, job: Job, answer: bytes) -> None:
-        """Tell all who asked."""
+    def _send_answer(self, job: Job, answer: bytes) -> None:
+        """Send an answer to every client that asked for the row."""
         self._jobs.pop(job.id, None)
-        for client in [client for client in self._owed if client in job.askers]:  # others have gone
+        for client in [client for client in self._unanswered if client in job.askers]:  # others have gone
             self.queue.count_answer(client)
             outbox, message = self._outboxes[client], answer
             if not outbox.takes(len(answer)):
-                message = encode(Wait(job.id, self._pause(), "earlier answers wait to be read"))
-            outbox.put(message, partial(self._release, client))
+                message = encode(Wait(job.id, self._estimate_wait(), "earlier answers wait to be read"))
+            outbox.put(message, partial(self._release_slot, client))
 
-    def _release(self, client: ServerConnection) -> None:
-        self._owed[client] -= 1
+    def _release_slot(self, client: ServerConnection) -> None:
+        self._unanswered[client] -= 1
 
-    def _start(self, work: Any) -> None:
+    def _start_task(self, work: Any) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _tick(self) -> None:
-        """Tell those whose rows were not begun in time, and send those away who read nothing."""
+    async def _watch_timeouts(self) -> None:
+        """Refuse rows that were not begun in time, and disconnect clients that read nothing."""
         leaving = set[ServerConnection]()
         while True:
             await asyncio.sleep(TICK)
@@ -361,9 +361,9 @@ class Server:
                 if outbox.stalled_seconds() > UNREAD and client not in leaving:
                     leaving.add(client)
                     self.refused += 1
-                    self._start(self._send_away(client, outbox))
+                    self._start_task(self._disconnect_client(client, outbox))
             for job in self.queue.take_expired():
-                self._settle(
+                self._send_answer(
                     job, encode(Refusal(job.id, "deadline", "the row was not begun in time: the queue is long"))
                 )
 

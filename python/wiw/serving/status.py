@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One line that says how a server fares."""
+"""One line on the state of a server."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from wiw.serving.server import Server
 
 
 class Status:
-    """What the line is made of; rates are over the time since the line before."""
+    """The numbers of the line; rates are over the time since the previous line."""
 
     def __init__(self, server: Server) -> None:
         self._server = server

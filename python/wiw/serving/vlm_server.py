@@ -131,12 +131,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             self._send(403, _error("web pages are not answered"))
             return
-        told = self.headers.get("content-length", "")
-        if not told.isdecimal():
+        declared = self.headers.get("content-length", "")
+        if not declared.isdecimal():
             self.close_connection = True
             self._send(411, _error("expected a body with its content-length"))
             return
-        length = int(told)
+        length = int(declared)
         if self.path.rstrip("/") != "/v1/chat/completions" or length > MOST_BYTES:
             self.close_connection = True
             self._send(404 if length <= MOST_BYTES else 413, _error(f"{self.path}: {length} bytes"))

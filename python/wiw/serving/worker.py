@@ -14,7 +14,7 @@ from wiw.errors import ContractError
 from wiw.serving.queue import Job, Queue
 from wiw.wire.messages import Refusal
 from wiw.wire.rows import Row, stack
-from wiw.world_models.base import WorldModel, check_rollout, patience
+from wiw.world_models.base import WorldModel, answer_deadline, check_rollout
 
 Outcome = NDArray[np.uint8] | Refusal
 """Frames of a row, or why there are none."""
@@ -34,7 +34,7 @@ class Worker(threading.Thread):
         """Work until the queue has ended."""
         while (batch := self._queue.take()) is not None:
             begin = self.busy_since = time.monotonic()
-            with patience(max(job.expires for job in batch) - begin):
+            with answer_deadline(max(job.expires for job in batch) - begin):
                 outcomes = self._answers([job.row for job in batch])
             seconds, self.busy_since = time.monotonic() - begin, None
             self.batches, self.rows, self.busy_seconds = (

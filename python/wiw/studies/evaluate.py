@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs an agent, or several that differ in one thing, on the same episodes and records everything."""
+"""Run an agent, or several variants of it, on the same episodes and record everything."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def resume_run(
     try:
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
-            raise StoreError(f"{own} is what `wiw blame` keeps of {whole}; go on with it by `wiw blame {whole}`")
+            raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
         task, agents = recipes_of(store)
         require_own_sources(store, task, agents)
         built = task.build()
@@ -126,7 +126,7 @@ def resume_run(
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     if settings.lpips is not None:
-        Lpips(settings.lpips)  # what is missing is told before anything is run
+        Lpips(settings.lpips)  # report missing weights before anything is run
     built = task.build()
     seed = built.seed if settings.seed is None else settings.seed
     count = built.default_episodes if settings.episodes is None else settings.episodes

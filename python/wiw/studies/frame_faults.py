@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is wrong with imagined frames beside what an agent would truly see: channels, orientation, values that wrap."""
+"""Find faults of imagined frames by comparison with the truth: channels, orientation, values that wrap."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Frames = NDArray[np.uint8]
 
 
 def describe_alteration(truth: Sequence[Frames], found: Sequence[Frames]) -> str:
-    """Return what was done to all frames [K, H, W, 3] of some rollouts, in words; nothing where they are as they are.
+    """Describe how all frames [K, H, W, 3] of some rollouts are altered; empty where they are not.
 
     `truth` are frames of the same moments, of any size.
     """
@@ -42,14 +42,14 @@ def mean_correlation(truth: Sequence[Frames], found: Sequence[Frames]) -> float:
     return float(np.mean([correlation(true, frame) for true, frame in _pairs(truth, found)]))
 
 
-def share_of_jumps(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]) -> float:
+def measure_jump_fraction(images: Sequence[NDArray[np.uint8]] | NDArray[np.uint8]) -> float:
     """Return the share of horizontal neighbours in images [..., H, W, 3] that are nearly black and nearly white."""
     jumps = [np.abs(np.diff(image.astype(np.int16), axis=-2)) > JUMP for image in images]
     return float(np.mean([each.mean() for each in jumps]))
 
 
-def exchange_turns(plan: NDArray[Any]) -> NDArray[Any]:
-    """Return a plan of primitives with every turn to the other side."""
+def swap_turns(plan: NDArray[Any]) -> NDArray[Any]:
+    """Return a plan of primitives with left and right turns swapped."""
     exchange = {int(TURN_LEFT): int(TURN_RIGHT), int(TURN_RIGHT): int(TURN_LEFT)}
     return np.array([exchange.get(int(one), int(one)) for one in plan], plan.dtype)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a world model keeps its contract: asked as the loop asks, and told in plain words what is wrong."""
+"""Check a world model's contract by requests like the loop's, with findings in plain words."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from wiw.errors import ArgumentError, ConstructionError, ContractError
 from wiw.loop.attempts import DEADLINE, ExitError, LateError, make_model
 from wiw.loop.history import Frame, stack_histories
 from wiw.loop.plan_space import plan_space
-from wiw.studies.frame_faults import describe_alteration, exchange_turns, mean_correlation, share_of_jumps
+from wiw.studies.frame_faults import describe_alteration, mean_correlation, measure_jump_fraction, swap_turns
 from wiw.studies.model_networks import place_of_computation, training_networks
-from wiw.studies.questions import Frames, Questions, Row
+from wiw.studies.model_queries import Frames, ModelQueries, Row
 from wiw.types import GRIPPER_POSES, PRIMITIVES, Control, History
 from wiw.world_models.base import WorldModel
 from wiw.world_models.pictures import CLOSE, OTHER
@@ -95,7 +95,7 @@ CHECKS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found out about a world model."""
+    """One finding about a world model."""
 
     kind: str
     """"needs", "raised", "deadline", the kind of a `ContractError`, "frame 0", "pictures", "training", "random",
@@ -111,7 +111,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that was looked at, and what came of it."""
+    """One check and its findings."""
 
     name: str
     """A key of `CHECKS`."""
@@ -132,7 +132,7 @@ class Check:
 def check_model(
     model: Any, scenes: str | Path = "apartments:val:1", *, deadline: float = DEADLINE, **options: Any
 ) -> list[Finding]:
-    """Ask a world model a few rollouts as the loop would, and tell what is wrong with its answers.
+    """Request a few rollouts from a world model as the loop would, and report what is wrong with them.
 
         for finding in wiw.check_model(MyModel()):
             print(finding)
@@ -163,7 +163,7 @@ def check_model(
 def examine_model(
     model: Any, scenes: str | Path = "apartments:val:1", *, deadline: float = DEADLINE, **options: Any
 ) -> list[Check]:
-    """Return everything that `check_model` looks at, each with what came of it."""
+    """Return all checks of `check_model`, with their findings."""
     if not deadline > 0:
         raise ArgumentError(f"deadline: expected seconds above 0 (inf waits for ever), got {deadline}")
     try:
@@ -171,7 +171,7 @@ def examine_model(
     except ConstructionError as error:
         cause = error.__cause__
         text = f"{error}." if cause is None or error.kind == "deadline" else f"It cannot be made: {_locate(cause)}."
-        return _only(Finding(error.kind, text))
+        return _build_failed_checks(Finding(error.kind, text))
     if made is None:
         raise ArgumentError("check-model: 'none' stands for no world model; see `wiw list` for those that there are")
     try:
@@ -179,23 +179,23 @@ def examine_model(
             raise ArgumentError(f"check-model knows plans in {', '.join(PLANS)}, and the model takes others")
         plan_space(made.accepts.space).check_model(made, LENGTH)
     except ArgumentError as error:
-        return _only(Finding("needs", f"{error}."))
-    return _Check(made, str(scenes), deadline).checks()
+        return _build_failed_checks(Finding("needs", f"{error}."))
+    return _ModelExaminer(made, str(scenes), deadline).checks()
 
 
-def _only(finding: Finding) -> list[Check]:
-    """Return a first check that leaves nothing to ask."""
+def _build_failed_checks(finding: Finding) -> list[Check]:
+    """Return all checks, the first failed and the others skipped."""
     first, *others = CHECKS
     return [Check(first, (finding,)), *(Check(name, skipped="there is no model to ask") for name in others)]
 
 
-class _Check:
+class _ModelExaminer:
     """One model under examination."""
 
     def __init__(self, model: WorldModel, scenes: str, deadline: float) -> None:
         self.model, self.accepts, self.deadline = model, model.accepts, deadline
         self.plans = PLANS[self.accepts.space]
-        self.asking = Questions(model, scenes, deadline)
+        self.queries = ModelQueries(model, scenes, deadline)
         self.steps = min(LENGTH, self.accepts.frames - 1 if self.accepts.frames else LENGTH)
         self.rows: list[Row] = []
         self.frames: Frames = np.empty(0, np.uint8)
@@ -203,33 +203,33 @@ class _Check:
         self._done: dict[str, Check] = {"construction": Check("construction")}
 
     def checks(self) -> list[Check]:
-        """Yield all checks, in order; the first broken answer ends the asking."""
+        """Return all checks, in order; the first invalid answer ends the requests."""
         asked: Mapping[str, Callable[[], Iterable[Finding]]] = {
-            "answer": self._answer,
-            "frame 0": self._first_frames,
-            "pictures": self._pictures,
-            "plan": self._plan,
-            "training": self._training,
-            "random": self._again,
-            "batch": self._alone,
-            "causal": self._causal,
-            "history": self._history,
-            "length": self._short,
-            "inputs": self._inputs,
-            "memory": self._memory,
+            "answer": self._check_answer,
+            "frame 0": self._check_first_frames,
+            "pictures": self._check_pictures,
+            "plan": self._check_plan,
+            "training": self._check_training_mode,
+            "random": self._check_determinism,
+            "batch": self._check_batch_independence,
+            "causal": self._check_causality,
+            "history": self._check_history,
+            "length": self._check_short_plans,
+            "inputs": self._check_inputs,
+            "memory": self._check_memory,
         }
         broken = ""
         for name, look in asked.items():
-            broken = self._look(name, look, broken) or broken
-        self._done["identity"] = Check("identity", tuple(self._identity()))
-        self._done["speed"] = self._speed()
+            broken = self._run_check(name, look, broken) or broken
+        self._done["identity"] = Check("identity", tuple(self._check_identity()))
+        self._done["speed"] = self._measure_speed()
         return [self._done[name] for name in CHECKS]
 
-    def _look(self, name: str, look: Callable[[], Iterable[Finding]], broken: str) -> str:
-        """Look at one thing; return why nothing more can be asked, if that is so."""
+    def _run_check(self, name: str, look: Callable[[], Iterable[Finding]], broken: str) -> str:
+        """Run one check; return why no further requests can be made, if so."""
         if name in self._done:  # it is what broke
             return ""
-        skipped = broken or self._needless(name)
+        skipped = broken or self._find_skip_reason(name)
         if skipped:
             self._done[name] = Check(name, skipped=skipped)
             return ""
@@ -241,14 +241,12 @@ class _Check:
         except LateError:
             finding = Finding(
                 "deadline",
-                f"No answer in {self.deadline:g} s, so it was asked no more. In a run such a call is made three times, "
-                "then its episode has failed. Does it wait for a download, a lock, a server or a prompt? If it is only "
-                "slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
+                f"No answer in {self.deadline:g} s, so the check stopped. In a run such a call is made three times, "
+                "then its episode ends with an error. Does it wait for a download, a lock, a server or a prompt? If it "
+                "is only slow, give it a longer deadline, here and in the run, or a smaller best_batch.",
             )
         except ExitError as error:
-            text = (
-                f"`rollout` raised {_locate(error.__cause__ or error)}. A model that cannot answer raises an Exception."
-            )
+            text = f"`rollout` raised {_locate(error.__cause__ or error)}. Raise an Exception to report a failure."
             finding = Finding("raised", text)
         except Exception as error:
             finding = Finding("raised", f"`rollout` raised {_locate(error)}.")
@@ -258,8 +256,8 @@ class _Check:
         self._done[where] = Check(where, (finding,))
         return "it gave no usable answer"
 
-    def _needless(self, name: str) -> str:
-        """Return why something need not be looked at, if that is so."""
+    def _find_skip_reason(self, name: str) -> str:
+        """Return why a check can be skipped; empty if it cannot."""
         if name in ("batch", "causal", "history") and self._done["random"].findings:
             return "every comparison would fail: its answers are random"
         if name == "causal" and not self.accepts.causal:
@@ -270,18 +268,18 @@ class _Check:
             return f"it declares {self.accepts.frames} frames"
         return ""
 
-    def _answer(self) -> Iterator[Finding]:
-        self.rows = self.asking.rows([plan[: self.steps] for plan in self.plans])
-        self.asking.ask(self.rows[:1])  # the first call may load and compile
-        self.frames = self.asking.ask(self.rows)
-        self.row_seconds = self.asking.row_seconds
+    def _check_answer(self) -> Iterator[Finding]:
+        self.rows = self.queries.rows([plan[: self.steps] for plan in self.plans])
+        self.queries.ask(self.rows[:1])  # the first call may load and compile
+        self.frames = self.queries.ask(self.rows)
+        self.row_seconds = self.queries.row_seconds
         yield from ()
 
-    def _short(self) -> Iterator[Finding]:
-        self.asking.ask(self.asking.rows([plan[:SHORT] for plan in self.plans]))
+    def _check_short_plans(self) -> Iterator[Finding]:
+        self.queries.ask(self.queries.rows([plan[:SHORT] for plan in self.plans]))
         yield from ()
 
-    def _first_frames(self) -> Iterator[Finding]:
+    def _check_first_frames(self) -> Iterator[Finding]:
         off = np.abs(self.frames[:, 0].astype(np.int16) - np.stack([row.image for row in self.rows]))
         if not off.any():
             return
@@ -290,7 +288,7 @@ class _Check:
             yield Finding(
                 "frame 0",
                 f"Frame 0 is the observation only nearly: {difference}, as of a picture that was encoded and decoded. "
-                "That costs next to nothing; frames[:, 0] = observations.image mends it.",
+                "That costs next to nothing; frames[:, 0] = observations.image corrects it.",
                 serious=False,
             )
         else:
@@ -300,9 +298,9 @@ class _Check:
                 "in front: frames[:, 0] = observations.image.",
             )
 
-    def _pictures(self) -> Iterator[Finding]:
-        own = self._own()
-        jumps, usual = share_of_jumps(own), share_of_jumps(np.stack([row.image for row in self.rows]))
+    def _check_pictures(self) -> Iterator[Finding]:
+        own = self._select_action_frames()
+        jumps, usual = measure_jump_fraction(own), measure_jump_fraction(np.stack([row.image for row in self.rows]))
         if jumps > MANY_JUMPS + 4 * usual:
             yield Finding(
                 "pictures",
@@ -310,18 +308,18 @@ class _Check:
                 f"(in the observations: {usual:.1%}). Clip before the cast: np.clip(frames, 0, 255).astype(np.uint8).",
             )
             return
-        truth = self.asking.true_frames(self.rows, [row.plan for row in self.rows])
+        truth = self.queries.true_frames(self.rows, [row.plan for row in self.rows])
         if fault := describe_alteration(truth, own):
             yield Finding("pictures", f"After frame 0, {fault}, beside what an agent would truly see.")
 
-    def _own(self) -> list[Frames]:
-        """Return the frames of each row that stand for its actions."""
+    def _select_action_frames(self) -> list[Frames]:
+        """Return the frames of each row that correspond to its actions."""
         if self.accepts.space == PRIMITIVES:
             return [frames[1 : 1 + self.steps] for frames in self.frames]
         places = action.frames_of_actions(self.steps, self.frames.shape[1], "resample")[:, 1]
         return [frames[places] for frames in self.frames]
 
-    def _plan(self) -> Iterator[Finding]:
+    def _check_plan(self) -> Iterator[Finding]:
         places = {id(row): place for place, row in enumerate(self.rows)}
         pairs = [(self.frames[places[id(one)]], self.frames[places[id(other)]]) for one, other in _pairs(self.rows)]
         if self.accepts.control == "image" or not pairs:
@@ -334,8 +332,8 @@ class _Check:
                 serious=False,
             )
             return
-        own, plans = self._own(), [row.plan for row in self.rows]
-        truth = self.asking.true_frames(self.rows, plans)
+        own, plans = self._select_action_frames(), [row.plan for row in self.rows]
+        truth = self.queries.true_frames(self.rows, plans)
         alike = mean_correlation(truth, own)
         if mean_correlation([frames[::-1] for frames in truth], own) > max(OTHER, alike + MARGIN):
             yield Finding(
@@ -344,7 +342,7 @@ class _Check:
                 "follows action k: frames[:, 1:] = frames[:, :0:-1] turns them round.",
             )
         elif self.accepts.space == PRIMITIVES:
-            swapped = self.asking.true_frames(self.rows, [exchange_turns(plan) for plan in plans])
+            swapped = self.queries.true_frames(self.rows, [swap_turns(plan) for plan in plans])
             if mean_correlation(swapped, own) > max(OTHER, alike + MARGIN):
                 yield Finding(
                     "plan",
@@ -352,7 +350,7 @@ class _Check:
                     "Azimuths grow to the left (docs/conventions.md).",
                 )
 
-    def _training(self) -> Iterator[Finding]:
+    def _check_training_mode(self) -> Iterator[Finding]:
         for path, layers in training_networks(self.model):
             yield Finding(
                 "training",
@@ -360,56 +358,56 @@ class _Check:
                 "statistics mix the rows. Call .eval() on it once it is loaded.",
             )
 
-    def _again(self) -> Iterator[Finding]:
+    def _check_determinism(self) -> Iterator[Finding]:
         shared = min(1, self.steps - 1)
-        off = _off(self.asking.ask(self.rows, shared), self.frames, shared, self.steps)
+        off = _compute_differences(self.queries.ask(self.rows, shared), self.frames, shared, self.steps)
         if off.any():
-            yield self._differing(
+            yield self._build_difference_finding(
                 "random",
-                f"Asked twice with the same seeds, {_share(off)} differ, by up to {off.max()} of 255. Draw all noise "
+                f"In two calls with the same seeds, {_count_rows(off)} differ, by up to {off.max()} of 255. Draw noise "
                 "from the row's own seed, as torch.Generator().manual_seed(int(seed)), switch dropout off (eval()), "
                 "and keep nothing from one call to the next.",
                 off,
             )
 
-    def _alone(self) -> Iterator[Finding]:
+    def _check_batch_independence(self) -> Iterator[Finding]:
         rows = self.rows
         shared, some = min(2, self.steps - 1), [len(rows) - 1, len(rows) // 2]
-        alone = np.concatenate([self.asking.ask([rows[place]], shared) for place in some])
-        off = _off(alone, self.frames[some], shared, self.steps)
+        alone = np.concatenate([self.queries.ask([rows[place]], shared) for place in some])
+        off = _compute_differences(alone, self.frames[some], shared, self.steps)
         if off.any():
-            yield self._differing(
+            yield self._build_difference_finding(
                 "batch",
-                f"A row depends on the rows beside it: alone, {_share(off)} differ from the same in a batch of "
+                f"A row depends on the rows beside it: alone, {_count_rows(off)} differ from the same in a batch of "
                 f"{min(len(rows), self.accepts.best_batch)}, by up to {off.max()} of 255. Draw each row's noise from "
                 "its own seed, not the batch's from the first one, and mix no statistics over the batch (BatchNorm in "
                 "training).",
                 off,
             )
 
-    def _causal(self) -> Iterator[Finding]:
+    def _check_causality(self) -> Iterator[Finding]:
         """Check whether frames of a declared causal model stay the same when later primitives change."""
         alike = [
             (one, other)
             for one, other in _pairs(self.rows)
-            if len(one.control.actions) >= LENGTH and _begin_alike(one.control, other.control)
+            if len(one.control.actions) >= LENGTH and _share_first_actions(one.control, other.control)
         ]
         if not alike:
             return
         one, other = alike[0]
-        answer = self.asking.ask([replace(other, seed=one.seed)])
-        off = _off(answer, self.asking.ask([one]), 0, ALIKE)
+        answer = self.queries.ask([replace(other, seed=one.seed)])
+        off = _compute_differences(answer, self.queries.ask([one]), 0, ALIKE)
         if off.any():
-            yield self._differing(
+            yield self._build_difference_finding(
                 "causal",
                 f"It declares causal=True, but frames before a changed action change with it, by up to {off.max()} "
                 "of 255; plans that begin alike would share frames that are not theirs. Declare causal=False.",
                 off,
             )
 
-    def _history(self) -> Iterator[Finding]:
-        young = self.asking.ask([replace(row, history=_first_moment(row.history)) for row in self.rows])
-        if not _off(young, self.frames, 0, self.steps).any():
+    def _check_history(self) -> Iterator[Finding]:
+        young = self.queries.ask([replace(row, history=_first_moment(row.history)) for row in self.rows])
+        if not _compute_differences(young, self.frames, 0, self.steps).any():
             yield Finding(
                 "history",
                 "What was observed before makes no difference: at an episode's first moment its frames are the same. "
@@ -417,21 +415,21 @@ class _Check:
                 serious=False,
             )
 
-    def _inputs(self) -> Iterator[Finding]:
-        if self.asking.changed:
-            changed = ", ".join(sorted(self.asking.changed))
+    def _check_inputs(self) -> Iterator[Finding]:
+        if self.queries.changed:
+            changed = ", ".join(sorted(self.queries.changed))
             yield Finding("inputs", f"It changes what it is given: {changed}. Work on a copy.")
 
-    def _memory(self) -> Iterator[Finding]:
+    def _check_memory(self) -> Iterator[Finding]:
         time.sleep(SETTLE)  # for a thread that still writes
-        self.asking.look_back()
-        if self.asking.reuses:
+        self.queries.check_rewrites()
+        if self.queries.reuses:
             yield Finding(
                 "memory",
                 "An answer lies in the memory of an earlier one, which is still looked at when the next call is made. "
                 "Return an array of its own, as frames.copy().",
             )
-        elif self.asking.rewrites:
+        elif self.queries.rewrites:
             yield Finding(
                 "memory",
                 "An answer was written to after it was returned, while it was being looked at: by a later call, a "
@@ -439,7 +437,7 @@ class _Check:
                 "it is whole.",
             )
 
-    def _identity(self) -> Iterator[Finding]:
+    def _check_identity(self) -> Iterator[Finding]:
         try:
             json.dumps(self.model.describe())
         except Exception as error:
@@ -451,7 +449,7 @@ class _Check:
                 "`version = '1'`, and raise it whenever its answers change.",
             )
 
-    def _speed(self) -> Check:
+    def _measure_speed(self) -> Check:
         if not self.row_seconds:
             return Check("speed", skipped="it gave no usable answer")
         run, rows = RUNS[self.accepts.space]
@@ -467,8 +465,8 @@ class _Check:
         )
         return Check("speed", (found,) if hours > LONG_RUN else (), detail=detail)
 
-    def _differing(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
-        """Return a finding, which is no breach where it may be rounding."""
+    def _build_difference_finding(self, kind: str, text: str, off: NDArray[np.int16]) -> Finding:
+        """Return a finding, which is not serious where it may be rounding."""
         if off.max() > NOISE:
             return Finding(kind, text)
         where = place_of_computation(self.model)
@@ -480,8 +478,8 @@ class _Check:
         return Finding(kind, f"{text} {cause[where]}", serious=False)
 
 
-def _begin_alike(one: Control, other: Control) -> bool:
-    """Whether two plans have their first actions in common: primitives, or poses after that of the observation."""
+def _share_first_actions(one: Control, other: Control) -> bool:
+    """Return whether two plans share their first actions: primitives, or poses after that of the observation."""
     if one.ids is None or other.ids is None or len(one.ids) == len(one.actions):
         return np.array_equal(one.actions[:ALIKE], other.actions[:ALIKE])
     return np.array_equal(one.ids[: 1 + ALIKE], other.ids[: 1 + ALIKE])
@@ -500,18 +498,18 @@ def _pairs(rows: Sequence[Row]) -> list[tuple[Row, Row]]:
     return [(one, other) for one, other in combinations(rows, 2) if np.array_equal(one.image, other.image)]
 
 
-def _off(found: Frames, expected: Frames, shared: int, steps: int) -> NDArray[np.int16]:
+def _compute_differences(found: Frames, expected: Frames, shared: int, steps: int) -> NDArray[np.int16]:
     """Return absolute differences of the frames that are read."""
     read = slice(1 + shared, 1 + steps)
     return np.abs(found[:, read].astype(np.int16) - expected[:, read])
 
 
-def _share(off: NDArray[np.int16]) -> str:
+def _count_rows(off: NDArray[np.int16]) -> str:
     return f"{sum(bool(row.any()) for row in off)} of {len(off)} rows"
 
 
 def _locate(error: BaseException) -> str:
-    """Return what was raised, and where: the last line before libraries were entered, which is the model's own."""
+    """Return the exception and its place: the last line outside libraries, which is the model's own."""
     frames = traceback.extract_tb(error.__traceback__)
     place = ([frame for frame in frames if not frame.filename.startswith(LIBRARIES)] or frames)[-1]
     return f"{type(error).__name__}: {error} ({Path(place.filename).name}, line {place.lineno}: {place.line})"

@@ -66,7 +66,7 @@ def _training_layers(network: Any) -> list[str]:
 
 
 def _acts_otherwise(layer: Any) -> bool:
-    """Return whether a layer does something else in training than in use."""
+    """Return whether a layer behaves differently in training mode."""
     from torch.nn.modules.batchnorm import _BatchNorm
     from torch.nn.modules.dropout import _DropoutNd
 

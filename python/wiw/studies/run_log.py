@@ -60,9 +60,28 @@ class RunLog(Run):
         found = read_blame(self.store)
         return Records(line.as_dict() for line in found.arms) if found is not None else Records()
 
-    def report(self, path: str | Path | None = None) -> Path:
-        """Write a self-contained HTML report and return its path; default `report.html` in the run's folder."""
-        return write_report(self, Path(path) if path is not None else self.path / "report.html")
+    def report(
+        self,
+        path: str | Path | None = None,
+        *,
+        episodes: int | None = None,
+        max_mb: float | None = None,
+        remark: str = "",
+    ) -> Path:
+        """Write a self-contained HTML report and return its path.
+
+        Args:
+            path: of the file; `report.html` in the run's folder if not given.
+            episodes: how many to show with pictures; all that kept them if not given.
+            max_mb: most megabytes of the file; pictures are made smaller, then episodes left out, until it fits.
+            remark: sentence that the page shows below the result.
+
+        Raises:
+            ArgumentError: a number out of range, or less than the tables and plots take.
+            FileError: the file cannot be written; what was there before is kept.
+        """
+        file = Path(path) if path is not None else self.path / "report.html"
+        return write_report(self, file, episodes=episodes, max_mb=max_mb, remark=remark)
 
     def view(self, folder: str | Path | None = None) -> Path:
         """Write pages to walk through all episodes and decisions; return the one to open, `view/index.html`."""

@@ -33,7 +33,7 @@ class Table:
         self.bench = setup.build_workbench(backend, robot)
         self.goal = Goal(task, text=setup.instruction)
         self.objects = setup.objects
-        """Names of what agents are told the place of."""
+        """Names of the objects whose positions agents know."""
 
     def is_success(self) -> bool:
         """Return whether what is asked for is done."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets import ar
-from wiw.datasets.visibility import visible_share
+from wiw.datasets.visibility import visible_fraction
 from wiw.datasets.worlds import World, world
 from wiw.envs.episode_state import EpisodeState
 from wiw.envs.pointing import Pointing
@@ -155,8 +155,8 @@ class AR(NavigationTask):
             "success": float(final is not None and final.label == category),
             "actions": float(state.actions),
             "confidence": 0.0 if final is None else final.confidence,
-            "visible_start": visible_share(state.world, state.positions[0], target),
-            "visible_end": visible_share(state.world, state.positions[-1], target),
+            "visible_start": visible_fraction(state.world, state.positions[0], target),
+            "visible_end": visible_fraction(state.world, state.positions[-1], target),
             "category": float(self.choices.index(category)),
             "predicted": -1.0 if final is None else float(self.choices.index(final.label)),
         }

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`Task`: everything that evaluation asks of a task, with defaults where a task may be silent.
+"""`Task`: the interface that evaluation relies on, with defaults where a task need not say anything.
 
 `docs/write-your-own-task.md` has the shortest one.
 """
@@ -73,7 +73,7 @@ class Task(ABC):
 
     @property
     def default_episodes(self) -> int:
-        """How many episodes a run has where it is not told."""
+        """Default number of episodes of a run."""
         return 20
 
     @property

@@ -44,7 +44,7 @@ class ManipulationRules:
     execute: int
     """Poses carried out per decision; 0: all of the chosen plan; negative: all but that many, at least one."""
     episodes: int
-    """Of each task, where a run is not told how many."""
+    """Default number of episodes per task."""
 
     def __post_init__(self) -> None:
         if min(self.actions, self.candidates, self.horizon, self.episodes) < 1:
@@ -52,7 +52,7 @@ class ManipulationRules:
 
 
 class Manipulation(ManipulationSpec, Task):
-    """Push buttons, slide a block, put a ring on a peg, stack cups; told in words, done by gripper poses.
+    """Push buttons, slide a block, put a ring on a peg, stack cups; instructions in words, actions by gripper poses.
 
     Args:
         tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
@@ -69,7 +69,7 @@ class Manipulation(ManipulationSpec, Task):
     space = GRIPPER_POSES
     has_guide = True
     sensor_options = ("size", "cameras", "ids", "cloud", "grid")
-    wording = Wording("did what it was told", "done", "not done", "what is left", asked="Told", steps="decisions")
+    wording = Wording("completed the task", "done", "not done", "what is left", asked="Instruction", steps="decisions")
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class Manipulation(ManipulationSpec, Task):
 
     @property
     def default_episodes(self) -> int:
-        """Episodes of a run that is not told how many."""
+        """Default number of episodes of a run."""
         return self.rules.episodes * len(self.tasks)
 
     @property

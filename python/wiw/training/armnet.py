@@ -18,7 +18,7 @@ from wiw.errors import ArgumentError
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.plays import POSES, Plays
 from wiw.training.trainer import run_training, warmup_cosine_schedule
-from wiw.world_models.armnet.body import plate
+from wiw.world_models.armnet.body import render_bare_table
 from wiw.world_models.armnet.motion import motion as motion_of
 from wiw.world_models.armnet.network import (
     FRONT,
@@ -26,12 +26,12 @@ from wiw.world_models.armnet.network import (
     Arm,
     Motion,
     Network,
+    build_sources,
     clear_arm,
+    compose_static_view,
     compose_view,
+    find_unoccluded_arm,
     find_visible_arm,
-    in_sight,
-    sources,
-    still,
 )
 
 HELD_OUT = 150
@@ -180,7 +180,7 @@ def _to_tensor(images: NDArray[np.uint8]) -> Tensor:
 
 def load_bare_table() -> Tensor:
     """Return the network's window of the table without arm and objects, [1, 3, h, w]."""
-    return _to_tensor(plate(FRONT).color[WINDOW][None].copy())
+    return _to_tensor(render_bare_table(FRONT).color[WINDOW][None].copy())
 
 
 @dataclass(frozen=True)
@@ -189,7 +189,7 @@ class StepPrediction:
 
     prediction: Tensor
     target: Tensor
-    still: Tensor
+    static_view: Tensor
     """The view if nothing but the arm had moved."""
     shares: Tensor
     sources: Tensor
@@ -209,7 +209,7 @@ def predict_free_running(network: Network, sequences: Sequences, bfloat16: bool 
 
 def clear_canvas(seen: Tensor, arm: Arm, before: Tensor) -> Tensor:
     """Return the canvas after a true view."""
-    return clear_arm(seen, arm, in_sight(seen, arm), load_bare_table(), before)
+    return clear_arm(seen, arm, find_unoccluded_arm(seen, arm), load_bare_table(), before)
 
 
 def predict_teacher_forced(network: Network, sequences: Sequences, bfloat16: bool = False) -> Iterator[StepPrediction]:
@@ -233,12 +233,14 @@ def _predict_step(
     plate = load_bare_table()
     with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
         mixture = network(canvas, arm, before, motion, plate)
-    parts = sources(mixture, canvas, arm, motion, plate)
-    return StepPrediction(compose_view(mixture.shares, parts), target, still(canvas, arm, plate), mixture.shares, parts)
+    parts = build_sources(mixture, canvas, arm, motion, plate)
+    return StepPrediction(
+        compose_view(mixture.shares, parts), target, compose_static_view(canvas, arm, plate), mixture.shares, parts
+    )
 
 
 def _compute_loss(step: StepPrediction, recipe: Recipe) -> Tensor:
-    differs = ((step.target - step.still).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD).float()
+    differs = ((step.target - step.static_view).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD).float()
     weight = 1 + recipe.changes * functional.max_pool2d(differs, 3, 1, 1)
     gap = step.prediction - step.target
 
@@ -283,7 +285,7 @@ def evaluate(network: Network, plays: Plays) -> dict[str, Any]:
                 if number not in EVALUATED_STEPS:
                     continue
                 arm = batch.arms[number]
-                alone = still(first, arm, plate)
+                alone = compose_static_view(first, arm, plate)
                 changed = (step.target - alone).abs().amax(1, keepdim=True) > CHANGE_THRESHOLD
                 for name, made in (("copy", batch.views[0]), ("arm", alone), ("armnet", step.prediction)):
                     gap = made - step.target

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from wiw.errors import ArgumentError, FileError
-from wiw.files import whole_file
+from wiw.files import atomic_file
 
 
 class ResumableTrainer:
@@ -95,7 +95,7 @@ class Checkpoint:
             return
         packed = io.BytesIO()  # torch's own writer reports a full disk by a bare RuntimeError
         torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": trainer.state_dict()}, packed)
-        with whole_file(self.path) as draft:
+        with atomic_file(self.path) as draft:
             draft.write_bytes(packed.getbuffer())
         self._last_saved = time.monotonic()
 

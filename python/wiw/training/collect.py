@@ -26,7 +26,7 @@ import wiw
 from wiw.datasets import shards
 from wiw.datasets.demonstrations import MANIFEST, Demonstrations, read_manifest, shard_paths, shard_range
 from wiw.errors import ArgumentError, FileError, InfrastructureError
-from wiw.files import sweep, whole_file
+from wiw.files import atomic_file, remove_abandoned_drafts
 from wiw.render import resolve_backend
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS
@@ -156,9 +156,9 @@ def _open_folder(folder: Path, config: Mapping[str, Any]) -> None:
     """Create the folder with its manifest, or check that the manifest there describes the same collection."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        sweep(folder)
+        remove_abandoned_drafts(folder)
         if not any(folder.iterdir()):
-            with whole_file(folder / MANIFEST) as draft:
+            with atomic_file(folder / MANIFEST) as draft:
                 draft.write_text(json.dumps(config, indent=2) + "\n")
     except OSError as error:
         raise FileError(f"{folder}: cannot be written ({error.strerror}); name another folder with --out") from error

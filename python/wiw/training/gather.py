@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.datasets.worlds import world
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.perception.glimpses import Glimpses
 from wiw.perception.scene_labels import CATEGORIES
 from wiw.scenes.store import build_digest
@@ -175,7 +175,7 @@ def _build_missing(names: Sequence[str], files: dict[str, Path], job: Job, worke
 
 def _build_file(name: str, file: Path, job: Job) -> str:
     arrays = job.make(name)
-    with whole_file(file) as draft, draft.open("wb") as stream:
+    with atomic_file(file) as draft, draft.open("wb") as stream:
         np.savez(stream, **arrays)  # type: ignore[arg-type]
     return name
 

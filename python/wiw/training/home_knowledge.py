@@ -10,7 +10,7 @@ from pathlib import Path
 
 from wiw.datasets.questions.answers import MATERIALS
 from wiw.datasets.questions.facts import STRUCTURE, SceneTable, make_table
-from wiw.files import whole_file
+from wiw.files import atomic_file
 from wiw.scenes import apartment_table
 
 APARTMENTS = 200
@@ -49,5 +49,5 @@ def _find_commonest(counts: Counter[str]) -> str:
 def write_knowledge(path: str | Path, apartments: int = APARTMENTS) -> None:
     """Count in the first train apartments and write the file that `wiw.policies.explorer.home.load_knowledge` reads."""
     found = count_homes([make_table(apartment_table(seed, "train")) for seed in range(apartments)])
-    with whole_file(Path(path)) as partial:
+    with atomic_file(Path(path)) as partial:
         partial.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")

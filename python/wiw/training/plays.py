@@ -23,7 +23,7 @@ from wiw.tabletop.base import DOWN, TableSetup, TabletopTask
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import TABLE, Workbench
 from wiw.training.gather import Arrays, Job, ProgressBar, gather_arrays
-from wiw.world_models.armnet.body import sights
+from wiw.world_models.armnet.body import render_arm
 from wiw.world_models.armnet.network import FRONT, WINDOW
 
 POSES = 8
@@ -131,7 +131,7 @@ def _record_play(rng: np.random.Generator, number: int) -> Plays:
 
 def _build_play(views: NDArray[np.uint8], commanded: NDArray[np.float64]) -> Plays:
     """Return one play, with renderings of the arm alone at the same poses."""
-    arms = list(sights(commanded, FRONT))
+    arms = list(render_arm(commanded, FRONT))
     return Plays(
         views[None],
         np.stack([arm.color[WINDOW] for arm in arms])[None],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
 from wiw.report.cuts import BAND, FRONT, part
-from wiw.report.plans import glyphs, numbers, of_primitives
+from wiw.report.plans import glyphs, is_primitive_plan, numbers
 from wiw.report.stage import signs
 from wiw.runs.rows import select_frames
 from wiw.tabletop.workbench import SHUT
@@ -78,7 +78,7 @@ def _describe_plan(decision: Decision, index: int) -> str:
     actions, here = decision.proposals[index].actions.tolist(), decision.observation
     if isinstance(here, ArmObservation):
         return signs(actions, here.pose[:3].tolist(), bool(here.pose[6] < SHUT))
-    return " ".join(glyphs(actions)) if of_primitives(actions) else numbers(actions)
+    return " ".join(glyphs(actions)) if is_primitive_plan(actions) else numbers(actions)
 
 
 def _candidate(figure: Figure, place: Any, decision: Decision, index: int, scores: NDArray[np.float64]) -> None:

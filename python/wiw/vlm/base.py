@@ -126,8 +126,8 @@ class Client(ABC):
     def _keep(self, replies: Sequence[Reply]) -> None:
         """Cache the answers that were used; unusable ones are requested again next time."""
         if self.cache is not None:
-            said = [each for reply in replies for each in reply.said if each.used]
-            self.cache.put({self._make_cache_name(each.call): each.completion for each in said})
+            used = [each for reply in replies for each in reply.completions if each.used]
+            self.cache.put({self._make_cache_name(each.call): each.completion for each in used})
 
     def _make_cache_name(self, name: str) -> str:
         return f"{self.manner} {name}"

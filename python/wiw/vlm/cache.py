@@ -111,4 +111,4 @@ class ReplyCache:
 
     def _give_up(self, error: Exception) -> None:
         self._broken = True
-        _log.warning("answers are not kept any more: %s; make room or name another folder", error)
+        _log.warning("answers are no longer cached: %s; free disk space or name another folder", error)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.vlm import choices, structured
-from wiw.vlm.messages import Call, Completion, Problem, Reply, Request, Said
+from wiw.vlm.messages import Call, Completion, CompletionRecord, Problem, Reply, Request
 
 RETRY_TEMPERATURE = 0.7
 """Least temperature of a repeated question: at 0 the same answer would come."""
@@ -38,11 +38,11 @@ class Conversation:
         except StopIteration as end:
             reply: Reply = end.value
             latest = len(self._said) - len(answers)
-            said = tuple(
-                Said(name, completion, reply.problem is None and (bool(reply.by) or place >= latest))
+            records = tuple(
+                CompletionRecord(name, completion, reply.problem is None and (bool(reply.by) or place >= latest))
                 for place, (name, completion) in enumerate(self._said)
             )
-            self.calls, self.reply = [], replace(reply, said=said)
+            self.calls, self.reply = [], replace(reply, completions=records)
 
 
 def _ask_for_text(request: Request) -> Talk:

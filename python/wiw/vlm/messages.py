@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is said between a policy and a vision-language model: requests, calls, completions and replies."""
+"""Messages between a policy and a vision-language model: requests, calls, completions and replies."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class Problem:
 
 
 @dataclass(frozen=True)
-class Said:
+class CompletionRecord:
     """One completion of a conversation, for the record."""
 
     call: str
@@ -150,7 +150,7 @@ class Reply:
     repaired: bool = False
     """Whether JSON syntax errors were repaired."""
     problem: Problem | None = None
-    said: tuple[Said, ...] = field(default=(), repr=False)
+    completions: tuple[CompletionRecord, ...] = field(default=(), repr=False)
 
     @property
     def doubtful(self) -> bool:

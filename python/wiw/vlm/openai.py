@@ -139,7 +139,7 @@ class OpenAIClient(Client):
         return openai.OpenAI(base_url=self.base_url, api_key=key, timeout=self.timeout, max_retries=0, http_client=http)
 
     def _cut_off(self, response: Any) -> None:
-        """The SDK reads all of an error's body; of that, the beginning will do."""
+        """Truncate the body of an error, which the SDK would read whole."""
         if response.is_error:
             response.stream = _begin(response, self.timeout / 4)
 
@@ -172,7 +172,7 @@ class OpenAIClient(Client):
         return replace(completion, retries=retries.count)
 
     def _receive_completion(self, body: dict[str, Any]) -> Completion:
-        """One request; the body is read piece by piece, so that neither its length nor its pace has the last word."""
+        """Send one request; read the body piece by piece, with limits on length and time."""
         until = time.monotonic() + self.timeout
         data = bytearray()
         with self._sdk.chat.completions.with_streaming_response.create(**body) as response:
@@ -185,10 +185,10 @@ class OpenAIClient(Client):
         return _completion(bytes(data))
 
     def _ask_with_retries(self, work: Any, retries: _Retries | None = None) -> Any:
-        """Work that asks the server, done again where the server may come round.
+        """Call the server, with retries for errors that may pass.
 
         Raises:
-            VlmError: it did not in `attempts`, or said that it never will.
+            VlmError: all `attempts` failed, or the server refused the request.
         """
         import openai
 
@@ -224,7 +224,7 @@ class OpenAIClient(Client):
 
 
 def _within(seconds: float, work: Callable[[], Any]) -> Any:
-    """Do the work in a thread of its own, which is left behind where it takes longer.
+    """Do the work in a separate thread, which is abandoned after `seconds`.
 
     The transport limits each read but not their sum, so headers that drip in would take any time.
 
@@ -247,12 +247,12 @@ def _within(seconds: float, work: Callable[[], Any]) -> Any:
 
 @dataclass
 class _Retries:
-    """How often a request was sent in vain."""
+    """The number of failed attempts of a request."""
 
     count: int = 0
 
     def pause(self) -> float:
-        """Seconds, doubling from a half, spread so that many clients do not come back at once."""
+        """Return the seconds to wait: doubling from a half, with jitter."""
         return float(0.5 * 2**self.count * (0.75 + 0.5 * random.random()))
 
 
@@ -265,7 +265,7 @@ class _BrokenOffError(Exception):
 
 
 def _pieces(response: Any) -> Iterator[bytes]:
-    """The body as it comes; what the SDK's transport raises meanwhile is of classes that it does not name."""
+    """Yield the body in pieces; the transport's errors, which have private classes, become `_BrokenOffError`."""
     try:
         yield from response.iter_bytes()
     except Exception as error:
@@ -273,7 +273,7 @@ def _pieces(response: Any) -> Iterator[bytes]:
 
 
 def _begin(response: Any, seconds: float) -> Any:
-    """A response's stream that ends after some bytes and some time."""
+    """Return a response's stream that ends after some bytes or some time."""
     transport: Any = import_module(type(response).__module__.partition(".")[0])  # httpx, or what the SDK has instead
     stream = response.stream
 
@@ -301,7 +301,7 @@ def _short(error: Exception) -> str:
 
 
 def _read_retry_after(error: Any) -> float | None:
-    """Seconds that the server asks to wait: `Retry-After`, in seconds or as a date."""
+    """Return the seconds of the header `Retry-After`, which is a number or a date."""
     value = error.response.headers.get("retry-after")
     if value is None:
         return None
@@ -326,7 +326,7 @@ def _message(message: Message, images: dict[int, str]) -> dict[str, Any]:
 
 
 def _completion(data: bytes) -> Completion:
-    """Raises _NoCompletionError where the body is something else than a chat completion."""
+    """Parse a chat completion; raise _NoCompletionError for anything else."""
     try:
         body = json.loads(data)
         choice = body["choices"][0]
@@ -347,19 +347,19 @@ def _completion(data: bytes) -> Completion:
 
 
 def _tokens(count: Any) -> int:
-    """Nothing where the server does not say."""
+    """Return a token count; 0 where the server gives none."""
     if not 0 <= int(count or 0) < 2**31:
         raise ValueError(f"{count} tokens")
     return int(count or 0)
 
 
 def _clean(text: str) -> str:
-    """Text that can be written down: without lone surrogates."""
+    """Return the text without lone surrogates, so that it can be encoded."""
     return text.encode("utf-8", "replace").decode()
 
 
 def _first_token(logprobs: Any) -> tuple[tuple[str, float], ...] | None:
-    """Likeliest first tokens; None where the server lists none."""
+    """Return the likeliest first tokens; None where the server lists none."""
     tokens = (logprobs or {}).get("content") or []
     listed = tokens[0].get("top_logprobs") or [] if tokens else []
     pairs = tuple((_clean(str(each["token"])), float(each["logprob"])) for each in listed)

@@ -65,7 +65,7 @@ def fill_template(source: str, slots: Mapping[str, Any]) -> str:
 
 
 def answer(job: Mapping[str, Any]) -> dict[str, str]:
-    """Return what came of a job: "text", "unknown" or "error"."""
+    """Return the result of a job, under "text", "unknown" or "error"."""
     try:
         unknown = unknown_slot(job["source"], job["slots"]) if job["check"] else None
         return {"text": fill_template(job["source"], job["slots"])} if unknown is None else {"unknown": unknown}

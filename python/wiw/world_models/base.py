@@ -277,25 +277,25 @@ class WorldModel(ABC):
         return digest.hexdigest()
 
 
-_GIVE_UP: ContextVar[float] = ContextVar("wiw_give_up", default=math.inf)
+_DEADLINE: ContextVar[float] = ContextVar("wiw_give_up", default=math.inf)
 
 
 @contextmanager
-def patience(seconds: float) -> Iterator[None]:
-    """Tells models that are asked inside for how long their answer is waited for."""
-    token = _GIVE_UP.set(time.monotonic() + seconds)
+def answer_deadline(seconds: float) -> Iterator[None]:
+    """Set the deadline of calls to models inside the block, in seconds from now; models read it by `seconds_left`."""
+    token = _DEADLINE.set(time.monotonic() + seconds)
     try:
         yield
     finally:
-        _GIVE_UP.reset(token)
+        _DEADLINE.reset(token)
 
 
 def seconds_left() -> float:
-    """For how long the caller of `rollout` still waits for its answer: for models that wait for others themselves.
+    """Return the seconds that the caller of `rollout` still waits: for models that wait for servers themselves.
 
-    Infinite where nobody has set a deadline.
+    Infinite where no deadline is set.
     """
-    return _GIVE_UP.get() - time.monotonic()
+    return _DEADLINE.get() - time.monotonic()
 
 
 @lru_cache(64)

@@ -66,7 +66,7 @@ def check_pictures(
             raise ContractError(f"{name}.rollout: {SCALE}", "scale")
         expected = observed.astype(np.float32)
         exact = np.array_equal(row[0], observed)
-        if not exact and (fault := first_frame_fault(expected, row[0].astype(np.float32))):
+        if not exact and (fault := find_first_frame_fault(expected, row[0].astype(np.float32))):
             raise ContractError(
                 f"{name}.rollout: frame 0 is not the observation: {fault}. Frame k is what follows action k; "
                 "put the observation in front: frames[:, 0] = observations.image",
@@ -80,7 +80,7 @@ def check_pictures(
             raise ContractError(f"{name}.rollout: after frame 0, {CHANNELS}", "channels")
 
 
-def first_frame_fault(observed: Picture, found: Picture) -> str:
+def find_first_frame_fault(observed: Picture, found: Picture) -> str:
     """Return what is wrong with a frame 0, in words; nothing where it is the observation, if only by and large."""
     if are_channels_swapped(observed, found):
         return CHANNELS

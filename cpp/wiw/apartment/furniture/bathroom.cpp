@@ -12,7 +12,8 @@ struct Ring {
   float hx, hz, y, z;
 };
 
-void add_rings(Make& m, MaterialId material, const std::vector<Ring>& rings, float power, int segments = 24) {
+void add_rings(FurnitureBuilder& m, MaterialId material, const std::vector<Ring>& rings, float power,
+               int segments = 24) {
   for (std::size_t i = 0; i + 1 < rings.size(); ++i) {
     // Each band is its own strip of quads, so that edges between bands stay crisp.
     for (int s = 0; s < segments; ++s) {
@@ -26,7 +27,7 @@ void add_rings(Make& m, MaterialId material, const std::vector<Ring>& rings, flo
   }
 }
 
-void add_tap(Make& m, const Vec3& base, float height, float reach) {
+void add_tap(FurnitureBuilder& m, const Vec3& base, float height, float reach) {
   m.shape.cylinder(m.chrome(), base, base + Vec3(0, 0.02f, 0), 0.024f, 0.022f, 12);
   m.shape.tube(m.chrome(),
                {base, base + Vec3(0, height, 0), base + Vec3(0, height + 0.02f, 0.3f * reach),
@@ -40,7 +41,7 @@ void add_tap(Make& m, const Vec3& base, float height, float reach) {
 
 }  // namespace
 
-void make_toilet(Make& m) {
+void make_toilet(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   m.describe({0.94f, 0.94f, 0.93f}, "ceramic");
   const float hz = 0.5f * m.d(), z = 0.1f;
@@ -82,7 +83,7 @@ void make_toilet(Make& m) {
   }
 }
 
-void make_bathtub(Make& m) {
+void make_bathtub(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   m.describe({0.94f, 0.94f, 0.93f}, "enamel");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -110,7 +111,7 @@ void make_bathtub(Make& m) {
   m.shape.cylinder(m.chrome(), {-0.5f * hx, 0.152f, 0}, {-0.5f * hx, 0.158f, 0}, 0.03f, 0.03f, 12);
 }
 
-void make_shower(Make& m) {
+void make_shower(FurnitureBuilder& m) {
   const MaterialId white = m.white(), metal = m.chrome();
   m.describe({0.94f, 0.94f, 0.93f}, "ceramic");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -134,7 +135,7 @@ void make_shower(Make& m) {
                 {open ? -hx + 0.4f * m.w() : hx - 0.02f, h - 0.015f, hz + 0.02f}, open ? 4 : 6);
 }
 
-void make_washbasin(Make& m) {
+void make_washbasin(FurnitureBuilder& m) {
   const MaterialId white = m.white();
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   const bool vanity = m.rng.chance(0.65);
@@ -163,7 +164,7 @@ void make_washbasin(Make& m) {
   if (vanity && m.w() > 0.65f) m.supports.push_back({{hx - 0.1f, h, -hz + 0.07f}, {0.04f, 0.02f}, 0.3f});
 }
 
-void make_washing_machine(Make& m) {
+void make_washing_machine(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.75) ? Rgb(0.94f, 0.94f, 0.94f) : Rgb(0.35f, 0.36f, 0.38f);
   m.describe(color, "metal");
   const MaterialId body = m.plain("metal", color);
@@ -195,7 +196,7 @@ void make_washing_machine(Make& m) {
   m.supports.push_back({{0, h, -0.02f}, {hx - 0.1f, hz - 0.12f}, 0.6f});
 }
 
-void make_towel_rail(Make& m) {
+void make_towel_rail(FurnitureBuilder& m) {
   const float hx = 0.5f * m.w(), z = -0.5f * m.d();
   for (const float y : {0.f, 0.28f}) {
     m.shape.tube(m.chrome(), {{-hx, y, z}, {-hx, y, z + 0.07f}, {hx, y, z + 0.07f}, {hx, y, z}}, 0.009f, 8);
@@ -207,7 +208,7 @@ void make_towel_rail(Make& m) {
                    {0.8f * hx, 0.292f, z + 0.09f}, 0.015f);
 }
 
-void make_laundry_basket(Make& m) {
+void make_laundry_basket(FurnitureBuilder& m) {
   m.describe(m.look.wood, "wicker");
   const float r = 0.5f * m.w(), h = m.h();
   m.shape.lathe(m.materials.tinted(Pattern::kWicker, m.look.wood), Vec3::Zero(),

@@ -5,7 +5,7 @@ namespace wiw::apartment {
 
 namespace {
 
-void add_pillows(Make& m, MaterialId cover, float width, float top, float back) {
+void add_pillows(FurnitureBuilder& m, MaterialId cover, float width, float top, float back) {
   const int count = width > 1.2f ? 2 : 1;
   const float each = std::min(0.68f, (width - 0.12f) / static_cast<float>(count));
   for (int i = 0; i < count; ++i) {
@@ -17,14 +17,15 @@ void add_pillows(Make& m, MaterialId cover, float width, float top, float back) 
 }
 
 /// Quilt that hangs over three sides, turned back at the pillows.
-void add_quilt(Make& m, MaterialId quilt, MaterialId lining, float half, float top, float from, float front) {
+void add_quilt(FurnitureBuilder& m, MaterialId quilt, MaterialId lining, float half, float top, float from,
+               float front) {
   m.shape.soft_box(quilt, {-half - 0.025f, top - 0.22f, from}, {half + 0.025f, top + 0.05f, front + 0.02f}, 0.045f,
                    0.02f, 2);
   m.shape.soft_box(lining, {-half - 0.03f, top - 0.16f, from - 0.05f}, {half + 0.03f, top + 0.065f, from + 0.24f},
                    0.04f, 0.f, 2);
 }
 
-void add_headboard(Make& m, MaterialId wood, MaterialId fabric, int style, float back) {
+void add_headboard(FurnitureBuilder& m, MaterialId wood, MaterialId fabric, int style, float back) {
   const float half = 0.5f * m.w(), h = m.h();
   if (style == 0) {
     m.shape.soft_box(wood, {-half, 0.1f, back}, {half, h, back + 0.05f}, 0.02f);
@@ -50,7 +51,7 @@ void add_headboard(Make& m, MaterialId wood, MaterialId fabric, int style, float
 
 }  // namespace
 
-void make_bed(Make& m) {
+void make_bed(FurnitureBuilder& m) {
   const Rgb wood_color = m.case_color();
   const Rgb cover = m.fabric_color();
   const MaterialId wood = m.case_material(wood_color), sheet = m.fabric({0.93f, 0.92f, 0.9f});
@@ -71,7 +72,7 @@ void make_bed(Make& m) {
   m.attributes["state"] = "made";
 }
 
-void make_bunk_bed(Make& m) {
+void make_bunk_bed(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const Rgb cover = m.fabric_color();
   const MaterialId quilt = m.fabric(cover), sheet = m.fabric({0.93f, 0.92f, 0.9f});
@@ -98,7 +99,7 @@ void make_bunk_bed(Make& m) {
   m.shape.box(wood, {hx - 0.47f, 0, hz - 0.02f}, {hx - 0.43f, h, hz + 0.02f});
 }
 
-void make_nightstand(Make& m) {
+void make_nightstand(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId wood = m.case_material(color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), legs = range(m.rng, 0.f, 1.f) < 0.6f ? 0.14f : 0.f;

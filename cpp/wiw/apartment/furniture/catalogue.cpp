@@ -9,26 +9,26 @@
 
 namespace wiw::apartment {
 
-Rgb Make::case_color() {
+Rgb FurnitureBuilder::case_color() {
   const double kind = rng.uniform();
   const Rgb color = kind < 0.68 ? look.wood : kind < 0.8 ? look.trim : look.fabrics[rng.below(2)];
   describe(color, color == look.wood ? "wood" : "lacquer");
   return color;
 }
 
-Rgb Make::fabric_color() {
+Rgb FurnitureBuilder::fabric_color() {
   const Rgb color = look.fabrics[rng.chance(0.6) ? 0 : rng.chance(0.75) ? 1 : 2];
   describe(color, "fabric");
   return color;
 }
 
-bool Make::draw_open(double chance) {
+bool FurnitureBuilder::draw_open(double chance) {
   const bool drawn = rng.chance(chance), open = state.empty() ? drawn : state == "open";
   attributes["state"] = open ? "open" : "closed";
   return open;
 }
 
-MaterialId Make::case_material(const Rgb& color) { return color == look.wood ? wood(color) : plain("lacquer", color); }
+MaterialId FurnitureBuilder::case_material(const Rgb& color) { return color == look.wood ? wood(color) : plain("lacquer", color); }
 
 namespace {
 

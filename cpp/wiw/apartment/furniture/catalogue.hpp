@@ -27,8 +27,9 @@ struct Bulb {
   float strength = 1.f;  // of a room's main lamp
 };
 
-/// What a furniture function is given, and what it fills in. Frame: see Shape; back at z = -size.z / 2.
-struct Make {
+/// Inputs of a furniture function, and the shape and attributes that it fills in. Frame: see Shape; back at z = -size.z
+/// / 2.
+struct FurnitureBuilder {
   Vec3 size;  // width, height, depth
   Rng& rng;
   MaterialTable& materials;
@@ -65,7 +66,7 @@ struct Make {
     attributes["material"] = kind;
   }
 };
-using MakeFn = void (*)(Make&);
+using FurnitureFn = void (*)(FurnitureBuilder&);
 
 enum class Mount {
   kWall,     // on the floor, back to a wall
@@ -105,7 +106,7 @@ struct Companion {
 /// One kind of furniture: a function and a row of the catalogue.
 struct Category {
   const char* name;
-  MakeFn make;
+  FurnitureFn make;
   Vec3 smallest, largest;  // width, height, depth
   Mount mount;
   float front = 0.f;   // free floor it needs in front

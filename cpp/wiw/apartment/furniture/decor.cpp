@@ -13,8 +13,8 @@ constexpr std::array<Pattern, 7> kPaintings{Pattern::kPictureHills,  Pattern::kP
 
 /// Bent leaf from `base` outwards; two crossing strips would look flat from above, so the blade is folded along its
 /// rib.
-void add_leaf(Make& m, MaterialId green, const Vec3& base, float turn, float length, float width, float rise,
-              float droop) {
+void add_leaf(FurnitureBuilder& m, MaterialId green, const Vec3& base, float turn, float length, float width,
+              float rise, float droop) {
   const Vec3 out(std::sin(turn), 0, std::cos(turn)), side(std::cos(turn), 0, -std::sin(turn));
   constexpr int kSteps = 5;
   const auto rib = [&](int i) {
@@ -37,7 +37,7 @@ void add_leaf(Make& m, MaterialId green, const Vec3& base, float turn, float len
 
 }  // namespace
 
-void make_rug(Make& m) {
+void make_rug(FurnitureBuilder& m) {
   constexpr std::array<Pattern, 4> kStyles{Pattern::kRugBorder, Pattern::kRugStripes, Pattern::kRugDiamonds,
                                            Pattern::kRugShag};
   const Pattern style = pick(m.rng, kStyles);
@@ -56,7 +56,7 @@ void make_rug(Make& m) {
   m.shape.quad(edge, {-hx, 0, -hz}, {0, 0, 2 * hz}, {0, h, 0});
 }
 
-void make_plant(Make& m) {
+void make_plant(FurnitureBuilder& m) {
   const float r = 0.5f * m.w(), h = m.h(), pot = range(m.rng, 0.2f, 0.3f);
   const Rgb clay = m.rng.chance(0.5) ? m.look.fabrics[m.rng.below(3)] : Rgb(0.72f, 0.45f, 0.33f);
   const float pr = std::min(0.17f, 0.6f * r);
@@ -92,7 +92,7 @@ void make_plant(Make& m) {
   }
 }
 
-void make_picture(Make& m) {
+void make_picture(FurnitureBuilder& m) {
   const float hx = 0.5f * m.w(), h = m.h(), z = -0.5f * m.d();
   const Rgb frame_color = m.rng.chance(0.4)   ? m.look.wood
                           : m.rng.chance(0.5) ? Rgb(0.1f, 0.1f, 0.1f)
@@ -117,7 +117,7 @@ void make_picture(Make& m) {
   m.shape.image(art, {-x + mat, y0 + mat, z + 0.01f}, {2 * (x - mat), 0, 0}, {0, y1 - y0 - 2 * mat, 0});
 }
 
-void make_mirror(Make& m) {
+void make_mirror(FurnitureBuilder& m) {
   const float hx = 0.5f * m.w(), h = m.h(), z = -0.5f * m.d();
   m.describe(m.look.wood, "glass");
   // Renderers here do not trace reflections: pale glass stands for the reflected room.
@@ -136,7 +136,7 @@ void make_mirror(Make& m) {
   m.shape.quad(glass, {-hx + 0.025f, 0.025f, z + 0.0215f}, {2 * hx - 0.05f, 0, 0}, {0, h - 0.05f, 0});
 }
 
-void make_clock(Make& m) {
+void make_clock(FurnitureBuilder& m) {
   const float r = 0.5f * m.w();
   const Rgb color = m.look.fabrics[m.rng.below(2)];
   m.describe(color, "plastic");
@@ -159,7 +159,7 @@ void make_clock(Make& m) {
   m.shape.set_frame(before);
 }
 
-void make_curtain(Make& m) {
+void make_curtain(FurnitureBuilder& m) {
   const Rgb color = m.fabric_color();
   const MaterialId cloth = m.fabric(color);
   const float hx = 0.5f * m.w(), h = m.h();
@@ -178,7 +178,7 @@ void make_curtain(Make& m) {
   }
 }
 
-void make_radiator(Make& m) {
+void make_radiator(FurnitureBuilder& m) {
   const Rgb color = m.look.trim;
   m.describe(color, "metal");
   const MaterialId body = m.plain("metal", color);
@@ -192,7 +192,7 @@ void make_radiator(Make& m) {
   m.shape.tube(body, {{hx - 0.01f, 0.16f, 0.01f}, {hx + 0.04f, 0.16f, 0.01f}, {hx + 0.04f, 0.f, 0.01f}}, 0.009f, 6);
 }
 
-void make_bin(Make& m) {
+void make_bin(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.5) ? m.look.fabrics[m.rng.below(2)] : Rgb(0.7f, 0.71f, 0.72f);
   m.describe(color, "plastic");
   const float r = 0.5f * m.w(), h = m.h();
@@ -202,7 +202,7 @@ void make_bin(Make& m) {
                 20);
 }
 
-void make_toy_box(Make& m) {
+void make_toy_box(FurnitureBuilder& m) {
   const Rgb color = m.fabric_color();
   const MaterialId body = m.plain("wood", color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = 0.6f * m.h();

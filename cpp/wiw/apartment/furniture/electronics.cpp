@@ -5,7 +5,7 @@ namespace wiw::apartment {
 
 namespace {
 
-MaterialId screen(Make& m) {
+MaterialId screen(FurnitureBuilder& m) {
   m.attributes["state"] = m.on ? "on" : "off";
   if (!m.on) return m.plain("glass", {0.05f, 0.05f, 0.06f});
   constexpr std::array<Pattern, 4> kShows{Pattern::kPictureHills, Pattern::kPictureSkyline, Pattern::kPictureCircles,
@@ -18,7 +18,7 @@ MaterialId screen(Make& m) {
 
 }  // namespace
 
-void make_television(Make& m) {
+void make_television(FurnitureBuilder& m) {
   const float hx = 0.5f * m.w(), h = m.h(), z = -0.03f;
   m.describe({0.1f, 0.1f, 0.11f}, "plastic");
   m.shape.soft_box(m.black(), {-hx, 0.06f, z - 0.03f}, {hx, h, z}, 0.008f, 0.f, 1);
@@ -29,7 +29,7 @@ void make_television(Make& m) {
                  6);
 }
 
-void make_laptop(Make& m) {
+void make_laptop(FurnitureBuilder& m) {
   const Rgb color(0.66f, 0.67f, 0.69f);
   m.describe(color, "metal");
   const MaterialId body = m.plain("metal", color);
@@ -43,7 +43,7 @@ void make_laptop(Make& m) {
   m.shape.set_frame(before);
 }
 
-void make_microwave(Make& m) {
+void make_microwave(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.5) ? Rgb(0.9f, 0.9f, 0.9f) : Rgb(0.25f, 0.25f, 0.27f);
   m.describe(color, "metal");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -60,7 +60,7 @@ void make_microwave(Make& m) {
                    0.02f, 12);
 }
 
-void make_kettle(Make& m) {
+void make_kettle(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.5) ? Rgb(0.74f, 0.75f, 0.76f) : m.look.fabrics[m.rng.below(2)];
   m.describe(color, "metal");
   const MaterialId body = m.plain("metal", color);
@@ -72,7 +72,7 @@ void make_kettle(Make& m) {
   m.shape.ellipsoid(m.black(), {0, 0.22f, 0}, {0.014f, 0.012f, 0.014f}, 8);
 }
 
-void make_speaker(Make& m) {
+void make_speaker(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   m.shape.soft_box(wood, {-hx, 0, -hz}, {hx, h, hz - 0.01f}, 0.01f, 0.f, 1);
@@ -93,7 +93,7 @@ void make_speaker(Make& m) {
   m.shape.set_frame(before);
 }
 
-void make_piano(Make& m) {
+void make_piano(FurnitureBuilder& m) {
   const double kind = m.rng.uniform();
   const Rgb color = kind < 0.5 ? Rgb(0.07f, 0.07f, 0.08f) : m.look.wood;
   m.describe(color, "wood");

@@ -14,7 +14,7 @@ struct KitchenStyle {
 };
 
 /// One style a room: the random stream is the room's, not the piece's.
-KitchenStyle kitchen_style(Make& m) {
+KitchenStyle kitchen_style(FurnitureBuilder& m) {
   const Rgb color = m.look.fabrics[0];
   const bool painted = color.x() + color.z() > 1.05f;
   const Rgb front = painted ? color : m.look.wood;
@@ -25,7 +25,7 @@ KitchenStyle kitchen_style(Make& m) {
                                {0.5f, 0.5f}, "stone", 5)};
 }
 
-void add_base(Make& m, const KitchenStyle& style, int columns, int rows, bool drawers) {
+void add_base(FurnitureBuilder& m, const KitchenStyle& style, int columns, int rows, bool drawers) {
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), top = m.h() - kWorktop;
   m.shape.box(style.carcass, {-hx, kPlinth, -hz}, {hx, top, hz - 0.04f});
   m.shape.box(m.black(), {-hx, 0, -hz}, {hx, kPlinth, hz - 0.09f});
@@ -33,14 +33,14 @@ void add_base(Make& m, const KitchenStyle& style, int columns, int rows, bool dr
              drawers);
 }
 
-void add_worktop(Make& m, MaterialId top) {
+void add_worktop(FurnitureBuilder& m, MaterialId top) {
   m.shape.soft_box(top, {-0.5f * m.w(), m.h() - kWorktop, -0.5f * m.d()}, {0.5f * m.w(), m.h(), 0.5f * m.d()}, 0.006f,
                    0.f, 1);
 }
 
 }  // namespace
 
-void make_counter(Make& m) {
+void make_counter(FurnitureBuilder& m) {
   const KitchenStyle style = kitchen_style(m);
   const bool drawers = m.rng.chance(0.5);
   add_base(m, style, m.w() > 0.75f ? 2 : 1, drawers ? 3 : 1, drawers);
@@ -48,7 +48,7 @@ void make_counter(Make& m) {
   m.supports.push_back({{0, m.h(), -0.03f}, {0.5f * m.w() - 0.1f, 0.5f * m.d() - 0.16f}, 0.45f});
 }
 
-void make_kitchen_sink(Make& m) {
+void make_kitchen_sink(FurnitureBuilder& m) {
   const KitchenStyle style = kitchen_style(m);
   add_base(m, style, m.w() > 0.75f ? 2 : 1, 1, false);
   const MaterialId steel = m.materials.tinted(Pattern::kBrushed, {0.8f, 0.81f, 0.82f});
@@ -75,7 +75,7 @@ void make_kitchen_sink(Make& m) {
   m.supports.push_back({{hx - 0.08f, h, -0.1f}, {0.03f, 0.08f}, 0.4f});
 }
 
-void make_stove(Make& m) {
+void make_stove(FurnitureBuilder& m) {
   const bool steel = m.rng.chance(0.5);
   const Rgb color = steel ? Rgb(0.7f, 0.71f, 0.72f) : Rgb(0.93f, 0.93f, 0.92f);
   m.describe(color, steel ? "metal" : "enamel");
@@ -122,7 +122,7 @@ void make_stove(Make& m) {
 namespace {
 
 /// Hollow case with a white lining, shelves and groceries.
-void add_larder(Make& m, MaterialId body, const Vec3& low, const Vec3& high) {
+void add_larder(FurnitureBuilder& m, MaterialId body, const Vec3& low, const Vec3& high) {
   constexpr float kWall = 0.045f;
   add_carcass(m, body, low, high, kWall);
   const MaterialId lining = m.plain("plastic", {0.96f, 0.97f, 0.97f});
@@ -153,7 +153,7 @@ void add_larder(Make& m, MaterialId body, const Vec3& low, const Vec3& high) {
 
 }  // namespace
 
-void make_refrigerator(Make& m) {
+void make_refrigerator(FurnitureBuilder& m) {
   const double kind = m.rng.uniform();
   const Rgb color = kind < 0.4 ? Rgb(0.94f, 0.94f, 0.94f) : kind < 0.75 ? Rgb(0.68f, 0.69f, 0.71f) : m.look.fabrics[1];
   m.describe(color, "metal");
@@ -196,7 +196,7 @@ void make_refrigerator(Make& m) {
 namespace {
 
 /// Plates and jars on two boards.
-void add_crockery(Make& m, MaterialId board, const Vec3& low, const Vec3& high) {
+void add_crockery(FurnitureBuilder& m, MaterialId board, const Vec3& low, const Vec3& high) {
   const float middle = 0.5f * (low.y() + high.y()), z = 0.5f * (low.z() + high.z());
   m.shape.box(board, {low.x(), middle - 0.016f, low.z()}, {high.x(), middle, high.z()});
   const MaterialId glaze = m.plain("ceramic", Rgb::Ones());
@@ -212,7 +212,7 @@ void add_crockery(Make& m, MaterialId board, const Vec3& low, const Vec3& high) 
 
 }  // namespace
 
-void make_wall_cabinet(Make& m) {
+void make_wall_cabinet(FurnitureBuilder& m) {
   const KitchenStyle style = kitchen_style(m);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   const int columns = m.w() > 0.75f ? 2 : 1;
@@ -227,7 +227,7 @@ void make_wall_cabinet(Make& m) {
   m.attributes["state"] = open ? "open" : "closed";
 }
 
-void make_range_hood(Make& m) {
+void make_range_hood(FurnitureBuilder& m) {
   const MaterialId steel = m.materials.tinted(Pattern::kBrushed, {0.74f, 0.75f, 0.76f});
   m.describe({0.74f, 0.75f, 0.76f}, "metal");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), back = -hz;

@@ -9,26 +9,26 @@ Rgb lit_shade(const Rgb& color) {
 
 namespace {
 
-MaterialId shade(Make& m, const Rgb& color) {
+MaterialId shade(FurnitureBuilder& m, const Rgb& color) {
   m.attributes["state"] = m.on ? "on" : "off";
   m.describe(color, "fabric");
   if (!m.on) return m.fabric(color);
   return m.materials.glow(lit_shade(color));
 }
 
-Rgb shade_color(Make& m) {
+Rgb shade_color(FurnitureBuilder& m) {
   constexpr std::array<float, 3> kPlain{0.95f, 0.92f, 0.86f};
   return m.rng.chance(0.55) ? Rgb(kPlain[0], kPlain[1], kPlain[2]) : m.look.fabrics[m.rng.below(2)];
 }
 
-void add_open_shade(Make& m, MaterialId cloth, const Vec3& base, float low, float high, float height) {
+void add_open_shade(FurnitureBuilder& m, MaterialId cloth, const Vec3& base, float low, float high, float height) {
   m.shape.lathe(cloth, base, {{low, 0}, {high, height}}, 22);
   m.shape.lathe(cloth, base, {{high - 0.003f, height}, {low - 0.003f, 0}}, 22);
 }
 
 }  // namespace
 
-void make_ceiling_lamp(Make& m) {
+void make_ceiling_lamp(FurnitureBuilder& m) {
   m.casts_shadow = false;
   const float r = 0.5f * m.w(), h = m.h();
   const Rgb color(0.97f, 0.95f, 0.9f);
@@ -54,7 +54,7 @@ void make_ceiling_lamp(Make& m) {
   if (m.on) m.bulbs.push_back({{0, -0.3f, 0}, 1.f});
 }
 
-void make_pendant(Make& m) {
+void make_pendant(FurnitureBuilder& m) {
   m.casts_shadow = false;
   const float r = 0.5f * m.w(), h = m.h(), tall = range(m.rng, 0.2f, 0.3f);
   m.shape.tube(m.black(), {{0, tall, 0}, {0, h, 0}}, 0.004f, 6);
@@ -69,7 +69,7 @@ void make_pendant(Make& m) {
   if (m.on) m.bulbs.push_back({{0, -0.1f, 0}, 1.f});
 }
 
-void make_floor_lamp(Make& m) {
+void make_floor_lamp(FurnitureBuilder& m) {
   m.casts_shadow = false;
   const MaterialId metal = m.rng.chance(0.5) ? m.black() : m.chrome();
   const float h = m.h(), r = 0.5f * m.w();
@@ -79,7 +79,7 @@ void make_floor_lamp(Make& m) {
   if (m.on) m.bulbs.push_back({{0, h - 0.12f, 0}, 0.3f});
 }
 
-void make_table_lamp(Make& m) {
+void make_table_lamp(FurnitureBuilder& m) {
   m.casts_shadow = false;
   const Rgb color = oklch(range(m.rng, 0.4f, 0.85f), range(m.rng, 0.03f, 0.12f), range(m.rng, 0.f, 360.f));
   const float h = m.h(), r = 0.5f * m.w();

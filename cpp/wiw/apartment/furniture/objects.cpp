@@ -6,11 +6,13 @@ namespace wiw::apartment {
 
 namespace {
 
-Rgb lively(Make& m) { return oklch(range(m.rng, 0.45f, 0.85f), range(m.rng, 0.05f, 0.15f), range(m.rng, 0.f, 360.f)); }
+Rgb lively(FurnitureBuilder& m) {
+  return oklch(range(m.rng, 0.45f, 0.85f), range(m.rng, 0.05f, 0.15f), range(m.rng, 0.f, 360.f));
+}
 
 }  // namespace
 
-void make_books(Make& m) {
+void make_books(FurnitureBuilder& m) {
   const MaterialId paper = m.plain("paper", Rgb::Ones());
   float y = 0.f;
   const int count = static_cast<int>(2 + m.rng.below(4));
@@ -32,7 +34,7 @@ void make_books(Make& m) {
   m.shape.set_frame(before);
 }
 
-void make_vase(Make& m) {
+void make_vase(FurnitureBuilder& m) {
   const Rgb color = lively(m);
   m.describe(color, "ceramic");
   const float r = 0.5f * m.w(), h = 0.62f * m.h();
@@ -59,7 +61,7 @@ void make_vase(Make& m) {
   }
 }
 
-void make_cup(Make& m) {
+void make_cup(FurnitureBuilder& m) {
   const Rgb color = lively(m);
   m.describe(color, "ceramic");
   const MaterialId body = m.plain("ceramic", color);
@@ -69,7 +71,7 @@ void make_cup(Make& m) {
   m.shape.tube(body, {{0.04f, 0.075f, 0}, {0.068f, 0.07f, 0}, {0.068f, 0.035f, 0}, {0.04f, 0.025f, 0}}, 0.005f, 6);
 }
 
-void make_bowl(Make& m) {
+void make_bowl(FurnitureBuilder& m) {
   const Rgb color = lively(m);
   m.describe(color, "ceramic");
   const float r = 0.5f * m.w();
@@ -96,7 +98,7 @@ void make_bowl(Make& m) {
   m.shape.set_tint(Rgb::Ones());
 }
 
-void make_bottle(Make& m) {
+void make_bottle(FurnitureBuilder& m) {
   const std::array<Rgb, 4> kGlass{Rgb(0.16f, 0.35f, 0.2f), Rgb(0.35f, 0.2f, 0.1f), Rgb(0.75f, 0.85f, 0.85f),
                                   Rgb(0.2f, 0.3f, 0.55f)};
   const Rgb color = pick(m.rng, kGlass);
@@ -116,7 +118,7 @@ void make_bottle(Make& m) {
   m.shape.lathe(m.plain("paper", lively(m)), {0, 0.18f * h, 0}, {{0.0385f, 0}, {0.0385f, 0.3f * h}}, 16);
 }
 
-void make_box(Make& m) {
+void make_box(FurnitureBuilder& m) {
   const Rgb color = lively(m);
   m.describe(color, "cardboard");
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -125,7 +127,7 @@ void make_box(Make& m) {
   m.shape.soft_box(m.plain("cardboard", 0.85f * color), {-hx, 0.72f * h, -hz}, {hx, h, hz}, 0.004f, 0.f, 1);
 }
 
-void make_candles(Make& m) {
+void make_candles(FurnitureBuilder& m) {
   const Rgb color = m.rng.chance(0.5) ? Rgb(0.94f, 0.9f, 0.8f) : lively(m);
   m.describe(color, "wax");
   const MaterialId wax = m.plain("wax", color);
@@ -137,7 +139,7 @@ void make_candles(Make& m) {
   }
 }
 
-void make_photo(Make& m) {
+void make_photo(FurnitureBuilder& m) {
   const Eigen::Affine3f before = m.shape.frame();
   const float hx = 0.5f * m.w(), h = m.h();
   m.shape.set_frame(before * Eigen::AngleAxisf(-0.18f, Vec3::UnitX()));
@@ -149,7 +151,7 @@ void make_photo(Make& m) {
   m.shape.set_frame(before);
 }
 
-void make_small_plant(Make& m) {
+void make_small_plant(FurnitureBuilder& m) {
   const Rgb clay = lively(m);
   const float r = 0.055f;
   m.shape.lathe(m.plain("ceramic", clay), Vec3::Zero(),
@@ -163,7 +165,7 @@ void make_small_plant(Make& m) {
   }
 }
 
-void make_ball(Make& m) {
+void make_ball(FurnitureBuilder& m) {
   const Rgb color = lively(m);
   m.describe(color, "rubber");
   const float r = 0.5f * m.w();

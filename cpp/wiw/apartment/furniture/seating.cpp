@@ -6,14 +6,14 @@ namespace wiw::apartment {
 
 namespace {
 
-MaterialId upholstery(Make& m, const Rgb& color) {
+MaterialId upholstery(FurnitureBuilder& m, const Rgb& color) {
   const bool leather = m.rng.chance(0.25);
   m.attributes["material"] = leather ? "leather" : "fabric";
   return m.materials.tinted(leather ? Pattern::kLeather : Pattern::kWeave, color);
 }
 
 /// Body shared by sofas and armchairs: plinth, arms, back, seat and back cushions.
-void add_sofa_body(Make& m, int seats) {
+void add_sofa_body(FurnitureBuilder& m, int seats) {
   const Rgb color = m.fabric_color();
   const MaterialId cloth = upholstery(m, color);
   const MaterialId legs = m.wood(m.look.wood);
@@ -40,7 +40,7 @@ void add_sofa_body(Make& m, int seats) {
   }
 }
 
-void add_throw_pillow(Make& m, const Rgb& color, float x, float y, float z, float lean) {
+void add_throw_pillow(FurnitureBuilder& m, const Rgb& color, float x, float y, float z, float lean) {
   const Eigen::Affine3f before = m.shape.frame();
   m.shape.set_frame(before * Eigen::Translation3f(x, y, z) * Eigen::AngleAxisf(lean, Vec3::UnitY()) *
                     Eigen::AngleAxisf(-1.25f, Vec3::UnitX()));
@@ -49,7 +49,8 @@ void add_throw_pillow(Make& m, const Rgb& color, float x, float y, float z, floa
 }
 
 /// Chair back: 0 board, 1 slats, 2 ladder, 3 padded.
-void add_chair_back(Make& m, MaterialId frame, MaterialId pad, float half, float seat, float back, int style) {
+void add_chair_back(FurnitureBuilder& m, MaterialId frame, MaterialId pad, float half, float seat, float back,
+                    int style) {
   const float h = m.h();
   const auto lean = [&](float y) { return back - 0.06f * (y - seat) / (h - seat); };
   for (const float x : {-half + 0.02f, half - 0.02f})
@@ -80,7 +81,7 @@ void add_chair_back(Make& m, MaterialId frame, MaterialId pad, float half, float
 
 }  // namespace
 
-void make_sofa(Make& m) {
+void make_sofa(FurnitureBuilder& m) {
   add_sofa_body(m, m.w() > 1.9f ? 3 : 2);
   const int pillows = static_cast<int>(m.rng.below(4));
   for (int i = 0; i < pillows; ++i) {
@@ -91,12 +92,12 @@ void make_sofa(Make& m) {
   }
 }
 
-void make_armchair(Make& m) {
+void make_armchair(FurnitureBuilder& m) {
   add_sofa_body(m, 1);
   if (m.rng.chance(0.5)) add_throw_pillow(m, pick(m.rng, m.look.fabrics), 0.f, 0.6f, -0.5f * m.d() + 0.38f, 0.2f);
 }
 
-void make_chair(Make& m) {
+void make_chair(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId frame = m.case_material(color), pad = m.fabric(m.look.fabrics[m.rng.below(2)]);
   const float half = 0.5f * m.w() - 0.01f, hz = 0.5f * m.d() - 0.01f, seat = 0.46f;
@@ -110,7 +111,7 @@ void make_chair(Make& m) {
   add_chair_back(m, frame, pad, half, seat, -hz + 0.02f, style);
 }
 
-void make_office_chair(Make& m) {
+void make_office_chair(FurnitureBuilder& m) {
   const Rgb color = m.fabric_color();
   const MaterialId cloth = m.fabric(color), dark = m.black(), metal = m.chrome();
   const float half = 0.24f;
@@ -130,7 +131,7 @@ void make_office_chair(Make& m) {
   }
 }
 
-void make_stool(Make& m) {
+void make_stool(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float r = 0.5f * m.w(), h = m.h();
   if (m.rng.chance(0.6)) {
@@ -151,7 +152,7 @@ void make_stool(Make& m) {
   }
 }
 
-void make_bench(Make& m) {
+void make_bench(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   add_legs(m, wood, m.w() - 0.06f, m.d(), m.h() - 0.04f, 0.045f, static_cast<int>(m.rng.below(4)));
@@ -163,7 +164,7 @@ void make_bench(Make& m) {
   }
 }
 
-void make_pouf(Make& m) {
+void make_pouf(FurnitureBuilder& m) {
   const Rgb color = m.fabric_color();
   const float r = 0.5f * m.w(), h = m.h();
   m.shape.lathe(m.fabric(color), Vec3::Zero(),

@@ -3,7 +3,7 @@
 
 namespace wiw::apartment {
 
-Eigen::Affine3f open_leaf(Make& m, const Vec2& hinge, const Vec3& low, const Vec3& high) {
+Eigen::Affine3f open_leaf(FurnitureBuilder& m, const Vec2& hinge, const Vec3& low, const Vec3& high) {
   constexpr float kAngle = 1.48f;  // 85 degrees: a leaf in a corner stays clear of the wall
   const bool left = hinge.x() < 0.5f * (low.x() + high.x());
   const Vec3 pivot(hinge.x(), 0.f, hinge.y());
@@ -13,7 +13,7 @@ Eigen::Affine3f open_leaf(Make& m, const Vec2& hinge, const Vec3& low, const Vec
   return turn;
 }
 
-void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
+void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
                 bool drawers, int open_columns) {
   const Eigen::Affine3f before = m.shape.frame();
   const int handle = static_cast<int>(m.rng.below(3));
@@ -42,7 +42,7 @@ void add_fronts(Make& m, MaterialId front, MaterialId metal, const Vec3& low, co
   }
 }
 
-void add_books(Make& m, float x0, float x1, float y, float z, float clearance, float depth) {
+void add_books(FurnitureBuilder& m, float x0, float x1, float y, float z, float clearance, float depth) {
   const MaterialId paper = m.plain("paper", Rgb::Ones());
   const float tall = std::min(clearance - 0.03f, 0.3f);
   float x = x0;
@@ -58,7 +58,7 @@ void add_books(Make& m, float x0, float x1, float y, float z, float clearance, f
   m.shape.set_tint(Rgb::Ones());
 }
 
-void add_carcass(Make& m, MaterialId wood, const Vec3& low, const Vec3& high, float board) {
+void add_carcass(FurnitureBuilder& m, MaterialId wood, const Vec3& low, const Vec3& high, float board) {
   m.shape.box(wood, low, {low.x() + board, high.y(), high.z()});
   m.shape.box(wood, {high.x() - board, low.y(), low.z()}, high);
   m.shape.box(wood, {low.x() + board, low.y(), low.z()}, {high.x() - board, low.y() + board, high.z()});
@@ -70,7 +70,7 @@ void add_carcass(Make& m, MaterialId wood, const Vec3& low, const Vec3& high, fl
 namespace {
 
 /// Clothes on a rail across the case, and folded linen below.
-void add_clothes(Make& m, const Vec3& low, const Vec3& high) {
+void add_clothes(FurnitureBuilder& m, const Vec3& low, const Vec3& high) {
   const float rail = high.y() - 0.09f, z = 0.5f * (low.z() + high.z());
   m.shape.tube(m.chrome(), {{low.x(), rail, z}, {high.x(), rail, z}}, 0.011f, 8);
   const MaterialId cloth = m.fabric(Rgb::Ones());
@@ -91,7 +91,7 @@ void add_clothes(Make& m, const Vec3& low, const Vec3& high) {
 }
 
 /// Fills a shelf board with books, a gap and perhaps an ornament's place.
-void fill_shelf(Make& m, float x0, float x1, float y, float z, float clearance, float depth) {
+void fill_shelf(FurnitureBuilder& m, float x0, float x1, float y, float z, float clearance, float depth) {
   const double kind = m.rng.uniform();
   const float middle = x0 + (x1 - x0) * range(m.rng, 0.35f, 0.75f);
   if (kind < 0.55)
@@ -105,7 +105,7 @@ void fill_shelf(Make& m, float x0, float x1, float y, float z, float clearance, 
 
 }  // namespace
 
-void make_wardrobe(Make& m) {
+void make_wardrobe(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId wood = m.case_material(color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
@@ -140,7 +140,7 @@ void make_wardrobe(Make& m) {
   m.attributes["state"] = open ? "open" : "closed";
 }
 
-void make_bookshelf(Make& m) {
+void make_bookshelf(FurnitureBuilder& m) {
   const Rgb color = m.case_color();
   const MaterialId wood = m.case_material(color);
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), board = 0.022f;
@@ -159,7 +159,7 @@ void make_bookshelf(Make& m) {
   if (columns == 2) m.shape.box(wood, {-0.5f * board, board, -hz + 0.008f}, {0.5f * board, m.h() - board, hz - 0.005f});
 }
 
-void make_dresser(Make& m) {
+void make_dresser(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.1f;
   m.shape.soft_box(wood, {-hx, m.h() - 0.03f, -hz}, {hx, m.h(), hz + 0.01f}, 0.008f, 0.f, 1);
@@ -170,7 +170,7 @@ void make_dresser(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.08f}, 0.8f});
 }
 
-void make_sideboard(Make& m) {
+void make_sideboard(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.15f;
   m.shape.soft_box(wood, {-hx, base, -hz}, {hx, m.h(), hz - 0.02f}, 0.008f, 0.f, 1);
@@ -185,7 +185,7 @@ void make_sideboard(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.08f}, 0.8f});
 }
 
-void make_tv_stand(Make& m) {
+void make_tv_stand(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), base = 0.1f, board = 0.025f;
   add_carcass(m, wood, {-hx, base, -hz}, {hx, m.h(), hz}, board);
@@ -198,7 +198,7 @@ void make_tv_stand(Make& m) {
   m.supports.push_back({{0, m.h(), 0.03f}, {hx - 0.06f, hz - 0.08f}, 0.9f});
 }
 
-void make_shoe_rack(Make& m) {
+void make_shoe_rack(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   for (const float x : {-hx, hx - 0.025f}) m.shape.box(wood, {x, 0, -hz}, {x + 0.025f, m.h(), hz});
@@ -221,7 +221,7 @@ void make_shoe_rack(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {hx - 0.06f, hz - 0.06f}, 0.5f});
 }
 
-void make_coat_rack(Make& m) {
+void make_coat_rack(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w();
   m.shape.soft_box(wood, {-hx, m.h() - 0.1f, -0.5f * m.d()}, {hx, m.h(), -0.5f * m.d() + 0.025f}, 0.008f, 0.f, 1);
@@ -238,7 +238,7 @@ void make_coat_rack(Make& m) {
   }
 }
 
-void make_wall_shelf(Make& m) {
+void make_wall_shelf(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d();
   const int boards = m.h() > 0.4f ? 2 : 1;

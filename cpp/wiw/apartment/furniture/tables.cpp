@@ -3,7 +3,7 @@
 
 namespace wiw::apartment {
 
-void add_legs(Make& m, MaterialId material, float width, float depth, float top, float thickness, int style,
+void add_legs(FurnitureBuilder& m, MaterialId material, float width, float depth, float top, float thickness, int style,
               const Vec3& center) {
   const float hx = 0.5f * width - thickness * 0.7f, hz = 0.5f * depth - thickness * 0.7f, r = 0.5f * thickness;
   for (const float sx : {-1.f, 1.f}) {
@@ -35,7 +35,7 @@ void add_legs(Make& m, MaterialId material, float width, float depth, float top,
 namespace {
 
 /// Table top: 0 board with rounded edges, 1 round, 2 board on an apron.
-void add_top(Make& m, MaterialId material, int style, float thickness) {
+void add_top(FurnitureBuilder& m, MaterialId material, int style, float thickness) {
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   if (style == 1) {
     m.shape.lathe(material, {0, h - thickness, 0},
@@ -56,7 +56,7 @@ void add_top(Make& m, MaterialId material, int style, float thickness) {
 }
 
 /// A turned column on a spreading foot.
-void add_pedestal(Make& m, MaterialId material, float top) {
+void add_pedestal(FurnitureBuilder& m, MaterialId material, float top) {
   const float r = 0.3f * std::min(m.w(), m.d());
   m.shape.lathe(material, Vec3::Zero(),
                 {{0, 0},
@@ -73,7 +73,7 @@ void add_pedestal(Make& m, MaterialId material, float top) {
 
 }  // namespace
 
-void make_dining_table(Make& m) {
+void make_dining_table(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const bool round = std::abs(m.w() - m.d()) < 0.12f;
   if (round) m.size.z() = m.size.x();
@@ -88,7 +88,7 @@ void make_dining_table(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {0.34f * m.w(), 0.34f * m.d()}, 0.9f});
 }
 
-void make_coffee_table(Make& m) {
+void make_coffee_table(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const bool round = m.rng.chance(0.35);
   if (round) m.size.x() = m.size.z() = 0.5f * (m.w() + m.d());
@@ -102,7 +102,7 @@ void make_coffee_table(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {0.32f * m.w(), 0.32f * m.d()}, 0.8f});
 }
 
-void make_desk(Make& m) {
+void make_desk(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   const float hx = 0.5f * m.w(), hz = 0.5f * m.d(), h = m.h();
   m.shape.soft_box(wood, {-hx, h - 0.03f, -hz}, {hx, h, hz}, 0.008f, 0.f, 1);
@@ -117,7 +117,7 @@ void make_desk(Make& m) {
   m.supports.push_back({{0, h, -0.05f}, {hx - 0.12f, hz - 0.16f}, 0.7f});
 }
 
-void make_side_table(Make& m) {
+void make_side_table(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   m.size.z() = m.size.x();
   add_top(m, wood, 1, 0.025f);
@@ -128,7 +128,7 @@ void make_side_table(Make& m) {
   m.supports.push_back({{0, m.h(), 0}, {0.28f * m.w(), 0.28f * m.w()}, 0.8f});
 }
 
-void make_console(Make& m) {
+void make_console(FurnitureBuilder& m) {
   const MaterialId wood = m.case_material(m.case_color());
   add_top(m, wood, 2, 0.03f);
   add_legs(m, wood, m.w(), m.d(), m.h() - 0.03f, 0.04f, static_cast<int>(m.rng.below(4)));

@@ -79,7 +79,7 @@ Arm::Arm(std::shared_ptr<const ArmModel> model, const Pose& T_world_base, btMult
   make_motors(time_step_);
   const JointLimits& limits = articulation().limits();
   const Eigen::VectorXd near_zero = Eigen::VectorXd::Zero(articulation().dof()).cwiseMax(limits.lower);
-  set_positions(articulation().coupled(near_zero.cwiseMin(limits.upper)));
+  set_positions(articulation().apply_mimics(near_zero.cwiseMin(limits.upper)));
   set_targets(positions());
   set_forces(limits.effort.cwiseMin(kUnlimitedForce));
 }
@@ -163,7 +163,7 @@ void Arm::make_motors(double time_step) {
   }
 }
 
-void Arm::number(int index) {
+void Arm::set_index(int index) {
   for (const auto& collider : colliders_) collider->setUserIndex(-1 - index);
 }
 

@@ -46,8 +46,8 @@ class Arm {
   [[nodiscard]] const Articulation& articulation() const { return *model_->articulation; }
   [[nodiscard]] const Pose& base() const { return T_world_base_; }
   [[nodiscard]] btMultiBody& multibody() { return *body_; }
-  /// Index of the articulation goes here, for contacts.
-  void number(int index);
+  /// Sets the articulation's index, by which contacts name it.
+  void set_index(int index);
 
   [[nodiscard]] Eigen::VectorXd positions() const;
   [[nodiscard]] Eigen::VectorXd velocities() const;

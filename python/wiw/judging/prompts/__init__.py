@@ -2,7 +2,7 @@
 """The language-model judge's prompt: one Jinja template with the slots of `SLOTS`; a user's own may replace it.
 
 The shipped template is filled here, a user's in a process with limits on time, memory and length
-(`wiw.vlm.template_filling`).
+(`wiw.vlm.template_filler`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from wiw.errors import PromptError
 from wiw.vlm import template_worker
-from wiw.vlm.template_filling import Filling
+from wiw.vlm.template_filler import TemplateFiller
 
 FOLDER = Path(__file__).parent
 NAME = "judge.j2"
@@ -44,7 +44,7 @@ class JudgePrompt:
             self._source = self._path.read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
             raise PromptError(f"{self._path}: expected a template for the judge: {error}") from error
-        self._filling = Filling()
+        self._filling = TemplateFiller()
         self.digest = blake2b(self._source.encode(), digest_size=8).hexdigest()
         """Digest of the template, as hexadecimal digits."""
         if self.folder is not None:  # tried on, so that what is wrong is known before the first question

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where to go for a better view of a boxed object: towards it, or aside, out from behind what hides it."""
+"""Directions to a better view of a boxed object: towards it, or sideways around an occluder."""
 
 from __future__ import annotations
 

@@ -431,7 +431,7 @@ class VLM(Policy):
         exchange = Exchange(
             purpose,
             self.client.model,
-            tuple({"call": said.call, **said.completion.to_json()} for said in reply.said),
+            tuple({"call": each.call, **each.completion.to_json()} for each in reply.completions),
             {name: value for name, value in self._describe_reading(reply).items() if value},
             "" if reply.problem is None else str(reply.problem),
             "" if reply.problem is None else instead,
@@ -450,7 +450,7 @@ def derive_seed(key: Key, number: int) -> int:
 
 
 def _caption_strips(proposals: Sequence[Proposal], strips: Sequence[prompt_images.Image]) -> list[Part]:
-    """Put each plan in words before its strip."""
+    """Put each plan's description before its strip."""
     parts: list[Part] = []
     for number, (plan, strip) in enumerate(zip(proposals, strips, strict=True), 1):
         parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", strip]

@@ -21,7 +21,7 @@ NEARER = 1e-3
 
 
 @dataclass(frozen=True)
-class Sight:
+class ArmView:
     """The arm over the bare table."""
 
     color: NDArray[np.uint8]
@@ -29,7 +29,7 @@ class Sight:
     arm: NDArray[np.bool_]
     """[H, W]: where it hides the table."""
     pose: NDArray[np.float64]
-    """float64 [7] of the gripper, which may not have come to the pose that it was told to go to."""
+    """float64 [7]: the gripper's actual pose, which may differ from the commanded one."""
 
 
 @cache
@@ -38,11 +38,11 @@ def _bare() -> Workbench:
 
 
 @cache
-def plate(size: tuple[int, int]) -> Sight:
+def render_bare_table(size: tuple[int, int]) -> ArmView:
     """Return the front view of the bare table without an arm."""
     seen = _bare().render_view("front", size, arm=False)
     seen["color"].setflags(write=False)
-    return Sight(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
+    return ArmView(seen["color"], np.zeros(size, np.bool_), np.full(7, np.nan))
 
 
 @cache
@@ -51,13 +51,13 @@ def _depth(size: tuple[int, int]) -> NDArray[np.float32]:
     return depth
 
 
-def sights(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[Sight]:
-    """Yield the arm after it has gone to each of the poses [N, 7] in turn, from where it waits."""
+def render_arm(poses: NDArray[np.float64], size: tuple[int, int]) -> Iterator[ArmView]:
+    """Yield the view of the arm after it has moved to each of the poses [N, 7] in turn, from its start pose."""
     bench = _bare().fork()
     for pose in poses:
         bench.move_to(np.clip(pose, *_RANGE))
         seen = bench.render_view("front", size, ("color", "depth"))
-        yield Sight(seen["color"], seen["depth"] < _depth(size) - NEARER, bench.pose)
+        yield ArmView(seen["color"], seen["depth"] < _depth(size) - NEARER, bench.pose)
 
 
 _RANGE = np.array([[-np.inf] * 6 + [0.0], [np.inf] * 6 + [1.0]])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from wiw.world_models.armnet.body import Sight, plate, sights
+from wiw.world_models.armnet.body import ArmView, render_arm, render_bare_table
 from wiw.world_models.armnet.motion import motion
 from wiw.world_models.armnet.network import (
     FRONT,
@@ -20,12 +20,12 @@ from wiw.world_models.armnet.network import (
     Mixture,
     Motion,
     Network,
+    build_sources,
     clear_arm,
+    compose_static_view,
     compose_view,
+    find_unoccluded_arm,
     find_visible_arm,
-    in_sight,
-    sources,
-    still,
 )
 
 
@@ -38,19 +38,21 @@ def imagine_views(
     """
     size = image.shape[0], image.shape[1]
     scale = size[0] // FRONT[0]
-    bare = _image(plate(size).color)
-    arms = sights(poses, size)
+    bare = _image(render_bare_table(size).color)
+    arms = render_arm(poses, size)
     here = next(arms)
     with torch.inference_mode():
         view, before = _image(image), _arm(here)
-        canvas = clear_arm(view, before, in_sight(view, before), bare, bare)
+        canvas = clear_arm(view, before, find_unoccluded_arm(view, before), bare, bare)
         for there in arms:
             arm, way = _arm(there), motion(here.pose[None], there.pose[None])
-            seen = still(canvas, arm, bare)
+            seen = compose_static_view(canvas, arm, bare)
             inner = Arm(_window(arm.color, scale), _window(arm.mask, scale))
             around, table = _window(canvas, scale), _window(bare, scale)
             mixture = _mix_views(network, around, inner, _window(before.mask, scale), way, table, scale)
-            _window(seen, scale)[:] = compose_view(mixture.shares, sources(mixture, around, inner, way, table, scale))
+            _window(seen, scale)[:] = compose_view(
+                mixture.shares, build_sources(mixture, around, inner, way, table, scale)
+            )
             hidden = arm.mask > 0.5
             _window(hidden, scale)[:] = find_visible_arm(mixture.shares, inner)
             canvas = clear_arm(seen, arm, hidden, bare, canvas)
@@ -80,7 +82,7 @@ def _window(image: Tensor, scale: int) -> Tensor:
     return image[..., rows, columns]
 
 
-def _arm(sight: Sight) -> Arm:
+def _arm(sight: ArmView) -> Arm:
     return Arm(_image(sight.color), torch.from_numpy(sight.arm.astype(np.float32))[None, None])
 
 

@@ -65,25 +65,25 @@ class Mixture:
     """[B, 2, h, w]: pixels that what is carried comes from beside the gripper's own way."""
 
 
-def shade(bare: Tensor, plate: Tensor, mask: Tensor) -> Tensor:
+def compute_shading(bare: Tensor, plate: Tensor, mask: Tensor) -> Tensor:
     """Return how much darker than without the arm each pixel is; 1 where the arm itself is."""
     ratio = ((bare + 0.02) / (plate + 0.02)).clamp(0.25, 4.0)
     return torch.where(mask > 0.5, torch.ones_like(ratio), ratio)
 
 
-def still(canvas: Tensor, arm: Arm, plate: Tensor) -> Tensor:
+def compose_static_view(canvas: Tensor, arm: Arm, plate: Tensor) -> Tensor:
     """Return the view if nothing but the arm had moved."""
-    return torch.where(arm.mask > 0.5, arm.color, canvas * shade(arm.color, plate, arm.mask)).clamp(0, 1)
+    return torch.where(arm.mask > 0.5, arm.color, canvas * compute_shading(arm.color, plate, arm.mask)).clamp(0, 1)
 
 
-def in_sight(image: Tensor, arm: Arm) -> Tensor:
+def find_unoccluded_arm(image: Tensor, arm: Arm) -> Tensor:
     """Return where, [B, 1, H, W], a true view shows the arm itself, and no object in front of it."""
     return (arm.mask > 0.5) & ((image - arm.color).abs().amax(1, keepdim=True) < ALIKE)
 
 
 def clear_arm(image: Tensor, arm: Arm, hidden: Tensor, plate: Tensor, before: Tensor) -> Tensor:
     """Return the canvas after a view: without the arm and its shadow; where that is `hidden`, as it was `before`."""
-    return torch.where(hidden, before, (image / shade(arm.color, plate, arm.mask)).clamp(0, 1))
+    return torch.where(hidden, before, (image / compute_shading(arm.color, plate, arm.mask)).clamp(0, 1))
 
 
 def find_visible_arm(shares: Tensor, arm: Arm) -> Tensor:
@@ -114,9 +114,11 @@ def carry_canvas(canvas: Tensor, motion: Motion, flow: Tensor | None = None, sca
     )
 
 
-def sources(mixture: Mixture, canvas: Tensor, arm: Arm, motion: Motion, plate: Tensor, scale: float = 1.0) -> Tensor:
+def build_sources(
+    mixture: Mixture, canvas: Tensor, arm: Arm, motion: Motion, plate: Tensor, scale: float = 1.0
+) -> Tensor:
     """Return canvas, carried canvas, arm or bare table, and paint as they would be seen: [B, 4, 3, H, W]."""
-    dark = shade(arm.color, plate, arm.mask)
+    dark = compute_shading(arm.color, plate, arm.mask)
     moved = carry_canvas(canvas, motion, mixture.flow, scale)
     return torch.stack([canvas * dark, moved * dark, arm.color, mixture.paint], dim=1)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A connection that mends itself: a thread of its own keeps it, asks again what was not answered, and tells when.
+"""A connection that reconnects: its own thread maintains it and repeats unanswered questions.
 
 Rows are asked under ids made of their content, so a row that is sent again, after the connection broke or by a caller
 that tries once more, is answered from what the server knows or is computing.
@@ -54,15 +54,15 @@ class _Question:
 
 
 class Link:
-    """Asks the server at an address. Any number of threads may use it."""
+    """A connection to the server at an address. Any number of threads may use it."""
 
     def __init__(self, address: str, token: str | None) -> None:
         self.address = address
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._proxy: Any = None if _is_here(address) else True
+        self._proxy: Any = None if _is_loopback(address) else True
         self._open: dict[bytes, _Question] = {}
         self._welcome: Future[Welcome] = Future()
-        self._trouble = "not connected yet"
+        self._last_error = "not connected yet"
         self._closed = False
         self._loop = asyncio.new_event_loop()
         self._wanted = asyncio.Event()
@@ -70,7 +70,7 @@ class Link:
         self._thread = threading.Thread(target=self._run, daemon=True, name="wiw remote")
         self._thread.start()
 
-    # -- called by those who ask ---------------------------------------------------------------------------------------
+    # -- called from any thread ----------------------------------------------------------------------------------------
 
     def welcome(self, seconds: float) -> Welcome:
         """Return what is served.
@@ -78,11 +78,13 @@ class Link:
         Raises:
             RemoteError: nobody has answered in time, or the server refuses.
         """
-        self._soon(self._wanted.set)
+        self._call_soon(self._wanted.set)
         try:
             return self._welcome.result(seconds)
         except LateError:
-            raise RemoteError(f"nobody serves a world model at {self.address}: {self._trouble}", "connection") from None
+            raise RemoteError(
+                f"nobody serves a world model at {self.address}: {self._last_error}", "connection"
+            ) from None
 
     def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
         """Return the frames of each row, in order.
@@ -95,20 +97,20 @@ class Link:
             raise self._build_closed_error()
         questions = [_Question(row_id(row), row, give_up, len(rows) - place) for place, row in enumerate(rows, start=1)]
         asked: Future[list[_Question]] = Future()
-        self._soon(lambda: asked.set_result([self._submit(question) for question in questions]))
+        self._call_soon(lambda: asked.set_result([self._submit(question) for question in questions]))
         try:
             questions = asked.result(max(0.0, give_up - time.monotonic()))
             return [question.answer.result(max(0.0, give_up - time.monotonic())) for question in questions]
         except LateError:
-            raise self._late() from None
+            raise self._build_deadline_error() from None
         finally:
-            self._soon(lambda: self._leave(questions))
+            self._call_soon(lambda: self._drop_questions(questions))
 
     def close(self) -> None:
         """End the connection and the thread, and tell those who still wait."""
         self._closed = True
         if self._thread.is_alive():
-            self._soon(self._loop.stop)
+            self._call_soon(self._loop.stop)
             self._thread.join(5)
 
     def _build_closed_error(self) -> RemoteError:
@@ -116,12 +118,12 @@ class Link:
             f"the connection to {self.address} was closed on this side; make the model anew", "connection"
         )
 
-    def _late(self) -> RemoteError:
+    def _build_deadline_error(self) -> RemoteError:
         if self._outbox is None:
-            return RemoteError(f"{self.address} could not be reached in time: {self._trouble}", "connection")
+            return RemoteError(f"{self.address} could not be reached in time: {self._last_error}", "connection")
         return RemoteError(f"no answer from {self.address} in time; the server is there, but busy or hung", "deadline")
 
-    def _soon(self, work: Any) -> None:
+    def _call_soon(self, work: Any) -> None:
         with contextlib.suppress(RuntimeError):  # closed: callers find out by their deadlines
             self._loop.call_soon_threadsafe(work)
 
@@ -129,32 +131,32 @@ class Link:
 
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
-        main = self._loop.create_task(self._keep())
+        main = self._loop.create_task(self._maintain_connection())
         self._loop.run_forever()
         main.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             self._loop.run_until_complete(main)
-        self._give_up(self._build_closed_error())
+        self._fail_all(self._build_closed_error())
         self._loop.close()
 
-    async def _keep(self) -> None:
-        """Connect whenever something is asked, and again while it is not answered."""
+    async def _maintain_connection(self) -> None:
+        """Connect when there is a question, and reconnect until it is answered."""
         pause = FIRST_PAUSE
         while True:
             await self._wanted.wait()
             try:
                 async with self._connection() as connection:
-                    await self._greet(connection)
+                    await self._shake_hands(connection)
                     pause = FIRST_PAUSE
-                    await self._talk(connection)
+                    await self._exchange_messages(connection)
             except RemoteError as error:
-                self._give_up(error)
+                self._fail_all(error)
             except InvalidStatus as error:
                 if error.response.status_code in (401, 403):
-                    self._give_up(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
-                self._trouble = str(error)
+                    self._fail_all(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
+                self._last_error = str(error)
             except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
-                self._trouble = f"{type(error).__name__}: {error}"
+                self._last_error = f"{type(error).__name__}: {error}"
             if not self._open and self._welcome.done():
                 self._wanted.clear()
                 continue
@@ -174,24 +176,24 @@ class Link:
             close_timeout=1,
         )
 
-    async def _greet(self, connection: ClientConnection) -> None:
+    async def _shake_hands(self, connection: ClientConnection) -> None:
         await connection.send(encode(Hello(f"wiw {wiw.__version__}")))
-        said = decode(await asyncio.wait_for(connection.recv(), HANDSHAKE))
-        if isinstance(said, Refusal):
-            raise RemoteError(f"{self.address}: {said.text}", said.kind)
-        if not isinstance(said, Welcome):
-            raise RemoteError(f"{self.address}: expected a welcome, got {type(said).__name__}", "message")
+        message = decode(await asyncio.wait_for(connection.recv(), HANDSHAKE))
+        if isinstance(message, Refusal):
+            raise RemoteError(f"{self.address}: {message.text}", message.kind)
+        if not isinstance(message, Welcome):
+            raise RemoteError(f"{self.address}: expected a welcome, got {type(message).__name__}", "message")
         if not self._welcome.done():
-            self._welcome.set_result(said)
-        elif said != (first := self._welcome.result()):
-            what = "weights or options" if (said.accepts, said.model) == (first.accepts, first.model) else "model"
+            self._welcome.set_result(message)
+        elif message != (first := self._welcome.result()):
+            what = "weights or options" if (message.accepts, message.model) == (first.accepts, first.model) else "model"
             raise RemoteError(
                 f"{self.address} has come back with another {what} than this run began with; serve the same one again",
                 "model",
             )
 
-    async def _talk(self, connection: ClientConnection) -> None:
-        """Ask and hear until the connection ends."""
+    async def _exchange_messages(self, connection: ClientConnection) -> None:
+        """Send questions and receive answers until the connection ends."""
         outbox: asyncio.Queue[_Question] = asyncio.Queue()
         room = asyncio.Semaphore(self._welcome.result().in_flight)
         asked: set[bytes] = set()
@@ -201,8 +203,8 @@ class Link:
             outbox.put_nowait(question)
         self._outbox = outbox
         tasks = [
-            asyncio.ensure_future(self._send(connection, outbox, room, asked)),
-            asyncio.ensure_future(self._hear(connection, outbox, room, asked)),
+            asyncio.ensure_future(self._send_questions(connection, outbox, room, asked)),
+            asyncio.ensure_future(self._receive_answers(connection, outbox, room, asked)),
         ]
         try:
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -214,14 +216,14 @@ class Link:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _send(
+    async def _send_questions(
         self,
         connection: ClientConnection,
         outbox: asyncio.Queue[_Question],
         room: asyncio.Semaphore,
         asked: set[bytes],
     ) -> None:
-        """Ask what is in the outbox; a row that was asked on this connection and has no answer yet is not repeated."""
+        """Send the questions in the outbox, except those that wait for an answer on this connection already."""
         while True:
             question = await outbox.get()
             await room.acquire()
@@ -232,7 +234,7 @@ class Link:
             asked.add(question.id)
             await connection.send(encode(Ask(question.id, question.row, left, question.rest)))
 
-    async def _hear(
+    async def _receive_answers(
         self,
         connection: ClientConnection,
         outbox: asyncio.Queue[_Question],
@@ -241,27 +243,27 @@ class Link:
     ) -> None:
         while True:
             try:
-                said = decode(await connection.recv())
+                message = decode(await connection.recv())
             except ConnectionClosed as error:
                 raise ConnectionError(f"the connection was lost ({error})") from None
-            if isinstance(said, Refusal) and not said.id:
-                raise RemoteError(f"{self.address}: {said.text}", said.kind)
-            if not isinstance(said, Answer | Wait | Refusal):
-                raise RemoteError(f"{self.address}: did not expect a {type(said).__name__}", "message")
+            if isinstance(message, Refusal) and not message.id:
+                raise RemoteError(f"{self.address}: {message.text}", message.kind)
+            if not isinstance(message, Answer | Wait | Refusal):
+                raise RemoteError(f"{self.address}: did not expect a {type(message).__name__}", "message")
             room.release()
-            asked.discard(said.id)
-            question = self._open.get(said.id)
+            asked.discard(message.id)
+            question = self._open.get(message.id)
             if question is None or question.answer.done():
                 continue
-            if isinstance(said, Refusal) and said.kind == "deadline" and question.give_up > time.monotonic():
+            if isinstance(message, Refusal) and message.kind == "deadline" and question.give_up > time.monotonic():
                 outbox.put_nowait(question)  # that was the deadline of one who asked before and has gone
-            elif isinstance(said, Wait):
+            elif isinstance(message, Wait):
                 question.rest = 0  # those that followed it have gone on
-                self._loop.call_later(said.seconds, outbox.put_nowait, question)
-            elif isinstance(said, Answer):
-                question.answer.set_result(said.frames)
+                self._loop.call_later(message.seconds, outbox.put_nowait, question)
+            elif isinstance(message, Answer):
+                question.answer.set_result(message.frames)
             else:
-                question.answer.set_exception(_error(said))
+                question.answer.set_exception(_error(message))
 
     def _submit(self, question: _Question) -> _Question:
         """Open a question, or return the same one that is open already."""
@@ -276,16 +278,16 @@ class Link:
         self._wanted.set()
         return question
 
-    def _leave(self, questions: Sequence[_Question]) -> None:
-        """Forget questions that nobody waits for any more."""
+    def _drop_questions(self, questions: Sequence[_Question]) -> None:
+        """Drop questions that nobody waits for any more."""
         for question in questions:
             question.askers -= 1
             if question.askers <= 0 and self._open.get(question.id) is question:
                 del self._open[question.id]
 
-    def _give_up(self, error: RemoteError) -> None:
-        """Pass the error on to all who wait."""
-        self._trouble = str(error)
+    def _fail_all(self, error: RemoteError) -> None:
+        """Raise the error in all waiting callers."""
+        self._last_error = str(error)
         if not self._welcome.done():
             self._welcome.set_exception(error)
         for question in self._open.values():
@@ -299,8 +301,8 @@ def _error(refusal: Refusal) -> Exception:
     return RemoteError(refusal.text, refusal.kind)
 
 
-def _is_here(address: str) -> bool:
-    """Return whether the address is of this machine, for which no proxy is asked."""
+def _is_loopback(address: str) -> bool:
+    """Return whether the address is on this machine, where no proxy is used."""
     host = urlsplit(address).hostname or ""
     try:
         return ip_address(host).is_loopback

@@ -8,7 +8,7 @@ and recognition: `obs_key` (the observation in words) and `actions` (name to mea
 `instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far).
 
 The shipped templates are filled here, a user's in a process with limits on time, memory and length
-(`wiw.vlm.template_filling`).
+(`wiw.vlm.template_filler`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError, PromptError
 from wiw.vlm import template_worker
-from wiw.vlm.template_filling import Filling
+from wiw.vlm.template_filler import TemplateFiller
 
 FOLDER = Path(__file__).parent
 SLOTS: dict[str, Any] = {
@@ -67,7 +67,7 @@ class Prompts:
         self._templates = {
             path.relative_to(FOLDER).as_posix(): (path, _read_source(path)) for path in _list_templates(FOLDER)
         }
-        self._filling = Filling()
+        self._filling = TemplateFiller()
         if self.folder is not None:
             self._templates |= self._load_own(self.folder)
 

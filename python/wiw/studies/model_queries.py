@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Questions to a world model as the loop asks them, row by row, to be asked in other company."""
+"""Requests to a world model as the loop makes them, which can be batched in other ways."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class Row:
     """Its actions, without padding."""
 
 
-class Questions:
-    """The requests that the loop would make of a model in the first moments of some episodes.
+class ModelQueries:
+    """The requests that the loop would make of a model at the start of some episodes.
 
     Args:
         model: who is asked: about primitives in scenes, or, if it takes poses, about poses at a table.
@@ -74,8 +74,10 @@ class Questions:
     def __init__(self, model: WorldModel, scenes: str, deadline: float = DEADLINE) -> None:
         self._model, self._attempts = model, Attempted(model, deadline)
         self._space = model.accepts.space
-        episodes = _at_tables() if self._space == GRIPPER_POSES else _in_scenes(scenes)
-        self._moments = [_later_moment(model.accepts, *each) for each in episodes]
+        episodes = (
+            _begin_manipulation_episodes() if self._space == GRIPPER_POSES else _begin_navigation_episodes(scenes)
+        )
+        self._moments = [_begin_with_history(model.accepts, *each) for each in episodes]
         self.row_seconds = 0.0
         """What a row took in the last call."""
         self.changed: set[str] = set()
@@ -89,7 +91,7 @@ class Questions:
 
     def rows(self, plans: Sequence[Sequence[Any]]) -> list[Row]:
         """Return the rows of these plans, of primitives or poses, in each episode."""
-        recorder = _Recorder(self._model)
+        recorder = _RequestRecorder(self._model)
         proposals = [[Proposal(np.array(plan)) for plan in plans] for _ in self._moments]
         origins = [range(len(plans)) for _ in proposals]
         space, keys = plan_space(self._space), [moment.key for moment in self._moments]
@@ -118,7 +120,7 @@ class Questions:
         ]
 
     def ask(self, rows: Sequence[Row], shared: int = 0) -> Frames:
-        """Return the model's answer, in calls of as many rows as it takes best, held to the contract.
+        """Return the model's frames, in calls of at most `best_batch` rows, checked against the contract.
 
         With `shared`, the first frames are not asked for: the same question to the model, but not to a server that
         remembers its answers.
@@ -156,12 +158,12 @@ class Questions:
         }
         self.reuses |= any(np.may_share_memory(frames, earlier) for earlier, _ in self._answers)
         answer = np.array(frames)
-        self.look_back()
+        self.check_rewrites()
         self._answers.append((frames, sample(answer)))
         return answer
 
-    def look_back(self) -> None:
-        """See whether one of the latest answers has been written to since; sets `rewrites`."""
+    def check_rewrites(self) -> None:
+        """Set `rewrites` if a recent answer has been written to since."""
         self.rewrites |= any(not np.array_equal(sample(frames), before) for frames, before in self._answers)
 
     def true_frames(self, rows: Sequence[Row], plans: Sequence[NDArray[Any]]) -> list[Frames]:
@@ -170,14 +172,14 @@ class Questions:
         uint8 [K, H, W, 3], in the model's view, of some small size.
         """
         accepts = self._model.accepts
-        truth = _true_fronts if self._space == GRIPPER_POSES else _true_views
+        truth = _render_true_front_views if self._space == GRIPPER_POSES else _render_true_views
         height, width = accepts.size
         small = max(1, round(SMALL * height / width)), SMALL
         return [truth(row.truth, plan, small, accepts.view) for row, plan in zip(rows, plans, strict=True)]
 
 
-class _Recorder(WorldModel):
-    """Notes what the loop asks of a model, and answers that nothing moves."""
+class _RequestRecorder(WorldModel):
+    """Records the loop's requests to a model, and answers with unchanged frames."""
 
     def __init__(self, model: WorldModel) -> None:
         self._model = model
@@ -191,14 +193,14 @@ class _Recorder(WorldModel):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Note the question."""
+        """Record the request."""
         self.asked.append((observations, controls, seeds))
         return np.repeat(observations.image[:, None], 1 + len(controls[0].actions), 1)
 
 
 @dataclass(frozen=True)
 class _Moment:
-    """Where an episode stands."""
+    """An episode's present state."""
 
     key: Key
     shown: ModelInput
@@ -208,8 +210,8 @@ def _history_of(rows: Sequence[Row]) -> History:
     return History.concatenate([row.history for row in rows if row.history is not None])
 
 
-def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
-    """Return what an agent that walks sees."""
+def _render_true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """Return an agent's true views along a plan."""
     poses = simulator.camera_poses_after(plan.astype(np.int8))
     panoramas = np.empty((len(plan), *TRUE_PANORAMA, 3), np.uint8)
     simulator.renderer.panorama(poses, TRUE_PANORAMA, panoramas, None, None)
@@ -218,26 +220,26 @@ def _true_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view:
     return np.stack([cv2.resize(each, size[::-1], interpolation=cv2.INTER_AREA) for each in panoramas])
 
 
-def _true_fronts(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
-    """Return what stands before the camera of a manipulator."""
+def _render_true_front_views(simulator: Any, plan: NDArray[Any], size: tuple[int, int], view: View) -> Frames:
+    """Return a manipulator's true front views along a plan."""
     return np.asarray(simulator.fork().render_fronts_after(plan, size))
 
 
-def _in_scenes(scenes: str) -> list[tuple[Any, Any, Key]]:
-    """Return some episodes of an agent that walks: environment, first observation and key."""
+def _begin_navigation_episodes(scenes: str) -> list[tuple[Any, Any, Key]]:
+    """Begin some navigation episodes: environment, first observation and key."""
     task = TASKS.make("imagenav", scenes=scenes)
     envs = [task.environment(depth=True) for _ in range(EPISODES)]
     return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
 
 
-def _at_tables() -> list[tuple[Any, Any, Key]]:
-    """Return some episodes of an arm."""
+def _begin_manipulation_episodes() -> list[tuple[Any, Any, Key]]:
+    """Begin some manipulation episodes: environment, first observation and key."""
     task = TASKS.make("manipulation")
     envs = [task.environment(depth=True) for _ in range(EPISODES)]
     return [(env, env.begin(task.episode(index)), Key(0, index)) for index, env in enumerate(envs)]
 
 
-def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Moment:
+def _begin_with_history(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Moment:
     """Return an episode's first moment; of a model with a memory, a moment some decisions later.
 
     One episode is older than the other, and its segments are shorter, so that histories differ in padding.
@@ -246,7 +248,7 @@ def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Mo
     decisions = 1 + key.episode if accepts.history else 0
     for decision in range(decisions):
         histories.add([Situation(observation, env.goal, key.at(decision), None, tuple(executed))])
-        plan = _segment(accepts.space, observation, 3 - key.episode)
+        plan = _make_segment(accepts.space, observation, 3 - key.episode)
         observation = env.run(plan).observation
         executed += plan.tolist()
     semantic = env.semantic() if accepts.space == PRIMITIVES else None
@@ -254,8 +256,8 @@ def _later_moment(accepts: Accepts, env: Any, observation: Any, key: Key) -> _Mo
     return _Moment(key.at(decisions), ModelInput(observation, env.fork(), semantic, history))
 
 
-def _segment(space: str, observation: Any, length: int) -> NDArray[Any]:
-    """Return what is carried out at a decision: some way ahead and a turn, or a gripper's way up."""
+def _make_segment(space: str, observation: Any, length: int) -> NDArray[Any]:
+    """Return a decision's actions: steps ahead and a turn, or a gripper's motion upwards."""
     if space == PRIMITIVES:
         return np.array([FORWARD] * (length - 1) + [TURN_LEFT], np.int8)
     ways = np.arange(1, length + 1)[:, None] * (0, 0, 0.01, 0, 0, 0, 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From names to the parts of an agent, and whether they fit each other."""
+"""The specification of an agent, by names or objects, and how its parts are built and checked against each other."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
-from wiw.loop.decision_pass import Components
+from wiw.loop.decision_pass import AgentParts
 from wiw.loop.imagination import Imaginer, NoModel
 from wiw.loop.imagine import NO_SEMANTICS
 from wiw.loop.memory import EpisodeMemories
@@ -22,8 +22,8 @@ from wiw.types import PRIMITIVES
 
 
 @dataclass(frozen=True)
-class Parts:
-    """The parts of an agent, before anything is looked up; see `wiw.Agent`."""
+class AgentSpec:
+    """An agent's parts as the user names them, before anything is looked up; see `wiw.Agent`."""
 
     policy: Any
     model: Any
@@ -31,8 +31,8 @@ class Parts:
     config: AgentConfig
     observers: tuple[Observer, ...]
 
-    def build(self) -> Components:
-        """Look the parts up and see that they fit each other.
+    def build(self) -> AgentParts:
+        """Look the parts up and check that they fit each other.
 
         Raises:
             ArgumentError: they do not.
@@ -52,7 +52,7 @@ class Parts:
             if config.depth > 1:
                 space.check_search(model, policy, config.depth)
         observers = () if model is None else self.observers
-        return Components(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, model))
+        return AgentParts(policy, imaginer, reviser, space, config, observers, EpisodeMemories(policy, reviser, model))
 
     def _make_reviser(self, policy: Policy, space: str, imagines: bool) -> Policy:
         if self.reviser is not None:
@@ -85,7 +85,7 @@ def _make_policy(policy: Any, space: str) -> Policy:
     made: Policy = POLICIES.make(policy, **space_option(POLICIES, policy, space))
     if made.space != space:
         raise ArgumentError(
-            f"Agent: plans are asked for in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
+            f"Agent: expected plans in {plan_space(space).words}, but policy {type(made.unwrapped).__name__} "
             f"makes them of {plan_space(made.space).words}"
         )
     return made

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The parent's side of `template_worker.py`: a user's templates are filled within limits of time and memory."""
+"""Fill a user's templates in a separate process with limits on time and memory; the parent's side of `template_worker.py`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from wiw.errors import PromptError
 from wiw.vlm import template_worker
 
 
-class Filling:
-    """Fills templates in a process that starts with the first and, where one takes too much, again with the next."""
+class TemplateFiller:
+    """Fills templates in a child process, started with the first template and restarted after one exceeds a limit."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Answers that were given lately, for clients that ask again because they never got them."""
+"""A cache of recent answers, for clients that ask again because an answer was lost."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 
 
-class Known:
-    """Encoded answers by the id of their row; those that were not asked for longest go first.
+class AnswerCache:
+    """Encoded answers by the id of their row; the least recently used are evicted first.
 
     Args:
         most_bytes: that they may take together.
@@ -18,13 +18,13 @@ class Known:
         self._answers: OrderedDict[bytes, bytes] = OrderedDict()
 
     def get(self, row: bytes) -> bytes | None:
-        """Return the answer, where it is known."""
+        """Return the answer, if it is cached."""
         if row in self._answers:
             self._answers.move_to_end(row)
         return self._answers.get(row)
 
     def put(self, row: bytes, answer: bytes) -> None:
-        """Keep an answer."""
+        """Store an answer."""
         self._size += len(answer) - len(self._answers.pop(row, b""))
         self._answers[row] = answer
         while self._size > self._most:
