@@ -73,7 +73,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (serve_vlm, "serve-vlm", "Serve a small vision-language model to this machine, for tests and trials."),
     (episodes, "episodes", "Write episodes to a file, to be run again by anyone."),
     (collect, "collect", "Collect demonstrations of manipulation tasks, to learn from."),
-    (train, "train", "Train a network: recogniser, warpnet, armnet or diffuser."),
+    (train, "train", "Train a network: recogniser, warpnet, perception, armnet or diffuser."),
 )
 
 EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.perception.labelling_network import STRIDE, Network, fuse, to_network_input
+from wiw.perception.labelling_network import MULTIPLE, STRIDE, Network, fuse, to_network_input
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
@@ -36,12 +36,16 @@ class Recipe:
     batch: int = 4
     widths: tuple[int, int, int, int] = (24, 48, 96, 160)
     """Channels of the U-Net's levels."""
-    rate: float = 2e-3
+    rate: float = 5e-3
     decay: float = 0.01
     balance: float = 0.35
     """Weight of a category's pixels is their frequency to minus this."""
     states: float = 0.3
     """Weight of the states' loss beside that of the categories."""
+    coarse: float = 0.15
+    """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
+    several times as many views in the same time. The rest of the training is at full size.
+    """
     degraded: float = 0.4
     """Share of views that are warped, blurred and noisy, as imagined ones are."""
     bfloat16: bool = True
@@ -110,7 +114,8 @@ class _Trainer(ResumableTrainer):
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
         rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
-        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng)
+        coarse = learning_rate > self.recipe.coarse * self.recipe.rate
+        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
             categories, states = self.network.train()(batch.shown)
         loss = functional.cross_entropy(categories.float(), batch.category, self._category_weights)
@@ -152,24 +157,48 @@ class Batch:
 
 
 def sample_batch(
-    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator
+    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator, coarse: bool = False
 ) -> Batch:
-    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded."""
-    rows = rng.choice(len(views), recipe.batch, p=weights)
+    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded.
+
+    If `coarse`, twice as many views as usual, at about half their size.
+    """
+    count = 2 * recipe.batch if coarse else recipe.batch
+    rows = rng.choice(len(views), count, p=weights)
     images, category, state = views.images[rows], views.category[rows], views.state[rows]
-    for i in np.flatnonzero(rng.random(recipe.batch) < recipe.degraded):
+    for i in np.flatnonzero(rng.random(count) < recipe.degraded):
         images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
         category[i], state[i] = labels[..., 0], labels[..., 1]
-    mirrored = rng.random(recipe.batch) < 0.5
+    mirrored = rng.random(count) < 0.5
     for array in (images, category, state):
         array[mirrored] = array[mirrored, :, ::-1]
-    light = rng.uniform(0.75, 1.3, (recipe.batch, 1, 1, 1)) * rng.uniform(0.92, 1.08, (recipe.batch, 1, 1, 3))
+    light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
+    tangents = compute_view_tangents(views.hfov_deg[rows])
+    if coarse:
+        images, category, state, tangents = _halve(images, category, state, tangents)
     return Batch(
-        to_network_input(images, compute_view_tangents(views.hfov_deg[rows])),
+        to_network_input(images, tangents),
         torch.from_numpy(category.astype(np.int64)),
         torch.from_numpy(state.astype(np.int64)),
     )
+
+
+def _halve(
+    images: NDArray[np.uint8], category: NDArray[np.uint8], state: NDArray[np.uint8], tangents: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    """Shrink views and labels to about half their size, a size that the network takes."""
+    height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in images.shape[1:3])
+    rows, columns = (
+        (np.arange(new // STRIDE) * 2 + 1) * old // (2 * (new // STRIDE))
+        for new, old in zip((height, width), category.shape[1:], strict=True)
+    )
+    resized = [
+        np.stack([cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in array])
+        for array in (images, tangents)
+    ]
+    places = (slice(None), rows[:, None], columns)
+    return resized[0], category[places], state[places], resized[1]
 
 
 def degrade_view(
