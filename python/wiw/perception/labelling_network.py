@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -44,7 +45,7 @@ class Network(nn.Module):
         a, b, c, d = widths
 
         def block(*channels: int, stride: int = 1) -> nn.Sequential:
-            pairs = zip(channels[:-1], channels[1:], strict=True)
+            pairs = pairwise(channels)
             return nn.Sequential(
                 *(Convolution(i, o, normalised, stride if not row else 1) for row, (i, o) in enumerate(pairs))
             )

@@ -73,9 +73,7 @@ class LearnedLabeller(Labeller):
             "torch": torch.__version__,
         }
 
-    def compute_labels(
-        self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None
-    ) -> SceneLabels:
+    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
         """Run the network on each view."""
         size = (images.shape[1], images.shape[2])
         labels = SceneLabels(

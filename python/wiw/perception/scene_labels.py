@@ -58,14 +58,10 @@ class Labeller(ABC):
     """Whether it knows what no sensor of the agent measures."""
 
     @abstractmethod
-    def compute_labels(
-        self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None
-    ) -> SceneLabels:
+    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
         """Return the labels of at least one view; `ids` is None unless the labeller needs it."""
 
-    def label(
-        self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None = None
-    ) -> SceneLabels:
+    def label(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None = None) -> SceneLabels:
         """Label each pixel of each view. A view's labels do not depend on the other views.
 
         Args:

@@ -99,7 +99,9 @@ def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers:
     )
 
 
-def gather_views(specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar) -> LabelledViews:
+def gather_views(
+    specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar
+) -> LabelledViews:
     """Load the labelled views of all scenes of a spec; build those that `folder` lacks in `workers` processes.
 
     Raises:

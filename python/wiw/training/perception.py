@@ -174,7 +174,7 @@ def sample_batch(
         array[mirrored] = array[mirrored, :, ::-1]
     light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
-    tangents = compute_view_tangents(views.hfov_deg[rows])
+    tangents = compute_view_tangents(views.hfov_deg[rows], (images.shape[1], images.shape[2]))
     if coarse:
         images, category, state, tangents = _halve(images, category, state, tangents)
     return Batch(
@@ -215,11 +215,10 @@ def degrade_view(
     field = rng.normal(0, rng.uniform(0, 4), (5, 6, 2)).astype(np.float32)
     offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
     across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    image = np.asarray(
-        cv2.remap(image, across + offset[..., 0], down + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-    )
+    across_source, down_source = across + offset[..., 0], down + offset[..., 1]
+    image = np.asarray(cv2.remap(image, across_source, down_source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
     middle = (slice(STRIDE // 2, None, STRIDE),) * 2
-    source = (np.stack([across, down], axis=-1) + offset)[middle] / STRIDE
+    source = np.stack([across_source, down_source], axis=-1)[middle] / STRIDE
     columns, rows = np.clip(source, 0, (width // STRIDE - 1, height // STRIDE - 1)).astype(np.intp).transpose(2, 0, 1)
     labels = labels[rows, columns]
     if rng.random() < 0.5:
