@@ -36,9 +36,9 @@ class Recipe:
     batch: int = 4
     widths: tuple[int, int, int, int] = (24, 48, 96, 160)
     """Channels of the U-Net's levels."""
-    rate: float = 5e-3
+    rate: float = 2e-3
     decay: float = 0.01
-    balance: float = 0.35
+    balance: float = 0.4
     """Weight of a category's pixels is their frequency to minus this."""
     states: float = 0.3
     """Weight of the states' loss beside that of the categories."""
@@ -46,6 +46,8 @@ class Recipe:
     """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
     several times as many views in the same time. The rest of the training is at full size.
     """
+    auxiliary: float = 0.25
+    """Weight of the losses of the network's coarser levels, which speed up its training."""
     degraded: float = 0.4
     """Share of views that are warped, blurred and noisy, as imagined ones are."""
     bfloat16: bool = True
@@ -89,25 +91,35 @@ def train(
 class _Trainer(ResumableTrainer):
     """The network in training, with everything that its next step depends on."""
 
-    stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_optimiser")
+    stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_auxiliary", "_optimiser")
 
     def __init__(self, views: LabelledViews, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C21]) % 2**63)
         self.views, self.recipe = views, recipe
         self.network = Network(len(CATEGORIES), len(STATES), recipe.widths)
+        self._auxiliary = torch.nn.ModuleList(
+            torch.nn.Conv2d(width, len(CATEGORIES), 1) for width in reversed(recipe.widths[1:])
+        )
         self._set_prior()
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
+        self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(views.category)
         self._category_weights = torch.from_numpy(_compute_category_weights(views.category, recipe.balance))
 
+    def _compute_category_loss(self, logits: Tensor, category: Tensor) -> Tensor:
+        """Return the loss of logits at any level: they are compared with the middles of their pixels."""
+        factor = category.shape[1] // logits.shape[2]
+        middles = category[:, factor // 2 :: factor, factor // 2 :: factor]
+        return functional.cross_entropy(logits.float(), middles, self._category_weights)
+
     def _set_prior(self) -> None:
-        """Start from the categories' frequencies, as they are weighted."""
+        """Let all heads start from the categories' frequencies, as they are weighted."""
         share = np.bincount(self.views.category.ravel(), minlength=len(CATEGORIES)) / self.views.category.size
         prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
         with torch.no_grad():
-            assert self.network.head.bias is not None
-            self.network.head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
+            for head in (self.network.head, *self._auxiliary):
+                head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)  # type: ignore[index, operator]
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
@@ -117,8 +129,12 @@ class _Trainer(ResumableTrainer):
         coarse = learning_rate > self.recipe.coarse * self.recipe.rate
         batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
-            categories, states = self.network.train()(batch.shown)
-        loss = functional.cross_entropy(categories.float(), batch.category, self._category_weights)
+            features = self.network.train().compute_features(batch.shown)
+            categories, states = self.network.head(features[-1]).split([len(CATEGORIES), len(STATES)], dim=1)
+            coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]
+        loss = self._compute_category_loss(categories, batch.category)
+        for logits in coarser:
+            loss = loss + self.recipe.auxiliary * self._compute_category_loss(logits, batch.category)
         stateful = batch.state > 0
         if stateful.any():
             loss = loss + self.recipe.states * functional.cross_entropy(
