@@ -100,7 +100,8 @@ class InstanceTable:
 def read_instances(instances: Sequence[Mapping[str, Any]]) -> InstanceTable:
     """Return the labels of a scene's instances."""
     numbers = {name: i for i, name in enumerate(CATEGORIES)}
-    table = InstanceTable(*np.zeros((2, len(instances) + 1), np.uint8), np.full(len(instances) + 1, -1))
+    count = len(instances) + 1
+    table = InstanceTable(np.zeros(count, np.uint8), np.zeros(count, np.uint8), np.full(count, -1))
     for each in instances:
         name = merge_category(each["category"])
         state = each["attributes"].get("state", "")

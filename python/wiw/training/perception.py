@@ -119,7 +119,7 @@ class _Trainer(ResumableTrainer):
         prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
         with torch.no_grad():
             for head in (self.network.head, *self._auxiliary):
-                head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)  # type: ignore[index, operator]
+                head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
