@@ -73,7 +73,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
     (collect, "collect", "Collect demonstrations of manipulation tasks as training data."),
-    (train, "train", "Train a network: recogniser, warpnet, armnet or diffuser."),
+    (train, "train", "Train a network: recogniser, warpnet, perception, armnet or diffuser."),
 )
 
 EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130

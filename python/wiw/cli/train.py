@@ -81,14 +81,14 @@ def train(
     Args:
         what: recogniser, warpnet, perception, armnet or diffuser.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors.
-        scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world. Default:
-            apartments:train:80.
-        val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single one, into
-            halves for calibration and evaluation. Default: apartments:val:20.
+        scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
+            Default: apartments:train:80.
+        val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single
+            one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 8 for perception, 4
-            for armnet, 400 for diffuser.
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 8 for perception,
+            4 for armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
         places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 10), or walks
             recorded in each scene, for warpnet (default: 24).

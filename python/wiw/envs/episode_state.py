@@ -26,10 +26,16 @@ class NavigationSpec(ABC):
     backend: Literal["auto", "cpu", "gpu"]
     choices: tuple[str, ...] = ()
     """Labels that answers are chosen from, where the task asks for any."""
-    free_turns: bool = False
-    """Whether the turn at the start of a segment does not count."""
-    limit: int | None = None
-    """Most primitives of an episode, however they are divided over decisions; None where decisions are counted."""
+
+    @property
+    def free_turns(self) -> bool:
+        """Whether the turn at the start of a segment does not count."""
+        return False
+
+    @property
+    def limit(self) -> int | None:
+        """Most primitives of an episode, however they are divided over decisions; None where decisions are counted."""
+        return None
 
     @property
     @abstractmethod

@@ -20,7 +20,7 @@ from wiw.envs.table_guide import TableGuide
 from wiw.errors import ArgumentError
 from wiw.tabletop.table import Table
 from wiw.tabletop.workbench import Pose, Workbench
-from wiw.types import Answer, ArmObservation, Episode, Goal, Key, Truth
+from wiw.types import Answer, ArmObservation, Episode, Goal, Key, TextAnswer, Truth
 
 LEAST, MOST = np.array([-2.0] * 3 + [-7.0] * 3 + [0.0]), np.array([2.0] * 3 + [7.0] * 3 + [1.0])
 """Poses between these are in the action space; none beyond can be reached."""
@@ -122,7 +122,7 @@ class ManipulationEnv(gymnasium.Env[dict[str, Any], NDArray[np.float64]], Env):
         self._refused = []
         return self._observe()
 
-    def run(self, plan: ArrayLike, answer: Answer | None = None) -> Segment:
+    def run(self, plan: ArrayLike, answer: Answer | TextAnswer | None = None) -> Segment:
         """Carry out one decision's poses [K, 7], as far as the episode goes on; observe once, at the end.
 
         Raises:

@@ -162,7 +162,7 @@ def read_mark(reply: Reply) -> int:
         return int(reply.value.mark)
     if problem is not None and problem.kind in ("empty", "refusal", "huge"):
         raise JudgeError(f"expected a mark from 1 to 5, got {problem}", problem.kind)
-    cut = bool(reply.said) and reply.said[-1].completion.finish == "length"
+    cut = bool(reply.completions) and reply.completions[-1].completion.finish == "length"
     return parse_mark(reply.text, cut)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -44,7 +45,7 @@ class Network(nn.Module):
         a, b, c, d = widths
 
         def block(*channels: int, stride: int = 1) -> nn.Sequential:
-            pairs = zip(channels[:-1], channels[1:], strict=True)
+            pairs = pairwise(channels)
             return nn.Sequential(
                 *(Convolution(i, o, normalised, stride if not row else 1) for row, (i, o) in enumerate(pairs))
             )
@@ -68,30 +69,36 @@ class Network(nn.Module):
         Args:
             views: float [B, 5, H, W]; see `to_network_input`.
         """
+        logits = self.head(self.compute_features(views)[-1])
+        return logits[:, : self.categories], logits[:, self.categories :]
+
+    def compute_features(self, views: Tensor) -> list[Tensor]:
+        """Return the features that are decoded at each level, [B, widths[i], h, w], the coarsest first."""
         levels = []
         for level in self.down:
             views = level(views)
             levels.append(views)
         x = levels.pop()
-        x = x + self.context(x.mean(dim=(2, 3)))[:, :, None, None]  # which room it is
+        found = [x + self.context(x.mean(dim=(2, 3)))[:, :, None, None]]  # which room it is
         for narrow, level in zip(self.narrow, self.up, strict=True):
-            coarse = functional.interpolate(narrow(x), scale_factor=2.0, mode="nearest")
-            x = level(torch.cat([coarse, levels.pop()], dim=1))
-        logits = self.head(x)
-        return logits[:, : self.categories], logits[:, self.categories :]
+            coarse = functional.interpolate(narrow(found[-1]), scale_factor=2.0, mode="nearest")
+            found.append(level(torch.cat([coarse, levels.pop()], dim=1)))
+        return found
 
 
 class Convolution(nn.Module):
-    """A 3 x 3 convolution, batch normalisation where asked for, and a rectifier."""
+    """A 3 x 3 convolution, batch normalisation where asked for, its input added where shapes agree, and a rectifier."""
 
     def __init__(self, inputs: int, outputs: int, normalised: bool, stride: int) -> None:
         super().__init__()
         self.weights = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=not normalised)
         self.norm = nn.BatchNorm2d(outputs, momentum=0.05) if normalised else nn.Identity()
+        self.residual = inputs == outputs and stride == 1
 
     def forward(self, x: Tensor) -> Tensor:
         """Convolve."""
-        return functional.relu(self.norm(self.weights(x)), inplace=True)
+        y = self.norm(self.weights(x))
+        return functional.relu(y + x if self.residual else y)
 
 
 def fuse(network: Network) -> Network:

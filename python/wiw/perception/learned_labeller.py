@@ -87,10 +87,9 @@ class LearnedLabeller(Labeller):
         )
         for view, image in enumerate(images):
             category, confidence, state = self._label_view(image, input_size, tangents)
-            for whole, part in zip(
-                (labels.category, labels.confidence, labels.state), (category, confidence, state), strict=True
-            ):
-                whole[view] = part[rows[:, None], columns]
+            labels.category[view] = category[rows[:, None], columns]
+            labels.confidence[view] = confidence[rows[:, None], columns]
+            labels.state[view] = state[rows[:, None], columns]
         return labels
 
     def _label_view(

@@ -96,10 +96,10 @@ class Labeller(ABC):
         if "ids" not in self.needs:
             return None
         if ids is None or ids.shape != images.shape[:3] or not np.issubdtype(ids.dtype, np.integer):
-            came = None if ids is None else f"{ids.dtype} {ids.shape}"
+            provided = None if ids is None else f"{ids.dtype} {ids.shape}"
             raise ArgumentError(
                 f"label: {type(self).__name__} reads the simulator's instance ids; expected ids uint32 "
-                f"{images.shape[:3]}, got {came}; imagined views have none, so label these with another labeller"
+                f"{images.shape[:3]}, got {provided}; imagined views have none, so label these with another labeller"
             )
         return ids
 

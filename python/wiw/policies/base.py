@@ -150,7 +150,7 @@ class Policy(ABC):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | TextAnswer | None]:
+    ) -> Sequence[Answer | TextAnswer | None]:
         """Return what each episode's agent believes: an `Answer` where its goal has choices, a `TextAnswer` where it is
         a question; `rollouts` are None without a world model.
 

@@ -75,7 +75,7 @@ class PolicyWrapper(Policy):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | TextAnswer | None]:
+    ) -> Sequence[Answer | TextAnswer | None]:
         """See `Policy.answer`."""
         return self.inner.answer(situations, proposals, rollouts)
 

@@ -20,7 +20,7 @@ from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError
 from wiw.judging import Judge, Judgement, Reference, make_judge
 from wiw.metrics import path_efficiency
-from wiw.scenes import possible_edits, resolve
+from wiw.scenes import resolve
 from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, TextAnswer, Wording
 
@@ -90,7 +90,7 @@ class AEQA(NavigationTask):
     # -- what it says of itself ----------------------------------------------------------------------------------------
 
     @property
-    def limit(self) -> int:  # type: ignore[override]
+    def limit(self) -> int:
         """Most primitives of an episode."""
         return int(self.rules.actions)
 
@@ -135,8 +135,7 @@ class AEQA(NavigationTask):
     def generate_first(self, count: int) -> list[Episode]:
         """Return questions, each asked in two scenes at least with different answers, from where none is seen."""
         scenes = resolve(self.scenes)
-        options = {"per_scene": self.per_scene, "backend": self.backend, "possible_edits": possible_edits}
-        made = make_episodes(scenes, count, self.seed, self.generator, **options)
+        made = make_episodes(scenes, count, self.seed, self.generator, per_scene=self.per_scene, backend=self.backend)
         return [_name_kind(episode) for episode in made]
 
     def make_goal(self, place: World, episode: Episode) -> Goal:

@@ -137,10 +137,10 @@ class AR(NavigationTask):
 
     def final_answer(self, state: EpisodeState) -> Answer | None:
         """Return the answer that counts, of those given so far."""
-        if not state.answers:
+        given = [answer for answer in state.answers if isinstance(answer, Answer)]
+        if not given:
             return None
-        surest = max(state.answers, key=lambda answer: answer.confidence)
-        return surest if self.rules.prediction == "surest" else state.answers[-1]
+        return max(given, key=lambda answer: answer.confidence) if self.rules.prediction == "surest" else given[-1]
 
     def measure(self, state: EpisodeState) -> dict[str, float]:
         """Return the metrics of one finished episode.

@@ -34,9 +34,8 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
     inputs = torch.from_numpy(((features - shift) * scale).astype(np.float32))
     targets = torch.from_numpy(views.color.astype(np.int64))
     torch.manual_seed(core.fold_key([seed, 0x4C24]) % 2**63)
-    network = torch.nn.Sequential(
-        torch.nn.Linear(FEATURES, HIDDEN), torch.nn.ReLU(), torch.nn.Linear(HIDDEN, len(COLORS))
-    )
+    first, last = torch.nn.Linear(FEATURES, HIDDEN), torch.nn.Linear(HIDDEN, len(COLORS))
+    network = torch.nn.Sequential(first, torch.nn.ReLU(), last)
     optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     rng = np.random.default_rng(core.fold_key([seed, 0x4C25]))
@@ -48,8 +47,8 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
         loss.backward()
         optimiser.step()
         schedule.step()
-    first, _, last = network
-    arrays = [each.detach().double().numpy() for each in (first.weight, first.bias, last.weight, last.bias)]
+    parts: tuple[torch.Tensor, ...] = (*first.parameters(), *last.parameters())
+    arrays = [each.detach().double().numpy() for each in parts]
     return ColorNamer(shift, scale, *arrays)
 
 

@@ -100,7 +100,8 @@ class InstanceTable:
 def read_instances(instances: Sequence[Mapping[str, Any]]) -> InstanceTable:
     """Return the labels of a scene's instances."""
     numbers = {name: i for i, name in enumerate(CATEGORIES)}
-    table = InstanceTable(*np.zeros((2, len(instances) + 1), np.uint8), np.full(len(instances) + 1, -1))
+    count = len(instances) + 1
+    table = InstanceTable(np.zeros(count, np.uint8), np.zeros(count, np.uint8), np.full(count, -1))
     for each in instances:
         name = merge_category(each["category"])
         state = each["attributes"].get("state", "")
@@ -167,7 +168,7 @@ def _sample_colors(
     )
 
 
-def compute_view_tangents(hfov_deg: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the directions of the stored views' pixels, float32 [N, h, w, 2]."""
+def compute_view_tangents(hfov_deg: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the directions of the pixels of stored views, which are (h, w) in size: float32 [N, h, w, 2]."""
     focal = SIZE[1] / (2 * np.tan(np.radians(hfov_deg.astype(np.float64)) / 2))
-    return np.stack([compute_tangents(SIZE, InputSize(INPUT.height, INPUT.width, float(each))) for each in focal])
+    return np.stack([compute_tangents(SIZE, InputSize(*size, float(each))) for each in focal])

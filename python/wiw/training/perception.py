@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.perception.labelling_network import STRIDE, Network, fuse, to_network_input
+from wiw.perception.labelling_network import MULTIPLE, STRIDE, Network, fuse, to_network_input
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
@@ -38,10 +38,16 @@ class Recipe:
     """Channels of the U-Net's levels."""
     rate: float = 2e-3
     decay: float = 0.01
-    balance: float = 0.35
+    balance: float = 0.4
     """Weight of a category's pixels is their frequency to minus this."""
     states: float = 0.3
     """Weight of the states' loss beside that of the categories."""
+    coarse: float = 0.15
+    """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
+    several times as many views in the same time. The rest of the training is at full size.
+    """
+    auxiliary: float = 0.25
+    """Weight of the losses of the network's coarser levels, which speed up its training."""
     degraded: float = 0.4
     """Share of views that are warped, blurred and noisy, as imagined ones are."""
     bfloat16: bool = True
@@ -85,35 +91,50 @@ def train(
 class _Trainer(ResumableTrainer):
     """The network in training, with everything that its next step depends on."""
 
-    stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_optimiser")
+    stateful_parts: ClassVar[tuple[str, ...]] = ("network", "_auxiliary", "_optimiser")
 
     def __init__(self, views: LabelledViews, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C21]) % 2**63)
         self.views, self.recipe = views, recipe
         self.network = Network(len(CATEGORIES), len(STATES), recipe.widths)
+        self._auxiliary = torch.nn.ModuleList(
+            torch.nn.Conv2d(width, len(CATEGORIES), 1) for width in reversed(recipe.widths[1:])
+        )
         self._set_prior()
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
+        parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
+        self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(views.category)
         self._category_weights = torch.from_numpy(_compute_category_weights(views.category, recipe.balance))
 
+    def _compute_category_loss(self, logits: Tensor, category: Tensor) -> Tensor:
+        """Return the loss of logits at any level: they are compared with the middles of their pixels."""
+        factor = category.shape[1] // logits.shape[2]
+        middles = category[:, factor // 2 :: factor, factor // 2 :: factor]
+        return functional.cross_entropy(logits.float(), middles, self._category_weights)
+
     def _set_prior(self) -> None:
-        """Start from the categories' frequencies, as they are weighted."""
+        """Let all heads start from the categories' frequencies, as they are weighted."""
         share = np.bincount(self.views.category.ravel(), minlength=len(CATEGORIES)) / self.views.category.size
         prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
         with torch.no_grad():
-            assert self.network.head.bias is not None
-            self.network.head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
+            for head in (self.network.head, *self._auxiliary):
+                head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
         rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
-        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng)
+        coarse = learning_rate > self.recipe.coarse * self.recipe.rate
+        batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
-            categories, states = self.network.train()(batch.shown)
-        loss = functional.cross_entropy(categories.float(), batch.category, self._category_weights)
+            features = self.network.train().compute_features(batch.shown)
+            categories, states = self.network.head(features[-1]).split([len(CATEGORIES), len(STATES)], dim=1)
+            coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]
+        loss = self._compute_category_loss(categories, batch.category)
+        for logits in coarser:
+            loss = loss + self.recipe.auxiliary * self._compute_category_loss(logits, batch.category)
         stateful = batch.state > 0
         if stateful.any():
             loss = loss + self.recipe.states * functional.cross_entropy(
@@ -151,23 +172,49 @@ class Batch:
     state: Tensor
 
 
-def sample_batch(views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator) -> Batch:
-    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded."""
-    rows = rng.choice(len(views), recipe.batch, p=weights)
+def sample_batch(
+    views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator, coarse: bool = False
+) -> Batch:
+    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded.
+
+    If `coarse`, twice as many views as usual, at about half their size.
+    """
+    count = 2 * recipe.batch if coarse else recipe.batch
+    rows = rng.choice(len(views), count, p=weights)
     images, category, state = views.images[rows], views.category[rows], views.state[rows]
-    for i in np.flatnonzero(rng.random(recipe.batch) < recipe.degraded):
+    for i in np.flatnonzero(rng.random(count) < recipe.degraded):
         images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
         category[i], state[i] = labels[..., 0], labels[..., 1]
-    mirrored = rng.random(recipe.batch) < 0.5
+    mirrored = rng.random(count) < 0.5
     for array in (images, category, state):
         array[mirrored] = array[mirrored, :, ::-1]
-    light = rng.uniform(0.75, 1.3, (recipe.batch, 1, 1, 1)) * rng.uniform(0.92, 1.08, (recipe.batch, 1, 1, 3))
+    light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
+    tangents = compute_view_tangents(views.hfov_deg[rows], (images.shape[1], images.shape[2]))
+    if coarse:
+        images, category, state, tangents = _halve(images, category, state, tangents)
     return Batch(
-        to_network_input(images, compute_view_tangents(views.hfov_deg[rows])),
+        to_network_input(images, tangents),
         torch.from_numpy(category.astype(np.int64)),
         torch.from_numpy(state.astype(np.int64)),
     )
+
+
+def _halve(
+    images: NDArray[np.uint8], category: NDArray[np.uint8], state: NDArray[np.uint8], tangents: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    """Shrink views and labels to about half their size, a size that the network takes."""
+    height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in images.shape[1:3])
+    rows, columns = (
+        (np.arange(new // STRIDE) * 2 + 1) * old // (2 * (new // STRIDE))
+        for new, old in zip((height, width), category.shape[1:], strict=True)
+    )
+    resized = [
+        np.stack([cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in array])
+        for array in (images, tangents)
+    ]
+    places = (slice(None), rows[:, None], columns)
+    return resized[0], category[places], state[places], resized[1]
 
 
 def degrade_view(
@@ -184,13 +231,10 @@ def degrade_view(
     field = rng.normal(0, rng.uniform(0, 4), (5, 6, 2)).astype(np.float32)
     offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
     across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    image = np.asarray(
-        cv2.remap(
-            image, across + offset[..., 0], down + offset[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
-        )
-    )
+    across_source, down_source = across + offset[..., 0], down + offset[..., 1]
+    image = np.asarray(cv2.remap(image, across_source, down_source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
     middle = (slice(STRIDE // 2, None, STRIDE),) * 2
-    source = (np.stack([across, down], axis=-1) + offset)[middle] / STRIDE
+    source = np.stack([across_source, down_source], axis=-1)[middle] / STRIDE
     columns, rows = np.clip(source, 0, (width // STRIDE - 1, height // STRIDE - 1)).astype(np.intp).transpose(2, 0, 1)
     labels = labels[rows, columns]
     if rng.random() < 0.5:

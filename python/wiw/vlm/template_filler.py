@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fill a user's templates in a separate process with limits on time and memory; the parent's side of `template_worker.py`."""
+"""Fill a user's templates in a child process (`template_worker.py`) with limits on time and memory."""
 
 from __future__ import annotations
 

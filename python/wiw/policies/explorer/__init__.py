@@ -28,7 +28,7 @@ from wiw.policies.explorer.answering import Belief, answer, list_wanted
 from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
-from wiw.types import Answer, Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
 
 VIEW_SIZE = (192, 224)
 """(H, W) of the views that are labelled."""
@@ -146,7 +146,7 @@ class Explorer(Policy):
         memory.objects.add(views, labels, name_color)
         memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
         memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
-        memory.belief = answer(memory.question, situation.goal.text, memory.home, memory.grid)
+        memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -230,7 +230,7 @@ class Explorer(Policy):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | TextAnswer | None]:
+    ) -> list[TextAnswer]:
         """Answer from the map of real views."""
         return [
             TextAnswer(
@@ -260,10 +260,10 @@ def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
 
 
 def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
-    """Return the views at the end of a rollout, uint8 [V, H, W, 3] (one where only the front is shown), and their HFOV."""
+    """Return the views at the end of a rollout, uint8 [V, H, W, 3], one if it shows the front alone; and their HFOV."""
     end = rollout.frames[-1]
     if rollout.view == "panorama":
-        return np.stack([to_perspective(end, VIEW_SIZE, HFOV_DEG, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
+        return np.stack([to_perspective(end, HFOV_DEG, VIEW_SIZE, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
     return end[None] if end.ndim == 3 else end, 90.0
 
 

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The labeller's training: on made-up views whose truth is known, on views of an apartment, and by the command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.cli.app import main
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.worlds import world
+from wiw.errors import ArgumentError
+from wiw.perception.colors import COLORS, ColorNamer
+from wiw.perception.scene_labels import CATEGORIES, STATES
+
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+from wiw.perception.labelling_network import FOCAL  # noqa: E402
+from wiw.perception.learned_labeller import LearnedLabeller  # noqa: E402
+from wiw.training import color_naming  # noqa: E402
+from wiw.training.checkpoint import Checkpoint  # noqa: E402
+from wiw.training.labelled_views import (  # noqa: E402
+    COLOR_SAMPLES,
+    FIELDS,
+    LabelledViews,
+    ViewRules,
+    merge_views,
+    read_instances,
+    record_views,
+)
+from wiw.training.perception import (  # noqa: E402
+    Recipe,
+    _compute_sampling_weights,
+    degrade_view,
+    evaluate,
+    find_possible_states,
+    sample_batch,
+    train,
+)
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+SIZE, FIELD = (64, 96), float(np.degrees(2 * np.arctan(48 / FOCAL)))
+"""The network takes such views as they are."""
+WALL, FLOOR, LAMP = (CATEGORIES.index(name) for name in ("wall", "floor", "table lamp"))
+ON, OFF = STATES.index("on"), STATES.index("off")
+SMALL = (8, 8, 12, 16)
+
+
+def made_up(count: int, seed: int) -> LabelledViews:
+    """Grey walls over grey floors, in which nothing but the height tells them apart, and a lamp that is on or off."""
+    rng = np.random.default_rng(seed)
+    images = rng.normal(120, 6, (count, *SIZE, 3))
+    category = np.full((count, SIZE[0] // 2, SIZE[1] // 2), WALL, np.uint8)
+    category[:, category.shape[1] // 2 :] = FLOOR
+    state = np.zeros_like(category)
+    pixels, color = [], []
+    for view in range(count):
+        top, left = 4 * rng.integers(1, 10), 4 * rng.integers(1, 18)
+        lit = bool(rng.integers(2))
+        shade = np.array([230, 60, 60]) if rng.integers(2) else np.array([60, 60, 230])
+        images[view, top : top + 20, left : left + 20] = shade * (1.0 if lit else 0.5)
+        place = (view, slice(top // 2, top // 2 + 10), slice(left // 2, left // 2 + 10))
+        category[place], state[place] = LAMP, ON if lit else OFF
+        pixels.append(np.clip(shade * rng.uniform(0.4, 1.0, (COLOR_SAMPLES, 1)), 0, 255))
+        color.append(COLORS.index("red" if shade[0] > 100 else "blue"))
+    return LabelledViews(
+        np.clip(images, 0, 255).astype(np.uint8),
+        category,
+        state,
+        np.full(count, FIELD, np.float32),
+        np.array(pixels).astype(np.uint8),
+        np.array(color, np.uint8),
+        np.full(count, LAMP, np.uint8),
+    )
+
+
+@pytest.fixture(scope="module")
+def lesson() -> Any:
+    views = made_up(96, 0)
+    network, recipe = train(views, Recipe(epochs=10, widths=SMALL, bfloat16=False, degraded=0.3))
+    assert recipe.epochs == 10
+    return network, find_possible_states(views)
+
+
+def test_a_short_training_is_worth_something(lesson: Any) -> None:
+    network, states = lesson
+    assert states == {"table lamp": ["on", "off"]}
+    found = evaluate(network, states, made_up(12, 1), 0)
+    plain = found["plain"]
+    assert set(plain["iou"]) == {"wall", "floor", "table lamp"} and found["views"] == 12
+    assert plain["pixel_accuracy"] > 0.9 and plain["iou"]["table lamp"] > 0.6
+    assert plain["iou"]["floor"] > 0.8  # told from the wall by the direction alone
+    assert plain["state_accuracy"] > 0.8 and set(plain["states"]["table lamp"]) == {"on", "off"}
+    assert 0.6 < found["degraded"]["pixel_accuracy"] <= plain["pixel_accuracy"]
+
+
+def test_wrong_labels_are_measured_as_wrong(lesson: Any) -> None:
+    network, states = lesson
+    views = made_up(6, 1)
+    swapped = views.category.copy()
+    swapped[views.category == WALL], swapped[views.category == FLOOR] = FLOOR, WALL
+    found = evaluate(network, states, replace(views, category=swapped, state=views.state), 0)["plain"]
+    assert found["iou"]["wall"] < 0.1 and found["iou"]["floor"] < 0.1
+    flipped = np.where(views.state == ON, OFF, np.where(views.state == OFF, ON, 0)).astype(np.uint8)
+    assert evaluate(network, states, replace(views, state=flipped), 0)["plain"]["state_accuracy"] < 0.2
+
+
+class InterruptionError(Exception):
+    pass
+
+
+def test_an_interrupted_training_ends_with_the_same_weights(tmp_path: Path) -> None:
+    views, recipe = made_up(16, 0), Recipe(epochs=2, widths=SMALL, bfloat16=False)
+    whole, _ = train(views, recipe)
+
+    def stop(step: int, steps: int, loss: float) -> None:
+        if step == 5:
+            raise InterruptionError
+
+    def checkpoint() -> Checkpoint:
+        return Checkpoint(tmp_path / "checkpoint", {"of": "these"}, seconds=0)
+
+    with pytest.raises(InterruptionError):
+        train(views, recipe, None, stop, checkpoint())
+    steps: list[int] = []
+    resumed, _ = train(views, recipe, None, lambda step, *_: steps.append(step), checkpoint())
+    assert steps == [5, 6, 7, 8]
+    for name, value in whole.state_dict().items():
+        assert torch.equal(value, resumed.state_dict()[name]), name
+
+
+def test_degraded_views_keep_their_labels() -> None:
+    rng = np.random.default_rng(0)
+    blocks = rng.integers(0, 2, (8, 12)).astype(np.uint8)
+    labels = np.kron(blocks, np.ones((4, 4), np.uint8))[..., None].repeat(2, axis=2)
+    image = np.kron(blocks, np.ones((8, 8), np.uint8))[..., None].repeat(3, axis=2) * 200
+    moved, agree = [], []
+    for _ in range(20):
+        shown, found = degrade_view(image, labels, rng)
+        assert shown.shape == image.shape and found.shape == labels.shape
+        moved.append((found != labels).mean())
+        agree.append(((shown[1::2, 1::2].mean(axis=2) > 100) == found[..., 0]).mean())
+    assert max(moved) > 0.05 and np.mean(agree) > 0.9
+    assert np.mean(agree) > 1 - np.mean(moved)  # labels move with what they label
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+def test_batches_are_aligned(coarse: bool) -> None:
+    views = made_up(8, 0)
+    recipe = Recipe(batch=3, degraded=0.0)
+    batch = sample_batch(views, recipe, _compute_sampling_weights(views.category), np.random.default_rng(0), coarse)
+    size = (32, 48) if coarse else SIZE
+    assert batch.shown.shape == (6 if coarse else 3, 5, *size)
+    assert batch.category.shape == (len(batch.shown), size[0] // 2, size[1] // 2) == batch.state.shape
+    colored = np.ptp(batch.shown[:, :3, 1::2, 1::2].numpy(), axis=1) > 0.3
+    assert (colored == (batch.category.numpy() == LAMP)).mean() > 0.96
+    assert ((batch.state.numpy() > 0) == (batch.category.numpy() == LAMP)).all()
+    assert (batch.shown[:, 4, 0] > 0).all() and (batch.shown[:, 4, -1] < 0).all()  # up and down
+
+
+def test_recipes_are_checked() -> None:
+    with pytest.raises(ArgumentError, match="epochs, batch and widths must be positive"):
+        Recipe(epochs=0)
+    with pytest.raises(ArgumentError, match="in which one can stand"):
+        merge_views([])
+
+
+# -- colours -----------------------------------------------------------------------------------------------------------
+
+
+def test_colors_are_calibrated() -> None:
+    namer = color_naming.calibrate(made_up(60, 0), 0, steps=150)
+    found = color_naming.evaluate(namer, made_up(40, 1))
+    assert found["things"] == 40 and found["accuracy"] > 0.9 and found["structure"] is None
+    assert set(found["by_color"]) == {"red", "blue"} and found["by_category"] == {"table lamp": found["accuracy"]}
+    views = made_up(4, 2)
+    nothing = replace(views, pixels=views.pixels[:0], color=views.color[:0], colored_category=views.color[:0])
+    assert color_naming.evaluate(namer, nothing)["accuracy"] is None
+    with pytest.raises(ArgumentError, match="things of known colours"):
+        color_naming.calibrate(nothing, 0)
+
+
+# -- data --------------------------------------------------------------------------------------------------------------
+
+
+def test_instances_become_labels() -> None:
+    def instance(number: int, category: str, **attributes: str) -> dict[str, Any]:
+        return {"id": number, "category": category, "attributes": attributes}
+
+    table = read_instances(
+        [
+            instance(1, "door frame", color="white", state="fixed"),
+            instance(2, "curtain", color="green", state="half drawn"),
+            instance(3, "dragon", color="green", state="on"),
+            instance(4, "television", color="no color", state="on"),
+        ]
+    )
+    assert [CATEGORIES[i] for i in table.category] == ["", "opening", "curtain", "", "television"]
+    assert [STATES[i] for i in table.state] == ["", "", "closed", "on", "on"]
+    assert [COLORS[i] if i >= 0 else "" for i in table.color] == ["", "", "green", "", ""]
+
+
+def test_recorded_views_show_what_their_labels_say() -> None:
+    place, rules = world("apartments:train/0"), ViewRules(places=2, views=2, fields=(105.0, 105.0))
+    views = record_views(place, 3, rules)
+    again = record_views(place, 3, rules)
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(views, name), getattr(again, name))
+    assert len(views) == 4 and views.images.shape[1:] == (176, 208, 3) and views.category.shape[1:] == (88, 104)
+    names = {CATEGORIES[i] for i in np.unique(views.category)}
+    assert {"wall", "floor"} <= names
+    middle = views.category[:, :, 52]
+    assert (middle[:, 0] != FLOOR).all() and (middle[:, -1] != CATEGORIES.index("ceiling")).all()
+    assert views.pixels.shape[1:] == (COLOR_SAMPLES, 3) and len(views.pixels) == len(views.color) > 4
+
+    from wiw._core import core
+
+    key = core.fold_key([3, 0x4C20])
+    point = place.ground.put_down(place.navmesh.sample(2, key)).astype(np.float64)[0]
+    turn = core.uniform(core.fold_key([key, 1]), 4)[0]
+    pose = camera_pose(point, float(2 * np.pi * turn))
+    direct = place.renderer.perspective(pose[None], (352, 416), 105.0, outputs=("instance",))["instance"][0]
+    table = read_instances(place.scene.instances)
+    expected = table.category[direct[2::4, 2::4]]
+    assert (expected == views.category[0]).mean() > 0.93  # edges differ by a pixel
+
+
+@pytest.mark.slow
+def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
+    command = ["train", "perception", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "4"]
+    assert main([*command, "--out", str(out), "--cache", str(cache), "--workers", "1", "--epochs", "2"]) == 0
+    printed = capsys.readouterr().out
+    assert "pixel accuracy" in printed and "colours of things" in printed and "IoU by category: wall" in printed
+    card = LearnedLabeller(out).card
+    assert card["scenes"] == "apartments:train:2" and card["views"] == 32 and card["held_out"]["views"] == 16
+    assert card["held_out"]["plain"]["pixel_accuracy"] > 0.2 and card["held_out"]["colors"]["accuracy"] > 0.2
+    assert out.stat().st_size < 4 * 2**20
+    ColorNamer.load(tmp_path / "weights.colors.json")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["looks", "weights.colors.json", "weights.safetensors"]
+    assert len(list(cache.iterdir())) == 3
