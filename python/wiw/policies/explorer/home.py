@@ -18,8 +18,10 @@ from wiw.mapping.occupancy import OccupancyGrid
 
 KNOWLEDGE = Path(__file__).with_name("knowledge.json")
 """What homes are usually like, counted in train apartments by `wiw.training.home_knowledge`."""
-SMOOTHING = 0.3
-"""Added to each count, so that nothing is impossible."""
+SMOOTHING = 0.02
+"""Added to each mean, so that nothing is impossible."""
+UNSEEN = 0.1
+"""Weight of each thing that a room of a kind usually has and that was not observed."""
 LEAST_SIZE = 0.0004
 """Share of a view that a thing must once have filled to be believed in."""
 LEAST_SHARE = 0.4
@@ -56,11 +58,11 @@ class Knowledge:
     def judge_room(self, counts: Mapping[str, int]) -> NDArray[np.float64]:
         """Return the probability of each kind for a room with these things in it (naive Bayes, Poisson counts)."""
         names = sorted({name for kind in self.contents.values() for name in kind})
-        means = np.array([[self.contents[kind].get(name, 0.0) for name in names] for kind in self.kinds]) + 0.02
+        means = np.array([[self.contents[kind].get(name, 0.0) for name in names] for kind in self.kinds]) + SMOOTHING
         found = np.array([counts.get(name, 0) for name in names])
         # What is not observed says little: the room may not have been looked at as a whole.
         log = np.log([self.rooms[kind] for kind in self.kinds]) + np.log(means) @ np.minimum(found, 3)
-        log -= 0.3 * means.sum(axis=1)
+        log -= UNSEEN * means.sum(axis=1)
         shares = np.exp(log - log.max())
         return np.asarray(shares / shares.sum())
 

@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The explorer: what it believes of a home, what it looks for, how imagined views count, and when it answers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_aeqa import SCENE, Records, episode, make_task  # noqa: F401 - a fixture
+
+import wiw
+from wiw.datasets.questions import parse
+from wiw.datasets.questions.blind import blind_answer
+from wiw.datasets.questions.facts import make_table
+from wiw.errors import ArgumentError
+from wiw.experiments.true_perception import OracleExplorer
+from wiw.loop.memory import Query
+from wiw.loop.privileged import LiveEnvironments
+from wiw.loop.scheduler import run_episodes
+from wiw.mapping.object_map import ObjectMap
+from wiw.mapping.occupancy import OccupancyGrid
+from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
+from wiw.policies import explorer
+from wiw.policies.explorer.answering import answer, list_wanted
+from wiw.policies.explorer.home import KNOWLEDGE, believe_home, load_knowledge, to_table_frame
+from wiw.scenes import apartment_table
+from wiw.tasks.aeqa import AEQA
+from wiw.training.home_knowledge import count_homes, write_knowledge
+from wiw.types import Key, Proposal, Rollout
+
+PALETTE = {
+    "white": (230, 228, 222), "grey": (128, 128, 128), "black": (30, 30, 30), "brown": (110, 75, 45),
+    "red": (170, 50, 45), "yellow": (220, 190, 70), "green": (80, 130, 75), "blue": (65, 95, 150),
+}  # fmt: skip
+
+
+class RedIsASofa(Labeller):
+    """Takes pure red for a sofa and anything else for nothing."""
+
+    categories = CATEGORIES
+
+    def compute_labels(self, images: np.ndarray, hfov_deg: float, ids: Any) -> SceneLabels:
+        sofa = (images == (255, 0, 0)).all(axis=-1)
+        category = np.where(sofa, CATEGORIES.index("sofa"), 0).astype(np.uint8)
+        return SceneLabels(category, sofa.astype(np.float32), np.zeros_like(category))
+
+
+@pytest.fixture(autouse=True)
+def plain_colors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Name colours by the nearest of a few, so that no weights are needed."""
+    names, values = list(PALETTE), np.array(list(PALETTE.values()), float)
+
+    def name_color(pixels: np.ndarray) -> tuple[str, float]:
+        return names[int(((values - pixels.mean(axis=0)) ** 2).sum(axis=1).argmin())], 0.8
+
+    monkeypatch.setattr(explorer, "name_color", name_color)
+
+
+def make_explorer(**options: Any) -> OracleExplorer:
+    return OracleExplorer(perception=RedIsASofa(), **options)
+
+
+# -- what homes are like -----------------------------------------------------------------------------------------------
+
+
+def test_rooms_are_told_by_what_is_in_them():
+    known = load_knowledge()
+    for things, kind in (
+        ({"toilet": 1}, "bathroom"),
+        ({"bed": 1, "wardrobe": 1}, "bedroom"),
+        ({"stove": 1}, "kitchen"),
+    ):
+        shares = known.judge_room(things)
+        assert known.kinds[int(shares.argmax())] == kind and shares.sum() == pytest.approx(1)
+    assert known.measure_affinity("bathroom", ["toilet"]) > 0.5 > known.measure_affinity("kitchen", ["toilet"])
+
+
+def test_knowledge_is_counted_in_train_apartments(tmp_path):
+    write_knowledge(tmp_path / "own.json", apartments=2)
+    own = json.loads((tmp_path / "own.json").read_text())
+    assert own == json.loads(json.dumps(count_homes([make_table(apartment_table(i, "train")) for i in range(2)])))
+    assert set(own) == set(json.loads(KNOWLEDGE.read_text())) and sum(own["rooms"].values()) == pytest.approx(
+        1, abs=1e-3
+    )
+
+
+def test_the_table_has_the_axes_of_scenes():
+    forward, left, up = to_table_frame(np.eye(3))
+    assert forward.tolist() == [0, 0, -1] and left.tolist() == [-1, 0, 0] and up.tolist() == [0, 1, 0]
+
+
+# -- questions ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("What color is the sofa?", ("sofa",)),
+        ("Is the bin in the kitchen nearer to the stove or to the refrigerator?", ("bin", "stove", "refrigerator")),
+        ("Where can I wash clothes?", ("washing machine",)),
+        ("How many people can sleep in the beds of this home?", ("bed", "bunk bed")),
+        ("What is love?", ()),
+    ],
+)
+def test_what_is_looked_for_follows_from_the_words(text, wanted):
+    assert list_wanted(parse(text)) == wanted
+
+
+def test_an_empty_map_leaves_the_guess_from_the_text():
+    grid = OccupancyGrid()
+    home = believe_home(ObjectMap(CATEGORIES, STATES), grid, [], load_knowledge())
+    for text in ("What color is the sofa?", "What is love?"):
+        belief = answer(parse(text), text, home, grid)
+        assert (belief.text, belief.confidence) == (blind_answer(text), 0.0)
+
+
+# -- episodes ----------------------------------------------------------------------------------------------------------
+
+
+def test_it_finds_the_sofa_and_answers_from_its_map(episode):  # noqa: F811
+    task = make_task(episode)
+    sofa = next(each for each in make_table(apartment_table(1, "val")).things if each.category == "sofa")
+    asked = "In which room is the sofa?"
+    question = {**episode.info["question"], "text": asked, "template": "which_room", "answer_type": "place"}
+    moved = replace(episode, info={"question": {**question, "answer": sofa.room.split(" 1")[0]}})
+    sink = run(task, moved)
+    (result,) = sink.results
+    assert result.status == "done", result.error
+    assert result.metrics["answered"] == 1 and result.metrics["success"] == 1 and result.metrics["grounded"] == 1
+    assert sink.answers[-1].final and sink.answers[-2].final and sink.answers[-1].confidence >= 0.5
+
+
+def run(task: AEQA, *episodes: Any, live: int = 1) -> Records:
+    sink = Records()
+    agent = wiw.Agent(make_explorer(), **task.defaults)
+    run_episodes(task, agent, list(enumerate(episodes)), seed=0, live=live, sink=sink)
+    return sink
+
+
+def test_episodes_do_not_depend_on_what_else_is_live(episode):  # noqa: F811
+    task = make_task(episode, actions=45)
+    turned = replace(episode, episode_id="0001", start_yaw=2.0)
+    alone, together = run(task, episode, turned), run(task, episode, turned, live=2)
+    assert {each.episode: each.metrics for each in alone.results} == {
+        each.episode: each.metrics for each in together.results
+    }
+
+
+def test_time_that_is_nearly_up_makes_any_belief_final(episode):  # noqa: F811
+    policy = make_explorer(budget=20, sure=1.1)
+    task = make_task(episode, actions=20)
+    sink = Records()
+    run_episodes(task, wiw.Agent(policy, **task.defaults), [(0, episode)], seed=0, live=1, sink=sink)
+    assert [each.final for each in sink.answers[:1]] == [False] and sink.answers[-1].final
+    assert sink.results[0].metrics["answered"] == 1
+
+
+# -- imagined views ----------------------------------------------------------------------------------------------------
+
+
+def test_a_plan_whose_imagined_end_shows_the_thing_scores_higher(episode):  # noqa: F811
+    task, policy = make_task(episode), make_explorer(imagination=5.0)
+    env = task.environment(depth=True)
+    observation = env.begin(episode)
+    environments = LiveEnvironments()
+    environments.add(Key(0, 0), env)
+    policy.grant(environments)
+    memory = policy.begin(env.goal, Key(0, 0))
+    situation = wiw.policies.base.Situation(observation, env.goal, Key(0, 0), memory)
+    policy.observe([situation])
+    empty = np.zeros((2, 288, 512, 3), np.uint8)
+    shown = empty.copy()
+    shown[-1, 130:200, 200:300] = (255, 0, 0)
+    passed = empty.copy()
+    passed[0, 130:200, 200:300] = (255, 0, 0)  # in sight on the way only
+    front = np.zeros((2, 192, 192, 3), np.uint8)
+    front[-1, 90:150, 60:130] = (255, 0, 0)
+    real = np.zeros(2, bool)
+    rollouts = [Rollout(frames, real, "panorama") for frames in (empty, shown, passed)] + [
+        Rollout(front, real, "front")
+    ]
+    plans = [Proposal(np.array([1, 1], np.int8), prior=1.0) for _ in rollouts]
+    (scores,) = policy.score([situation], [plans], [rollouts])
+    assert scores[0] == scores[2] == 1.0 and scores[1] > 5.5 and scores[3] > 5.5
+
+
+def test_true_perception_is_told_apart():
+    assert make_explorer().describe()["privileged"] == "perception"
+    with pytest.raises(ArgumentError, match="explorer-oracle"):
+        wiw.policy("explorer", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
+    with pytest.raises(ArgumentError, match="use it with task aeqa"):
+        explorer.Explorer.require({"task": "imagenav"})
+
+
+def test_queries_carry_the_text_alone(episode):  # noqa: F811
+    env = make_task(episode).environment(depth=True)
+    query = Query(env.begin(episode), env.goal, Key(0, 0))
+    assert query.goal.text == episode.info["question"]["text"] and SCENE not in repr(query.goal)
