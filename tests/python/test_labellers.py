@@ -304,8 +304,8 @@ def test_the_shipped_labeller_on_two_apartments(held_out: Any) -> None:
     assert found["degraded"]["pixel_accuracy"] > SHIPPED["degraded"]
 
 
-SHIPPED = {"pixel_accuracy": 0.8, "mean_iou": 0.2, "state_accuracy": 0.6, "degraded": 0.75}
-"""Floors for the shipped weights on two val apartments, some way below what was measured on twelve."""
+SHIPPED = {"pixel_accuracy": 0.69, "mean_iou": 0.19, "state_accuracy": 0.7, "degraded": 0.66}
+"""Floors for the shipped weights on two val apartments, some way below what was measured there."""
 
 
 def test_a_network_of_chance_is_below_the_floors(held_out: Any) -> None:

@@ -76,7 +76,8 @@ def train(
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
     beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
     val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
-    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults.
+    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults,
+    those of perception in half the epochs.
 
     Args:
         what: recogniser, warpnet, perception, armnet or diffuser.
@@ -87,7 +88,7 @@ def train(
             one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 8 for perception,
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 16 for perception,
             4 for armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
         places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 10), or walks

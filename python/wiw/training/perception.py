@@ -31,7 +31,7 @@ LEAST_PIXELS = 20
 class Recipe:
     """Hyper-parameters of the training."""
 
-    epochs: int = 8
+    epochs: int = 16
     """How often each view is used, on average."""
     batch: int = 4
     widths: tuple[int, int, int, int] = (24, 48, 96, 160)
@@ -42,7 +42,7 @@ class Recipe:
     """Weight of a category's pixels is their frequency to minus this."""
     states: float = 0.3
     """Weight of the states' loss beside that of the categories."""
-    coarse: float = 0.15
+    coarse: float = 0.5
     """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
     several times as many views in the same time. The rest of the training is at full size.
     """
