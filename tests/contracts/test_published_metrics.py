@@ -41,7 +41,8 @@ def strangers_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 
 def outcomes(**more: float) -> list[dict]:
-    metrics = {"success": 1.0, "spl": 0.5, "actions": 9.0, "refused": 0.0, **more}
+    answers = {"answer_score": 0.75, "answered": 1.0, "grounded": 1.0, "path_length": 4.0}
+    metrics = {"success": 1.0, "spl": 0.5, "actions": 9.0, "refused": 0.0, **answers, **more}
     rows = ({"arm": arm, "episode": i, "scene": f"s{i % 3}"} for arm in ("none", "warp") for i in range(6))
     return [{**row, "status": "done", "metrics": metrics} for row in rows]
 
