@@ -81,7 +81,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class TextAnswer:
-    """What an agent believes at a decision, in words, where the goal is a question."""
+    """An agent's belief at a decision, in words, where the goal is a question."""
 
     text: str = ""
     """Empty while the agent believes nothing."""
@@ -89,11 +89,6 @@ class TextAnswer:
     """From 0 to 1."""
     final: bool = False
     """Whether the agent gives this as its answer; the task's rules say when that ends the episode."""
-
-    @property
-    def label(self) -> str:
-        """The text, by the name that `Answer` has for it."""
-        return self.text
 
 
 @dataclass(frozen=True)
@@ -482,4 +477,4 @@ class EpisodeResult:
     """What failed: "environment", "agent", "worker" (its process died), "world_model/" and a `RolloutError.kind`,
     "vlm/" and a `VlmError.kind`, or "judge/" and a `JudgeError.kind`."""
     details: Mapping[str, Any] = field(default_factory=dict)
-    """What the task says of the episode besides numbers, JSON-able. A-EQA: "answer" and its "judgement"."""
+    """Facts about the episode besides numbers, JSON-able. A-EQA: "answer" and its "judgement"."""

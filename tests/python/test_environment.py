@@ -202,7 +202,18 @@ def test_no_privileged_truth_reaches_policies_or_models(two_rooms: str) -> None:
                     f.name for f in dataclasses.fields(s.goal)
                 }
                 assert names == {
-                    *("panorama", "front", "odometry", "depth", "target", "task", "image", "text", "choices", "question")
+                    *(
+                        "panorama",
+                        "front",
+                        "odometry",
+                        "depth",
+                        "target",
+                        "task",
+                        "image",
+                        "text",
+                        "choices",
+                        "question",
+                    )
                 }
                 assert s.observation.target is None and s.goal.choices == ()
             return [[wiw.types.Proposal([TURN_LEFT, FORWARD])] for _ in situations]

@@ -36,9 +36,9 @@ class TaskFlags:
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None
     """Episodes to run instead of generated ones, from `wiw episodes`, habitat-lab or World-in-World."""
     scene_folder: Folder = None
-    """What scene paths in that file are relative to; its own folder if not given and from wiw."""
+    """Folder of the scene paths in that file; for files of wiw the file's own folder if not given."""
     motion: Literal["refuse", "slide"] | None = None
-    """What happens to a blocked move; the preset's rule if not given."""
+    """Rule for blocked moves; the preset's if not given."""
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
     """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None

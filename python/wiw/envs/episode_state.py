@@ -135,7 +135,7 @@ class EpisodeState:
     uncounted: int = 0
     """Primitives that the task does not count."""
     notes: dict[str, Any] = field(default_factory=dict)
-    """What the task keeps of the episode while it measures it."""
+    """Intermediate results that the task keeps while it measures the episode."""
 
     @property
     def actions(self) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What judges have in common: they compare answers with references and mark them from 1 (wrong) to 5 (right)."""
+"""The interface of judges: they compare answers with references and mark them from 1 (wrong) to 5 (right)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from wiw.datasets.questions.question import ANSWER_TYPES
 from wiw.errors import ArgumentError, JudgeError
 from wiw.judging.words import cut_after_last_period
 
 LOWEST_MARK, HIGHEST_MARK = 1, 5
-ANSWER_TYPES = ("yes_no", "count", "color", "material", "category", "place", "state", "text")
 
 
 @dataclass(frozen=True)

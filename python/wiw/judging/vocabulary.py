@@ -38,7 +38,7 @@ class Relation(IntEnum):
 
 @dataclass(frozen=True)
 class Concept:
-    """What a word stands for; `shade` is the word that qualifies a colour."""
+    """The meaning of a word; `shade` is the word that qualifies a colour."""
 
     kind: Kind
     name: str

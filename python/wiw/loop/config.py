@@ -29,7 +29,7 @@ class PlanConfig:
     width: Annotated[int | None, arg(metavar="N")] = None
     """Plans of an episode that are kept and extended at each level; None means `candidates`."""
     space: Annotated[str | None, Suppress] = None
-    """What plans are made of (`wiw.loop.plan_space`); None means the task's, else the policy's."""
+    """Plan space (`wiw.loop.plan_space`); None means the task's, else the policy's."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -209,16 +209,20 @@ class OccupancyGrid:
 
     def find_room(self, points: NDArray[np.float64], reach: float = 0.6) -> int:
         """Return the room that most of N points [N, 2 or 3] are in, or within `reach` metres of; 0 where in none."""
+        found = self.list_rooms(points, reach)
+        return int(np.bincount(found[found > 0]).argmax()) if found.any() else 0
+
+    def list_rooms(self, points: NDArray[np.float64], reach: float = 0.6) -> NDArray[np.int32]:
+        """Return the room that each of N points is in, or within `reach` metres of, int32 [N]; 0 where in none."""
         rooms = self.rooms
         rows, columns = self.to_cells(points)
         inside = (rows >= 0) & (rows < rooms.shape[0]) & (columns >= 0) & (columns < rooms.shape[1])
-        if not inside.any():
-            return 0
         away, (near_rows, near_columns) = self._nearest_room
         rows, columns = rows[inside], columns[inside]
-        close = away[rows, columns] * CELL <= reach
-        found = rooms[near_rows[rows, columns], near_columns[rows, columns]][close]
-        return int(np.bincount(found).argmax()) if len(found) else 0
+        found = np.zeros(len(inside), np.int32)
+        near = rooms[near_rows[rows, columns], near_columns[rows, columns]]
+        found[inside] = np.where(away[rows, columns] * CELL <= reach, near, 0)
+        return found
 
     @cached_property
     def _nearest_room(self) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
@@ -286,7 +290,7 @@ def _forget(grid: OccupancyGrid) -> None:
 @dataclass(frozen=True)
 class _Rays:
     azimuth: NDArray[np.float64]
-    """Of each column that is used, left positive."""
+    """Azimuth of each column that is used, left positive."""
     cosine: NDArray[np.float32]
     sine: NDArray[np.float32]
 

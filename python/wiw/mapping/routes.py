@@ -280,7 +280,7 @@ def _distance_field(open_: NDArray[np.bool_], goals: NDArray[np.bool_]) -> NDArr
     index[inner] = np.arange(int(inner.sum()))
     heads, tails, lengths = [], [], []
     for dr, dc in NEIGHBOURS:
-        a, b = _shifted(inner.shape, dr, dc)
+        a, b = _shift_slices(inner.shape, dr, dc)
         both = inner[a] & inner[b]
         for r, c in _between(dr, dc):  # a knight's move passes two more cells
             both &= inner[_offset(inner.shape, a, r, c)]
@@ -296,7 +296,7 @@ def _distance_field(open_: NDArray[np.bool_], goals: NDArray[np.bool_]) -> NDArr
     return field
 
 
-def _shifted(shape: tuple[int, ...], dr: int, dc: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def _shift_slices(shape: tuple[int, ...], dr: int, dc: int) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Return the slices of an array's cells that have a neighbour (dr, dc) away, and of those neighbours."""
     height, width = shape
     first = slice(0, height - dr), slice(max(0, -dc), width - max(0, dc))

@@ -153,11 +153,11 @@ def compute_features(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 @cache
-def _decoded() -> NDArray[np.float64]:
+def _decode_levels() -> NDArray[np.float64]:
     """Return the linear value of each byte, by the power law that the apartments are lit and drawn with."""
     return np.asarray((np.arange(256) / 255.0) ** 2.2)
 
 
 def to_oklab(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Return Oklab lightness, a and b of display-encoded colours [..., 3]."""
-    return np.asarray(np.cbrt(_decoded()[pixels] @ _TO_CONES.T) @ _TO_LAB.T)
+    return np.asarray(np.cbrt(_decode_levels()[pixels] @ _TO_CONES.T) @ _TO_LAB.T)

@@ -37,7 +37,7 @@ class LearnedLabeller(Labeller):
         from wiw.perception.labeller_weights import load
 
         self.weights = None if weights is None else str(weights)
-        self._set(*load(WEIGHTS if weights is None else weights))
+        self._use_network(*load(WEIGHTS if weights is None else weights))
 
     @classmethod
     def of(cls, network: Network, card: Mapping[str, Any]) -> LearnedLabeller:
@@ -49,10 +49,10 @@ class LearnedLabeller(Labeller):
         """
         labeller = cls.__new__(cls)
         labeller.weights = None
-        labeller._set(network, card)
+        labeller._use_network(network, card)
         return labeller
 
-    def _set(self, network: Network, card: Mapping[str, Any]) -> None:
+    def _use_network(self, network: Network, card: Mapping[str, Any]) -> None:
         import torch
 
         self.card = dict(card)

@@ -162,7 +162,7 @@ class AEQA(NavigationTask):
 
     def is_success(self, state: EpisodeState) -> bool:
         """Return whether the episode has ended with an answer of the highest mark."""
-        return bool(self.final_answer(state)) and self._judge_final(state).mark == 5
+        return bool(self.final_answer(state)) and self._judge_end(state).mark == 5
 
     def final_answer(self, state: EpisodeState) -> str:
         """Return the answer that the episode has ended with; empty without one.
@@ -186,8 +186,7 @@ class AEQA(NavigationTask):
         Raises:
             JudgeError: the judge gave no mark.
         """
-        answer, blind = self.final_answer(state), self._judge_blind(state)
-        judged = self._judge_final(state) if answer else self._judge_unanswered(blind)
+        answer, blind, judged = self.final_answer(state), self._judge_blind(state), self._judge_end(state)
         score = _score(judged.mark)
         counts = bool(answer) or self.rules.unanswered == "blind_with_path"
         shortest = state.episode.geodesic if np.isfinite(state.episode.geodesic) else 0.0
@@ -207,18 +206,18 @@ class AEQA(NavigationTask):
 
     def describe_end(self, state: EpisodeState) -> dict[str, Any]:
         """Return the answer, what was expected, and who judged it how."""
-        answer, question = self.final_answer(state), read_question(state.episode)
-        judged = self._judge_final(state) if answer else self._judge_unanswered(self._judge_blind(state))
-        return {"answer": answer, "expected": question.answer, "judgement": judged.to_info()}
+        answer, expected = self.final_answer(state), read_question(state.episode).answer
+        return {"answer": answer, "expected": expected, "judgement": self._judge_end(state).to_info()}
 
-    def _judge_final(self, state: EpisodeState) -> Judgement:
-        return self._judge(state, self.final_answer(state))
+    def _judge_end(self, state: EpisodeState) -> Judgement:
+        """Return the judgement of the final answer, or what the rules put in its place."""
+        if answer := self.final_answer(state):
+            return self._judge(state, answer)
+        blind = self._judge_blind(state)
+        return replace(blind, mark=1) if self.rules.unanswered == "lowest" else blind
 
     def _judge_blind(self, state: EpisodeState) -> Judgement:
         return self._judge(state, blind_answer(read_question(state.episode).text))
-
-    def _judge_unanswered(self, blind: Judgement) -> Judgement:
-        return replace(blind, mark=1) if self.rules.unanswered == "lowest" else blind
 
     def _judge(self, state: EpisodeState, answer: str) -> Judgement:
         """Return the judgement of an answer, each one asked for once per episode."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What homes are usually like, counted in train apartments: kinds of rooms, their contents, materials."""
+"""Statistics of homes, counted in train apartments: kinds of rooms, their contents, materials."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is true: the answer of a template with its words in one scene table, and what must be in view to know it."""
+"""The true answer of a template with its words in one scene table, and the things that must be in view to know it."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ CONFUSABLE = frozenset(frozenset((name, other)) for name, others in _NEIGHBOURS.
 
 @dataclass(frozen=True)
 class Sight:
-    """What must be in view at one place: all of these instances, from within a room where one is named."""
+    """Instances that must all be in view at one place, from within a room where one is named."""
 
     things: tuple[int, ...]
     room: str = ""
@@ -101,7 +101,7 @@ class Fact:
 
     @property
     def key(self) -> str:
-        """What two answers must differ in to be different answers."""
+        """The part in which two answers must differ to be different."""
         return self.gist or self.answer
 
 
@@ -212,11 +212,11 @@ def _room(table: SceneTable, slots: Slots) -> Room | None:
     return table.find_room(slots["room"]) if "room" in slots else None
 
 
-def _named(table: SceneTable, slots: Slots, slot: str = "object") -> Thing | None:
+def _find_named(table: SceneTable, slots: Slots, slot: str = "object") -> Thing | None:
     return table.find_one(slots[slot], _room(table, slots))
 
 
-def _seen(thing: Thing, *others: Thing) -> tuple[Sight, ...]:
+def _make_sight(thing: Thing, *others: Thing) -> tuple[Sight, ...]:
     return (Sight((thing.id, *(other.id for other in others))),)
 
 
@@ -225,21 +225,21 @@ def _alone(found: list[Thing]) -> Thing | None:
     return found[0] if found and len({thing.category for thing in found}) == 1 else None
 
 
-def _related(table: SceneTable, slots: Slots, find: Callable[[Thing], list[Thing]]) -> Fact | None:
-    anchor = _named(table, slots, "anchor")
+def _answer_by_relation(table: SceneTable, slots: Slots, find: Callable[[Thing], list[Thing]]) -> Fact | None:
+    anchor = _find_named(table, slots, "anchor")
     found = find(anchor) if anchor is not None else []
     thing = _alone(found)
     if anchor is None or thing is None:
         return None
-    return Fact(thing.category, _seen(found[0], anchor), tuple(each.id for each in found))
+    return Fact(thing.category, _make_sight(found[0], anchor), tuple(each.id for each in found))
 
 
 def _on_top(table: SceneTable, slots: Slots) -> Fact | None:
-    return _related(table, slots, table.things_on)
+    return _answer_by_relation(table, slots, table.things_on)
 
 
 def _above(table: SceneTable, slots: Slots) -> Fact | None:
-    return _related(table, slots, table.things_above)
+    return _answer_by_relation(table, slots, table.things_above)
 
 
 def _beside(table: SceneTable, slots: Slots) -> Fact | None:
@@ -250,17 +250,17 @@ def _beside(table: SceneTable, slots: Slots) -> Fact | None:
         # A second one not much farther away would be as good an answer.
         return near[:1] if len(near) == 1 else []
 
-    return _related(table, slots, find)
+    return _answer_by_relation(table, slots, find)
 
 
 def _color(table: SceneTable, slots: Slots) -> Fact | None:
-    return _color_of(_named(table, slots))
+    return _color_of(_find_named(table, slots))
 
 
 def _color_of(thing: Thing | None) -> Fact | None:
     if thing is None or not thing.color or thing.category in PATTERNED:
         return None
-    return Fact(thing.color, _seen(thing), (thing.id,), colored=thing.id, color=thing.color)
+    return Fact(thing.color, _make_sight(thing), (thing.id,), colored=thing.id, color=thing.color)
 
 
 def _floor_color(table: SceneTable, slots: Slots) -> Fact | None:
@@ -278,11 +278,11 @@ def _material_of(thing: Thing | None) -> Fact | None:
     if thing is None or not word or thing.category in PATTERNED:
         return None
     extra = ("painted wood",) if word == "lacquer" else ()
-    return Fact(word, _seen(thing), (thing.id,), extra)
+    return Fact(word, _make_sight(thing), (thing.id,), extra)
 
 
 def _material(table: SceneTable, slots: Slots) -> Fact | None:
-    return _material_of(_named(table, slots))
+    return _material_of(_find_named(table, slots))
 
 
 def _floor_material(table: SceneTable, slots: Slots) -> Fact | None:
@@ -291,8 +291,8 @@ def _floor_material(table: SceneTable, slots: Slots) -> Fact | None:
 
 
 def _state(table: SceneTable, slots: Slots, states: tuple[str, str]) -> Fact | None:
-    thing = _named(table, slots)
-    return Fact(thing.state, _seen(thing), (thing.id,)) if thing is not None and thing.state in states else None
+    thing = _find_named(table, slots)
+    return Fact(thing.state, _make_sight(thing), (thing.id,)) if thing is not None and thing.state in states else None
 
 
 def _switch(table: SceneTable, slots: Slots) -> Fact | None:
@@ -319,11 +319,11 @@ def _place(table: SceneTable, thing: Thing) -> Fact | None:
     support = table.find_support(thing)
     anchor = support or table.nearest_furniture(thing)
     if anchor is None:
-        return Fact(f"in the {kind}", _seen(thing), (thing.id,), gist=kind)
+        return Fact(f"in the {kind}", _make_sight(thing), (thing.id,), gist=kind)
     relation = "on" if support else "next to"
     answer = f"{relation} the {anchor.category} in the {kind}"
     extra = (f"above the {anchor.category} in the {kind}",) if thing.category in HUNG and not support else ()
-    return Fact(answer, _seen(thing), (thing.id,), extra, gist=kind)
+    return Fact(answer, _make_sight(thing), (thing.id,), extra, gist=kind)
 
 
 def _where(table: SceneTable, slots: Slots) -> Fact | None:
@@ -355,7 +355,7 @@ def _room_of(table: SceneTable, found: list[Thing], exactly: bool = False, categ
     if len(kinds) != 1 or (exactly and len(found) != 1) or (category and found[0].category != category):
         return None
     kind = table.kind_of(found[0].room)
-    return Fact(kind, _seen(found[0]), tuple(thing.id for thing in found)) if kind else None
+    return Fact(kind, _make_sight(found[0]), tuple(thing.id for thing in found)) if kind else None
 
 
 def _inside(room: Room, found: list[Thing], table: SceneTable) -> tuple[Sight, ...] | None:
@@ -381,7 +381,7 @@ def _exists(table: SceneTable, slots: Slots) -> Fact | None:
 
 
 def _count_around(table: SceneTable, slots: Slots) -> Fact | None:
-    anchor = _named(table, slots, "anchor")
+    anchor = _find_named(table, slots, "anchor")
     if anchor is None or slots["objects"] not in ("chair",):
         return None
     near, wide = (table.things_around(slots["objects"], anchor, reach) for reach in (0.6, 1.0))
@@ -392,7 +392,7 @@ def _count_around(table: SceneTable, slots: Slots) -> Fact | None:
 
 
 def _count_on(table: SceneTable, slots: Slots) -> Fact | None:
-    anchor = _named(table, slots, "anchor")
+    anchor = _find_named(table, slots, "anchor")
     found = table.things_on(anchor) if anchor is not None else []
     if anchor is None or not found or anchor.category in ("bookshelf",):
         return None
@@ -425,7 +425,7 @@ def _activity(table: SceneTable, slots: Slots) -> Fact | None:
         return None
     extra = (f"next to the {thing.category} in the {kind}",)
     ids = tuple(each.id for each in found)
-    return Fact(f"at the {thing.category} in the {kind}", _seen(thing), ids, extra, gist=kind)
+    return Fact(f"at the {thing.category} in the {kind}", _make_sight(thing), ids, extra, gist=kind)
 
 
 def _use(table: SceneTable, slots: Slots) -> Fact | None:

@@ -99,7 +99,7 @@ def to_episodes(pair: Pair, first: int) -> list[Episode]:
 
 @dataclass
 class _Tally:
-    """What a block has so far."""
+    """The contents of a block so far."""
 
     pairs: list[Pair] = field(default_factory=list)
     counts: Counter[str] = field(default_factory=Counter)

@@ -55,7 +55,7 @@ class EpisodeRules:
     yes_no: float = 0.2
     """Greatest share of questions that are answered by yes or no; half of these by yes."""
     guessing: float = 0.2
-    """What a guess from the text may be worth on average, 0 to 1, as far as there are questions to choose from."""
+    """Highest mean score of a guess from the text, 0 to 1, as far as there are questions to choose from."""
     twins: float = 0.25
     """Share of the questions that are also asked in a copy of the apartment where something else is true."""
 

@@ -61,7 +61,7 @@ ACTIVITIES: Mapping[str, tuple[str, ...]] = {
     "keep clothes in a dresser": ("dresser",),
     "keep dishes in a sideboard": ("sideboard",),
 }
-"""What one can do in a home, and categories that allow it."""
+"""Activities in a home, and categories that allow them."""
 
 USES: Mapping[str, tuple[str, ...]] = {
     "sit on": ("sofa", "armchair", "chair", "office chair", "stool", "bench", "pouf"),
@@ -72,7 +72,7 @@ USES: Mapping[str, tuple[str, ...]] = {
     "use to entertain myself": ("television", "piano", "laptop"),
     "put a cup down on": ("coffee table", "side table", "dining table", "desk", "nightstand", "console table"),
 }
-"""What one can use something in a room for, and categories that serve."""
+"""Uses of things in a room, and categories that serve them."""
 
 HABITS: Mapping[str, tuple[str, ...]] = {
     "have their meals": ("dining table",),
@@ -88,7 +88,7 @@ HABITS: Mapping[str, tuple[str, ...]] = {
     "collect their dirty laundry": ("laundry basket",),
     "look at the clock": ("clock",),
 }
-"""What people do at home, and the furniture that gives it away."""
+"""Habits of people at home, and the furniture that gives them away."""
 
 CAPACITIES: Mapping[str, str] = {
     "wash their hands at a sink": "sink",
@@ -97,7 +97,7 @@ CAPACITIES: Mapping[str, str] = {
     "read by a floor lamp": "floor lamp",
     "look into a mirror": "mirror",
 }
-"""What each of several people needs a thing of their own for."""
+"""Activities for which each of several people needs a thing of their own."""
 
 _RESERVED = "above are around can does home how in is it left many nearer of off on open closed or people right the to"
 _TOKEN = rf"(?!(?:{'|'.join(_RESERVED.split())})\b)[a-z0-9]+"
@@ -140,7 +140,7 @@ class Template:
         return tuple(re.findall(r"{(\w+)}", self.pattern))
 
     @property
-    def required(self) -> frozenset[str]:
+    def required_slots(self) -> frozenset[str]:
         """Names of the slots that must be filled."""
         return frozenset(re.findall(r"{(\w+)}", re.sub(r"\[.*?\]", "", self.pattern)))
 
@@ -210,7 +210,7 @@ def phrase(template: str, slots: Mapping[str, str]) -> str:
     if template not in TEMPLATES:
         raise ArgumentError(f"template '{template}': expected one of {', '.join(TEMPLATES)}")
     kind = TEMPLATES[template]
-    if not kind.required <= set(slots) <= set(kind.slots):
+    if not kind.required_slots <= set(slots) <= set(kind.slots):
         raise ArgumentError(f"template '{template}' has the slots {', '.join(kind.slots)}, got {dict(slots)}")
     for name, word in slots.items():
         if re.fullmatch(_SLOTS.get(name, _THING), word) is None or (

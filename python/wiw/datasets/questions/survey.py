@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is in view from where in a scene, measured once for all its questions in coarse panoramas of instance ids."""
+"""Views of a scene's instances from many places, measured once for all its questions in coarse panoramas of ids."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ class Edit:
     """As in the copy's spec, such as "state:ceiling_lamp_1=off"."""
     kind: str
     names: tuple[str, ...]
-    """Of the instances that it changes."""
+    """Names of the instances that it changes."""
 
     @classmethod
     def parse(cls, text: str) -> Edit:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,11 @@ class Memory:
     surfaces: list[Surface] = field(default_factory=list)
     belief: Belief = field(default_factory=lambda: Belief("", 0.0))
     home: Any = None
-    expected: NDArray[np.float64] | None = None
-    """Where the last segment should have ended: a step that was refused shows in the odometry."""
+
+    @cached_property
+    def wanted(self) -> tuple[str, ...]:
+        """Categories to look for, the one that is asked about first."""
+        return list_wanted(self.question)
 
 
 class Explorer(Policy):
@@ -140,8 +144,6 @@ class Explorer(Policy):
 
     def _add_views(self, situation: Situation, views: Views, labels: SceneLabels) -> None:
         memory, observation = situation.memory, situation.observation
-        if memory.expected is not None and np.hypot(*(memory.expected - observation.odometry)[:2]) > 0.05:
-            memory.grid.mark_blocked(observation.odometry, 0.2)
         memory.grid.add(observation.depth, observation.odometry)
         memory.objects.add(views, labels, name_color)
         memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
@@ -157,9 +159,9 @@ class Explorer(Policy):
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
         memory, pose = situation.memory, situation.observation.odometry
         final = self._is_final(situation)
-        found = choose_destinations(
-            memory.grid, pose, memory.belief.places, self._rate, memory, most=1 if final else 2 * candidates
-        )
+        rate = partial(self._rate, memory)
+        most = 1 if final else 2 * candidates
+        found = choose_destinations(memory.grid, pose, memory.belief.places, rate, most)
         plans: dict[bytes, Proposal] = {}
         for place in found:
             actions = plan_route(memory.grid, pose, place, LOOK_ACTIONS if final else horizon)
@@ -173,11 +175,10 @@ class Explorer(Policy):
 
     def _rate(self, memory: Memory, place: Destination, metres: float) -> float:
         """Return what going to a place is worth: new floor, what is likely to be there, less the way."""
-        wanted = list_wanted(memory.question)
         room = memory.home.room_names.get(memory.grid.find_room(place.position[None]), "")
         kind = room.rpartition(" ")[0]
         named = memory.question.slots.get("room") if memory.question is not None else None
-        likely = self.knowledge.measure_affinity(kind, wanted) if kind else 0.3
+        likely = self.knowledge.measure_affinity(kind, memory.wanted) if kind else 0.3
         likely = max(likely, float(kind == named)) if named else likely
         return place.gain + place.interest + self.affinity * likely - self.path * metres
 
@@ -194,8 +195,7 @@ class Explorer(Policy):
         labels = iter(self._label_views(ends))
         scores = []
         for situation, plans in zip(situations, proposals, strict=True):
-            wanted = list_wanted(situation.memory.question)
-            shown = [self._measure_evidence(next(labels), wanted) for _ in plans]
+            shown = [self._measure_evidence(next(labels), situation.memory.wanted) for _ in plans]
             prior = np.array([plan.prior for plan in plans], np.float64)
             scores.append(prior + self.imagination * np.array(shown))
         return scores
@@ -243,14 +243,6 @@ class Explorer(Policy):
         """Return whether the present belief is given as the answer: it is sure enough, or time is nearly up."""
         left = self.budget - len(situation.executed)
         return bool(situation.memory.belief.confidence >= self.sure or left <= 2 * LOOK_ACTIONS)
-
-    def revise(
-        self, situation: Situation, proposals: Sequence[Proposal], scores: NDArray[np.float64]
-    ) -> tuple[NDArray[Any], int | None]:
-        """Take the best plan, and remember where it leads."""
-        actions, chosen = super().revise(situation, proposals, scores)
-        situation.memory.expected = None
-        return actions, chosen
 
 
 def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:

@@ -29,7 +29,7 @@ WHOLE_ROOM = frozenset({"count_in", "exists", "use"})
 
 @dataclass(frozen=True)
 class Belief:
-    """What an agent would answer now."""
+    """The answer that an agent would give now."""
 
     text: str
     confidence: float

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +37,7 @@ class Destination:
     worth: float = 0.0
 
 
-Rate = Callable[[Any, Destination, float], float]
+Rate = Callable[[Destination, float], float]
 
 
 def choose_destinations(
@@ -46,7 +45,6 @@ def choose_destinations(
     pose: NDArray[np.float64],
     things: Sequence[NDArray[np.float64]],
     rate: Rate,
-    memory: Any,
     most: int,
 ) -> list[Destination]:
     """Return at most `most` places, the most worth first.
@@ -56,7 +54,6 @@ def choose_destinations(
         pose: x, y, azimuth of the agent.
         things: float64 [3] each: what the question is about, as far as it is in the map.
         rate: returns the worth of a place, with the metres to it.
-        memory: handed to `rate`.
         most: places at most.
     """
     distances = measure_distances(grid, pose)
@@ -69,7 +66,7 @@ def choose_destinations(
     for place in found:
         metres = _measure_way(grid, distances, place)
         if np.isfinite(metres):
-            rated.append(replace(place, worth=rate(memory, place, metres)))
+            rated.append(replace(place, worth=rate(place, metres)))
     return sorted(rated, key=lambda place: (-place.worth, *place.position.tolist()))[:most]
 
 

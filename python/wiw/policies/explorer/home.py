@@ -17,7 +17,7 @@ from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 
 KNOWLEDGE = Path(__file__).with_name("knowledge.json")
-"""What homes are usually like, counted in train apartments by `wiw.training.home_knowledge`."""
+"""Statistics of homes, counted in train apartments by `wiw.training.home_knowledge`."""
 SMOOTHING = 0.02
 """Added to each mean, so that nothing is impossible."""
 UNSEEN = 0.1
@@ -41,7 +41,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What homes are usually like."""
+    """Statistics of homes."""
 
     rooms: Mapping[str, float]
     """Share of homes' rooms that are of each kind."""
@@ -162,8 +162,9 @@ def _make_surfaces(
 ) -> list[Thing]:
     """Return the floor and the walls of each room, of the colour that most looks at them had."""
     votes: dict[tuple[str, str], dict[str, float]] = {}
-    for look in surfaces:
-        room = names.get(grid.find_room(look.position[None]), "")
+    places = grid.list_rooms(np.array([look.position for look in surfaces]).reshape(-1, 2))
+    for look, place in zip(surfaces, places.tolist(), strict=True):
+        room = names.get(place, "")
         colors = votes.setdefault((look.category, room), {})
         colors[look.color] = colors.get(look.color, 0.0) + look.weight
     made = []
