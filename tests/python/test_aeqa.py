@@ -33,7 +33,7 @@ def episode() -> Episode:
     place = world(SCENE)
     start = place.ground.put_down(place.navmesh.sample(1, 3)[0])
     sofa = next(each["id"] for each in place.scene.instances if each["category"] == "sofa")
-    info = {"question": {**QUESTION.to_info(), "target": [sofa]}}
+    info = {"question": {**QUESTION.to_info(), "target": [sofa]}, "instruction": QUESTION.text}
     x, y, z = (float(value) for value in start)
     return Episode("0000", SCENE, (x, y, z), 0.0, (x, y, z), 0.0, 2.0, info)
 
@@ -284,6 +284,7 @@ def test_runs_keep_answers_and_judgements_apart_from_numbers(episode, tmp_path):
     (line,) = log.numbers().arms
     assert line.estimates["answer_score"].value == 100 and line.estimates["answered"].value == 100
     assert "blue" in log.report().read_text()
+    assert f"<q>{QUESTION.text}</q>" in log.report().read_text()
     json.dumps(make_task(episode).describe())
 
 

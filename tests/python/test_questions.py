@@ -50,7 +50,7 @@ WORDS = {
 @st.composite
 def filled_templates(draw: st.DrawFn) -> tuple[str, dict[str, str]]:
     template = grammar.TEMPLATES[draw(st.sampled_from(list(grammar.TEMPLATES)))]
-    slots = [name for name in template.slots if name in template.required or draw(st.booleans())]
+    slots = [name for name in template.slots if name in template.required_slots or draw(st.booleans())]
     return template.name, {name: draw(WORDS.get(name, NAMES)) for name in slots}
 
 
@@ -104,7 +104,7 @@ def test_every_template_has_an_answer_function_and_all_categories_are_asked() ->
         "state": "on",
     }
     for template in grammar.TEMPLATES.values():
-        given_slots = {name: slots[name] for name in template.slots if name in template.required}
+        given_slots = {name: slots[name] for name in template.slots if name in template.required_slots}
         assert find_answer(table, template.name, given_slots) is None
     assert len({template.category for template in grammar.TEMPLATES.values()}) == 7
 

@@ -126,7 +126,7 @@ class AEQA(NavigationTask):
         assert self.episode_file is not None
         published = isinstance(read_json(self.episode_file), list)
         found = openeqa.load(self.episode_file, self.scene_folder) if published else super().load_episodes()
-        return [_name_kind(episode) for episode in found]
+        return [_describe(episode) for episode in found]
 
     def locate(self, place: World, episode: Episode) -> Episode:
         """Return the episode with a start on the floor: OpenEQA's lists may give none."""
@@ -136,7 +136,7 @@ class AEQA(NavigationTask):
         """Return questions, each asked in two scenes at least with different answers, from where none is seen."""
         scenes = resolve(self.scenes)
         made = make_episodes(scenes, count, self.seed, self.generator, per_scene=self.per_scene, backend=self.backend)
-        return [_name_kind(episode) for episode in made]
+        return [_describe(episode) for episode in made]
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
         """Return the question's text, and nothing else of it."""
@@ -242,9 +242,10 @@ def read_question(episode: Episode) -> Question:
     return Question.from_info(episode.info["question"])
 
 
-def _name_kind(episode: Episode) -> Episode:
-    """Let the question's category be the episode's kind, which tables are split by."""
-    return replace(episode, info={**episode.info, "task": read_question(episode).category})
+def _describe(episode: Episode) -> Episode:
+    """Let reports show the question, and tables be split by its category."""
+    question = read_question(episode)
+    return replace(episode, info={**episode.info, "task": question.category, "instruction": question.text})
 
 
 def _score(mark: float) -> float:
