@@ -7,8 +7,8 @@ asks ("A-EQA High-Level Planner Additional Prompt").
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from wiw.action import TURN_LEFT
 from wiw.datasets.questions import ParsedQuestion, parse
 from wiw.errors import ArgumentError
+from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
+from wiw.mapping.routes import STEP, find_refused
 from wiw.mapping.views import HFOV_DEG, VIEW_YAWS_DEG, Views, cut_views, unproject
 from wiw.panorama import to_perspective
 from wiw.perception.colors import name_color
@@ -42,6 +44,22 @@ CLEAR_SHARE = 0.01
 """Share of a view that a wanted thing must fill in an imagined view to count in full."""
 
 
+@dataclass(frozen=True)
+class Look:
+    """A real look around."""
+
+    panorama: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    """Distances along the ray in metres."""
+    odometry: NDArray[np.float64]
+    ids: NDArray[np.uint32] | None = None
+    """The simulator's instance of each pixel, for explorers that are given the truth."""
+
+    def with_ids(self, ids: NDArray[np.uint32]) -> Look:
+        """Return the same look with instance ids."""
+        return replace(self, ids=ids)
+
+
 @dataclass
 class Memory:
     """The memory of one episode."""
@@ -53,6 +71,20 @@ class Memory:
     surfaces: list[Surface] = field(default_factory=list)
     belief: Belief = field(default_factory=lambda: Belief("", 0.0))
     home: Any = None
+    azimuth: float | None = None
+    """Of the walls in the frame of the start; the map's x axis points along it."""
+    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """x, y, azimuth in the map at the last decision."""
+    executed: int = 0
+    """Primitives until then."""
+    destinations: list[Destination] = field(default_factory=list)
+    """Places worth going to from there, the most worth first."""
+
+    def align(self, look: Look) -> NDArray[np.float64]:
+        """Return x, y, azimuth of a look in the map."""
+        if self.azimuth is None:
+            self.azimuth = find_wall_azimuth(look.depth, look.odometry)
+        return turn_odometry(look.odometry, self.azimuth)
 
     @cached_property
     def wanted(self) -> tuple[str, ...]:
@@ -130,25 +162,40 @@ class Explorer(Policy):
     # -- real views ----------------------------------------------------------------------------------------------------
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Add the real views to the maps, labelled in one batch, and ask them the questions."""
-        cut = [
-            cut_views(own.panorama, own.depth, own.odometry, VIEW_SIZE) for own in (s.observation for s in situations)
-        ]
-        labels = self.label_real(situations, cut)
-        for i, (situation, views) in enumerate(zip(situations, cut, strict=True)):
-            self._add_views(situation, views, _take(labels, 4 * i, 4))
+        """Add the real views to the maps, and ask them the questions."""
+        for situation in situations:
+            memory = situation.memory
+            for look in self.look_around(situation):
+                pose = memory.align(look)
+                views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
+                labels = self.label(situation, look, views)
+                memory.grid.add(look.depth, pose)
+                memory.objects.add(views, labels, name_color)
+                memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
+            self._mark_refused(situation)
+            memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
+            memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
+            rate = partial(self._rate, memory)
+            memory.destinations = choose_destinations(memory.grid, memory.pose, memory.belief.things, rate)
 
-    def label_real(self, situations: Sequence[Situation], cut: Sequence[Views]) -> SceneLabels:
-        """Return the labels of the real views of all episodes, four of each."""
-        return self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
+    def _mark_refused(self, situation: Situation) -> None:
+        """Mark what stood in the way since the last decision, and note where the agent stands now."""
+        memory = situation.memory
+        pose = turn_odometry(situation.observation.odometry, memory.azimuth)
+        if memory.executed < len(situation.executed):
+            blocked = find_refused(memory.pose, situation.executed[memory.executed :], pose)
+            if blocked is not None:
+                memory.grid.mark_blocked(blocked, STEP)
+        memory.pose, memory.executed = pose, len(situation.executed)
 
-    def _add_views(self, situation: Situation, views: Views, labels: SceneLabels) -> None:
-        memory, observation = situation.memory, situation.observation
-        memory.grid.add(observation.depth, observation.odometry)
-        memory.objects.add(views, labels, name_color)
-        memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
-        memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
-        memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
+    def look_around(self, situation: Situation) -> Iterator[Look]:
+        """Yield what is to be added to the map: the present observation."""
+        observation = situation.observation
+        yield Look(observation.panorama, observation.depth, observation.odometry)
+
+    def label(self, situation: Situation, look: Look, views: Views) -> SceneLabels:
+        """Return the labels of the four real views of a look around."""
+        return self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -157,14 +204,11 @@ class Explorer(Policy):
         return [self._plan(situation, candidates, horizon) for situation in situations]
 
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
-        memory, pose = situation.memory, situation.observation.odometry
-        final = self._is_final(situation)
-        rate = partial(self._rate, memory)
-        most = 1 if final else 2 * candidates
-        found = choose_destinations(memory.grid, pose, memory.belief.places, rate, most)
+        memory = situation.memory
+        final = self.is_final(situation)
         plans: dict[bytes, Proposal] = {}
-        for place in found:
-            actions = plan_route(memory.grid, pose, place, LOOK_ACTIONS if final else horizon)
+        for place in memory.destinations[: 1 if final else 2 * candidates]:
+            actions = plan_route(memory.grid, memory.pose, place, LOOK_ACTIONS if final else horizon)
             if len(actions):
                 plans.setdefault(actions.tobytes(), Proposal(actions, prior=place.worth, note=place.note))
             if len(plans) == candidates:
@@ -233,16 +277,15 @@ class Explorer(Policy):
     ) -> list[TextAnswer]:
         """Answer from the map of real views."""
         return [
-            TextAnswer(
-                own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self._is_final(situation)
-            )
+            TextAnswer(own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self.is_final(situation))
             for situation, own in ((situation, situation.memory) for situation in situations)
         ]
 
-    def _is_final(self, situation: Situation) -> bool:
-        """Return whether the present belief is given as the answer: it is sure enough, or time is nearly up."""
+    def is_final(self, situation: Situation) -> bool:
+        """Return whether the present belief is the answer: it is sure enough, nothing is left to see, or no time."""
+        memory = situation.memory
         left = self.budget - len(situation.executed)
-        return bool(situation.memory.belief.confidence >= self.sure or left <= 2 * LOOK_ACTIONS)
+        return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= 2 * LOOK_ACTIONS)
 
 
 def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Explorers that are given truth about a home: which of their errors are perception's, exploration's, or neither's.
+
+Two things can be given: true labels of real views, by the simulator's instance ids, and a tour, which is views from all
+over the home before the first decision. Together with the explorer itself this makes four arms of one run. Those that
+are given something are privileged, and no agents to compare world models with: runs record what they are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw._core import core
+from wiw.loop.privileged import LiveEnvironments, Privileged
+from wiw.mapping.views import HFOV_DEG, Views, cut_labels
+from wiw.perception.oracle_labeller import OracleLabeller
+from wiw.perception.scene_labels import SceneLabels
+from wiw.policies.base import Situation
+from wiw.policies.explorer import Explorer, Look
+
+SPACING = 1.2
+"""Metres within which a tour passes every place that can be reached."""
+SURVEY = 500
+"""Places that a tour is chosen from."""
+
+
+class PrivilegedExplorer(Explorer, Privileged):
+    """`Explorer` that is given some truth, as its subclasses say.
+
+    Args:
+        options: of `Explorer`.
+    """
+
+    true_labels: ClassVar[bool] = False
+    """Whether real views are labelled by the truth; imagined views are labelled as ever."""
+    tour: ClassVar[bool] = False
+    """Whether the map begins with views from all over the home, so that the first answer is final."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._environments = LiveEnvironments()
+
+    def grant(self, environments: LiveEnvironments) -> None:
+        """Take the environments whose truth is given."""
+        self._environments = environments
+
+    def describe(self) -> dict[str, Any]:
+        """Return a JSON-able identity that says what is given."""
+        given = (("labels", self.true_labels), ("tour", self.tour))
+        return {**super().describe(), "privileged": [name for name, whether in given if whether]}
+
+    def look_around(self, situation: Situation) -> Iterator[Look]:
+        """Yield the looks of a tour, where one is due, and then the real one; with ids where these are given."""
+        env = self._environments.find(situation.key)
+        if self.tour and not situation.memory.grid.visits:
+            yield from take_tour(env, self.true_labels)
+        for look in super().look_around(situation):
+            yield look.with_ids(env.instances()[0]) if self.true_labels else look
+
+    def label(self, situation: Situation, look: Look, views: Views) -> SceneLabels:
+        """Return the labels by the ids where these are given."""
+        if look.ids is None:
+            return super().label(situation, look, views)
+        labeller = OracleLabeller(self._environments.find(situation.key).instances()[1], self.labeller.categories)
+        return labeller.label(views.images, HFOV_DEG, cut_labels(look.ids, views.size))
+
+    def is_final(self, situation: Situation) -> bool:
+        """Return whether the present belief is given as the answer: after a tour there is nothing left to see."""
+        return self.tour or super().is_final(situation)
+
+
+class OracleExplorer(PrivilegedExplorer):
+    """Explores for itself with true labels."""
+
+    true_labels = True
+
+
+class TourExplorer(PrivilegedExplorer):
+    """Is led through the whole home, and labels it as `Explorer` does."""
+
+    tour = True
+
+
+class OracleTourExplorer(PrivilegedExplorer):
+    """Is led through the whole home with true labels: what it gets wrong is the map's or the answerer's error."""
+
+    true_labels = tour = True
+
+
+def take_tour(env: Any, ids: bool) -> Iterator[Look]:
+    """Yield looks around from places all over the home of a live environment, which does not move.
+
+    Args:
+        env: a navigation environment in an episode.
+        ids: whether looks carry the simulator's instance ids.
+    """
+    yield from look_from(env, choose_places(env.state.world, env.state.positions[-1]), ids)
+
+
+def look_from(env: Any, places: Iterable[NDArray[np.float64]], ids: bool) -> Iterator[Look]:
+    """Yield a look around from each place, float64 [3] in the world; the environment itself does not move."""
+    start, here = env.state.positions[-1], env.observation.odometry
+    simulator = env.fork()
+    heading = float(simulator.yaw)
+    outputs = ["panorama", "depth", *(["panorama_ids"] if ids else [])]
+    for place in places:
+        simulator.reset(place, heading)
+        shown = simulator.observe(outputs)
+        odometry = _to_odometry(np.asarray(simulator.position) - start, heading, here)
+        yield Look(shown["panorama"], shown["depth"], odometry, shown.get("panorama_ids"))
+
+
+def choose_places(world: Any, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return places within `SPACING` of every place that can be reached from a start, float64 [N, 3].
+
+    The farthest from all that are chosen is next, from the start on; a pure function of (world, start).
+    """
+    island = int(world.navmesh.island_of(start))
+    points = world.ground.put_down(world.navmesh.sample(SURVEY, core.fold_key([0x70A2]), island)).astype(np.float64)
+    away = np.linalg.norm(points - start, axis=1)
+    chosen = []
+    while len(points) and away.max() > SPACING:
+        chosen.append(points[int(away.argmax())])
+        away = np.minimum(away, np.linalg.norm(points - chosen[-1], axis=1))
+    return np.array(chosen).reshape(-1, 3)
+
+
+def _to_odometry(offset: NDArray[np.float64], heading: float, here: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return x, y, azimuth of a place in the frame of the start.
+
+    Args:
+        offset: of the place from the agent, in the world (Y up).
+        heading: of the agent in the world, radians, left positive from -Z.
+        here: x, y, azimuth of the agent.
+    """
+    ahead = np.array([-np.sin(heading), 0.0, -np.cos(heading)]) @ offset
+    left = np.array([-np.cos(heading), 0.0, np.sin(heading)]) @ offset
+    cos, sin = np.cos(here[2]), np.sin(here[2])
+    return np.array([here[0] + cos * ahead - sin * left, here[1] + sin * ahead + cos * left, here[2]])
