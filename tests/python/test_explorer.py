@@ -279,8 +279,8 @@ def test_a_plan_whose_imagined_end_shows_the_thing_scores_higher(episode):  # no
 
 
 def test_true_perception_is_told_apart():
-    assert make_explorer().describe()["privileged"] == ["labels"]
-    assert OracleTourExplorer(perception=RedIsASofa()).describe()["privileged"] == ["labels", "tour"]
+    assert make_explorer().describe()["privileged"] == ["perception"]
+    assert OracleTourExplorer(perception=RedIsASofa()).describe()["privileged"] == ["perception", "tour"]
     with pytest.raises(ArgumentError, match="explorer-oracle"):
         wiw.policy("explorer", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
     with pytest.raises(ArgumentError, match="use it with task aeqa"):

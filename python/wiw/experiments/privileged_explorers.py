@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Explorers that are given truth about a home: which of their errors are perception's, exploration's, or neither's.
 
-Two things can be given: true labels of real views, by the simulator's instance ids, and a tour, which is views from all
-over the home before the first decision. Together with the explorer itself this makes four arms of one run. Those that
-are given something are privileged, and no agents to compare world models with: runs record what they are given.
+Two things can be given: perception, which is true labels and colours of real views by the simulator's instance ids, and
+a tour, which is views from all over the home before the first decision. Together with the explorer itself this makes
+four arms of one run. Those that are given something are privileged, and no agents to compare world models with: runs
+record what they are given.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,11 +18,12 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.loop.privileged import LiveEnvironments, Privileged
-from wiw.mapping.views import HFOV_DEG, Views, cut_labels
+from wiw.mapping.views import HFOV_DEG, Views, cut_labels, cut_views
+from wiw.perception.colors import COLORS
 from wiw.perception.oracle_labeller import OracleLabeller
 from wiw.perception.scene_labels import SceneLabels
 from wiw.policies.base import Situation
-from wiw.policies.explorer import Explorer, Look
+from wiw.policies.explorer import VIEW_SIZE, Explorer, Look
 
 SPACING = 1.2
 """Metres within which a tour passes every place that can be reached."""
@@ -36,7 +39,7 @@ class PrivilegedExplorer(Explorer, Privileged):
     """
 
     true_labels: ClassVar[bool] = False
-    """Whether real views are labelled by the truth; imagined views are labelled as ever."""
+    """Whether real views have true labels and colours; imagined views are labelled as ever."""
     tour: ClassVar[bool] = False
     """Whether the map begins with views from all over the home, so that the first answer is final."""
 
@@ -50,7 +53,7 @@ class PrivilegedExplorer(Explorer, Privileged):
 
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity that says what is given."""
-        given = (("labels", self.true_labels), ("tour", self.tour))
+        given = (("perception", self.true_labels), ("tour", self.tour))
         return {**super().describe(), "privileged": [name for name, whether in given if whether]}
 
     def look_around(self, situation: Situation) -> Iterator[Look]:
@@ -61,16 +64,33 @@ class PrivilegedExplorer(Explorer, Privileged):
         for look in super().look_around(situation):
             yield look.with_ids(env.instances()[0]) if self.true_labels else look
 
-    def label(self, situation: Situation, look: Look, views: Views) -> SceneLabels:
-        """Return the labels by the ids where these are given."""
+    def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
+        """Return the views and their labels; where ids are given by these, and each thing painted in its colour."""
         if look.ids is None:
-            return super().label(situation, look, views)
-        labeller = OracleLabeller(self._environments.find(situation.key).instances()[1], self.labeller.categories)
-        return labeller.label(views.images, HFOV_DEG, cut_labels(look.ids, views.size))
+            return super().perceive(situation, look, pose)
+        instances = self._environments.find(situation.key).instances()[1]
+        views, ids = cut_views(look.panorama, look.depth, pose, VIEW_SIZE), cut_labels(look.ids, VIEW_SIZE)
+        labels = OracleLabeller(instances, self.labeller.categories).label(views.images, HFOV_DEG, ids)
+        return replace(views, images=_paint_colors(instances)[ids]), labels
+
+    def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+        """Return the colour word that painted pixels stand for, or that real ones show."""
+        if not self.true_labels:
+            return super().name_color(pixels)
+        return COLORS[int(np.bincount(pixels[:, 0]).argmax())], 1.0
 
     def is_final(self, situation: Situation) -> bool:
         """Return whether the present belief is given as the answer: after a tour there is nothing left to see."""
         return self.tour or super().is_final(situation)
+
+
+def _paint_colors(instances: Sequence[Mapping[str, Any]]) -> NDArray[np.uint8]:
+    """Return the pixel of each instance, uint8 [instances + 1, 3], whose red is the number of its colour."""
+    painted = np.zeros((max((int(each["id"]) for each in instances), default=0) + 1, 3), np.uint8)
+    for each in instances:
+        color = each["attributes"].get("color", "")
+        painted[each["id"]] = COLORS.index(color) if color in COLORS else 0
+    return painted
 
 
 class OracleExplorer(PrivilegedExplorer):

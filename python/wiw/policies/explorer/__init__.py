@@ -167,16 +167,34 @@ class Explorer(Policy):
             memory = situation.memory
             for look in self.look_around(situation):
                 pose = memory.align(look)
-                views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
-                labels = self.label(situation, look, views)
+                views, labels = self.perceive(situation, look, pose)
                 memory.grid.add(look.depth, pose)
-                memory.objects.add(views, labels, name_color)
-                memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
+                memory.objects.add(views, labels, self.name_color)
+                memory.surfaces += self._look_at_surfaces(views, labels)
             self._mark_refused(situation)
             memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
             memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
             rate = partial(self._rate, memory)
             memory.destinations = choose_destinations(memory.grid, memory.pose, memory.belief.things, rate)
+
+    def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
+        """Return looks at floors and walls: patches that are all of one surface, with their colour."""
+        looks, categories = [], self.labeller.categories
+        half = SURFACE_STRIDE // 2
+        for name in SURFACES:
+            if name not in categories:
+                continue
+            mask = (labels.category == categories.index(name)) & (views.depth > 0)
+            height, width = views.size
+            for view in range(len(mask)):
+                for row in range(half, height - half, SURFACE_STRIDE):
+                    for column in range(half, width - half, SURFACE_STRIDE):
+                        patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
+                        if mask[patch].all():
+                            color, confidence = self.name_color(views.images[patch].reshape(-1, 3))
+                            point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
+                            looks.append(Surface(name, point[:2], color, confidence))
+        return looks
 
     def _mark_refused(self, situation: Situation) -> None:
         """Mark what stood in the way since the last decision, and note where the agent stands now."""
@@ -193,9 +211,14 @@ class Explorer(Policy):
         observation = situation.observation
         yield Look(observation.panorama, observation.depth, observation.odometry)
 
-    def label(self, situation: Situation, look: Look, views: Views) -> SceneLabels:
-        """Return the labels of the four real views of a look around."""
-        return self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
+    def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
+        """Return the four real views of a look around from a pose in the map, and their labels."""
+        views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
+        return views, self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
+
+    def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+        """Return the colour word of pixels uint8 [n, 3] of one thing in such views, and its probability."""
+        return name_color(pixels)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -300,23 +323,3 @@ def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
     if rollout.view == "panorama":
         return np.stack([to_perspective(end, HFOV_DEG, VIEW_SIZE, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
     return end[None] if end.ndim == 3 else end, 90.0
-
-
-def _look_at_surfaces(views: Views, labels: SceneLabels, categories: Sequence[str]) -> list[Surface]:
-    """Return looks at floors and walls: patches that are all of one surface, with their colour."""
-    looks = []
-    half = SURFACE_STRIDE // 2
-    for name in SURFACES:
-        if name not in categories:
-            continue
-        mask = (labels.category == categories.index(name)) & (views.depth > 0)
-        height, width = views.size
-        for view in range(len(mask)):
-            for row in range(half, height - half, SURFACE_STRIDE):
-                for column in range(half, width - half, SURFACE_STRIDE):
-                    patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
-                    if mask[patch].all():
-                        color, confidence = name_color(views.images[patch].reshape(-1, 3))
-                        point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
-                        looks.append(Surface(name, point[:2], color, confidence))
-    return looks

@@ -29,6 +29,8 @@ LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
 
 
+WALL_REACH = 0.7
+"""Metres behind what was seen of furniture in which its wall is looked for."""
 TOO_LONG = 1.3
 """Times the usual length of its category, from which on a thing of the map may be several."""
 
@@ -194,20 +196,22 @@ def _complete_bounds(
 
 
 def _find_front(thing: MapObject, grid: OccupancyGrid) -> NDArray[np.float64]:
-    """Return the horizontal axis, in the table's frame, with floor ahead and a wall behind: where furniture faces."""
+    """Return the horizontal axis, in the table's frame, that a thing faces along: floor ahead, a wall behind, wide."""
     best, most = np.array([1.0, 0.0]), -np.inf
     for axis in np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]):
         across = np.array([-axis[1], axis[0]])
         along, beside = thing.points[:, :2] @ axis, thing.points[:, :2] @ across
         width = np.linspace(*np.quantile(beside, [0.1, 0.9]), 5)
-        ahead = np.quantile(along, 0.98) + np.array([0.15, 0.3, 0.45, 0.6])
-        behind = np.quantile(along, 0.02) - np.array([0.05, 0.15, 0.25, 0.35])
-        free, blocked = (
-            grid.lookup(layer, (places[:, None, None] * axis + width[None, :, None] * across).reshape(-1, 2)).mean()
-            for layer, places in ((grid.free, ahead), (grid.walls, behind))
-        )
-        if free + blocked > most:
-            best, most = axis, free + blocked
+
+        def look(layer: NDArray[np.bool_], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+            points = places[:, None, None] * axis + width[None, :, None] * across  # noqa: B023 - used at once
+            return grid.lookup(layer, points.reshape(-1, 2)).reshape(len(places), -1)
+
+        free = look(grid.free, np.quantile(along, 0.98) + np.array([0.15, 0.3, 0.45, 0.6])).mean()
+        wall = look(grid.walls, np.quantile(along, 0.02) - np.arange(0.0, WALL_REACH, 0.05)).any(axis=0).mean()
+        score = free + wall + 0.25 * (np.ptp(along) <= np.ptp(beside))
+        if score > most:
+            best, most = axis, score
     return to_table_frame(np.array([best[0], best[1], 0.0]))
 
 
