@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.questions.facts import FLAT, HUNG, Room, SceneTable, Thing
+from wiw.datasets.questions.facts import FRONTED, Room, SceneTable, Thing
 from wiw.mapping.fragments import split_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
@@ -29,6 +29,8 @@ LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
 
 
+WORKTOPS = frozenset({"kitchen counter", "kitchen cabinet"})
+"""Categories that stand against walls and have no left and right."""
 WALL_REACH = 0.7
 """Metres behind what was seen of furniture in which its wall is looked for."""
 TOO_LONG = 1.3
@@ -159,8 +161,11 @@ def _name_rooms(
 
 
 def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Knowledge) -> Thing:
-    front = _find_front(thing, grid)
-    low, high = _complete_bounds(thing, front, knowledge)
+    corners = to_table_frame(thing.bounds)
+    low, high, front = corners.min(axis=0), corners.max(axis=0), np.array([0.0, 0.0, 1.0])
+    if thing.category in FRONTED | WORKTOPS:
+        front = _find_front(thing, grid)
+        low, high = _complete_bounds(low, high, front, knowledge.sides.get(thing.category, (0.0, 0.0))[1])
     return Thing(
         id=thing.id,
         name=f"{thing.category} {thing.id}",
@@ -176,23 +181,13 @@ def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Kno
 
 
 def _complete_bounds(
-    thing: MapObject, front: NDArray[np.float64], knowledge: Knowledge
+    low: NDArray[np.float64], high: NDArray[np.float64], front: NDArray[np.float64], depth: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a thing's corners in the table's frame, with the depth that its category usually has.
-
-    Of a worktop at eye level hardly more than the front is in sight; what was not seen of it is behind.
-    """
-    corners = to_table_frame(thing.bounds)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    if thing.category in FLAT | HUNG:
-        return low, high
+    """Return bounds at least `depth` metres deep: of a worktop at eye level little but the front is in sight."""
     axis = int(np.abs(front).argmax())
-    missing = max(0.0, knowledge.sides.get(thing.category, (0.0, 0.0))[1] - float(high[axis] - low[axis]))
-    if front[axis] > 0:
-        low[axis] -= missing
-    else:
-        high[axis] += missing
-    return low, high
+    missing = np.zeros(3)
+    missing[axis] = max(0.0, depth - float(high[axis] - low[axis]))
+    return (low - missing, high) if front[axis] > 0 else (low, high + missing)
 
 
 def _find_front(thing: MapObject, grid: OccupancyGrid) -> NDArray[np.float64]:
@@ -200,15 +195,16 @@ def _find_front(thing: MapObject, grid: OccupancyGrid) -> NDArray[np.float64]:
     best, most = np.array([1.0, 0.0]), -np.inf
     for axis in np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]):
         across = np.array([-axis[1], axis[0]])
-        along, beside = thing.points[:, :2] @ axis, thing.points[:, :2] @ across
-        width = np.linspace(*np.quantile(beside, [0.1, 0.9]), 5)
+        along, beside = np.sort(thing.points[:, :2] @ axis), np.sort(thing.points[:, :2] @ across)
+        last = len(along) - 1
+        width = np.linspace(beside[int(0.1 * last)], beside[int(0.9 * last)], 5)
 
         def look(layer: NDArray[np.bool_], places: NDArray[np.float64]) -> NDArray[np.bool_]:
             points = places[:, None, None] * axis + width[None, :, None] * across  # noqa: B023 - used at once
             return grid.lookup(layer, points.reshape(-1, 2)).reshape(len(places), -1)
 
-        free = look(grid.free, np.quantile(along, 0.98) + np.array([0.15, 0.3, 0.45, 0.6])).mean()
-        wall = look(grid.walls, np.quantile(along, 0.02) - np.arange(0.0, WALL_REACH, 0.05)).any(axis=0).mean()
+        free = look(grid.free, along[int(0.98 * last)] + np.array([0.15, 0.3, 0.45, 0.6])).mean()
+        wall = look(grid.walls, along[int(0.02 * last)] - np.arange(0.0, WALL_REACH, 0.05)).any(axis=0).mean()
         score = free + wall + 0.25 * (np.ptp(along) <= np.ptp(beside))
         if score > most:
             best, most = axis, score
