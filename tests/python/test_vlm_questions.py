@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from fakes import agent_for
 from test_aeqa import Records
+from test_labellers import Whole
 
 pytest.importorskip("pydantic")
 pytest.importorskip("openai")
@@ -30,6 +31,8 @@ from wiw.mapping.marks import MarkedViews
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.mapping.routes import STEP, TURN
 from wiw.mapping.views import SIZE
+from wiw.perception.detection import Detections, Detector
+from wiw.perception.detector_labeller import DetectorLabeller
 from wiw.policies.vlm.make import make_vlm
 from wiw.policies.vlm.questions import QuestionVLM, commands, steering
 from wiw.policies.vlm.questions.home_map import HomeMap, find_named
@@ -349,6 +352,31 @@ def test_an_answer_is_looked_at_again_and_confirmed(two_rooms: str) -> None:
     assert result.details["answer"] == "red." and result.metrics["success"] == 1
     assert result.metrics["primitives"] == steering.LOOK and result.metrics["path_length"] > 0
     assert {level(call) for call in policy.client.calls} == {"plan"}, "nothing to choose among"
+
+
+def test_on_the_same_view_the_answer_is_asked_for_again_at_once(two_rooms: str) -> None:
+    policy = make_policy(Script(command("back", answer="green"), command(landmark=1, answer="red")))
+    (result,) = run(AEQA(two_rooms, preset="official"), policy, make_episode(two_rooms)).results
+    assert result.details["answer"] == "red" and result.metrics["primitives"] == 0
+    first, second = (call for call in policy.client.calls if level(call) == "plan")
+    assert words(first) == words(second) and first.seed != second.seed
+    np.testing.assert_array_equal(images(first)[0], images(second)[0])
+
+
+class OneLamp(Detector):
+    """Finds a lamp in the middle of every view that is 448 pixels wide."""
+
+    def find(self, images: Any, names: Any, ids: Any) -> list[Detections]:
+        boxes = np.array([[160, 150, 290, 250]], np.float32)
+        return [Detections(boxes, np.array([0.9], np.float32), ("lamp",)) for _ in images]
+
+
+def test_landmarks_may_come_from_a_detector_and_a_segmenter(two_rooms: str) -> None:
+    found = DetectorLabeller(OneLamp(), Whole(), ("chair", "lamp"))
+    policy = make_vlm(task="aeqa", vlm=MockClient(Script(command(landmark=1))), perception=found)
+    decision = decide(two_rooms, policy)
+    assert policy.describe()["perception"]["detector"] == "OneLamp" and decision.note == ""
+    assert "front view: 1 lamp\n" in words(policy.client.calls[0])
 
 
 def test_the_planner_is_told_what_it_has_decided_unless_it_has_no_memory(two_rooms: str) -> None:

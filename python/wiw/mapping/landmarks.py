@@ -108,12 +108,12 @@ def _find_openings(views: Views, openings: Sequence[Opening]) -> list[Landmark]:
         if masks:
             position = np.array([*opening.position, sum(OPENING_HEIGHT) / 2])
             away = float(np.linalg.norm(opening.position - views.odometry[:2]))
-            behind = _find_place_behind(opening, views.odometry)
+            behind = find_place_behind(opening, views.odometry)
             found.append(Landmark(OPENING_IDS + opening.id, "opening", position, masks, away, behind=behind))
     return found
 
 
-def _find_place_behind(opening: Opening, odometry: NDArray[np.float64]) -> NDArray[np.float64]:
+def find_place_behind(opening: Opening, odometry: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the place `BEHIND` metres from the middle of an opening, on the side where the agent is not."""
     along = opening.edges[1] - opening.edges[0]
     normal = np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
