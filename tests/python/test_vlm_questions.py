@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from fakes import agent_for
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from test_aeqa import Records
 from test_labellers import Whole
 
@@ -108,6 +110,19 @@ def test_commands_have_the_papers_fields_and_name_what_is_marked() -> None:
     assert "plans" in parse(listed, {"plans": [command()] * 3})
 
 
+VALUES = st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.lists(st.integers(), max_size=2)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.fixed_dictionaries(dict.fromkeys(command(), VALUES)))
+def test_whatever_a_model_writes_is_a_command_or_a_problem(said: dict[str, Any]) -> None:
+    for value in (said, {**command(), "chosen_landmark": said["chosen_landmark"], "answer": said["answer"]}):
+        found = parse(commands.command_schema((1, 4)), value)
+        if not isinstance(found, str):
+            assert found.chosen_landmark in (None, 1, 4) and found.chosen_view in ("front", "left", "right", "back")
+            assert commands.parse_answer(found) == "" or found.answer.strip()
+
+
 def test_where_imagined_views_are_shown_no_answer_can_be_given() -> None:
     schema = commands.command_schema((1,), answers=False)
     assert parse(schema, without_answer(command(landmark=1))).chosen_landmark == 1
@@ -200,11 +215,11 @@ def test_a_step_that_is_refused_though_floor_is_seen_is_remembered(two_rooms: st
     views = cut_views(observation.panorama, observation.depth, observation.odometry)
     labels = labeller.label(views.images, HFOV_DEG)
     ahead = np.array([[0.0, -0.2]])  # of the second primitive of the walk, a right angle turned
-    for walked, blocked in (([RIGHT] * 4 + [int(FORWARD)], True), ([RIGHT] * 4, False), ([], False)):
+    for actions, blocked in (([RIGHT] * 4 + [int(FORWARD)], True), ([RIGHT] * 4, False), ([], False)):
         home = HomeMap(labeller.categories)
         home.add(observation, views, labels, "", np.zeros(0, np.int8))
         assert not home.grid.lookup(home.grid.occupied, ahead).any()
-        home.add(observation, views, labels, "", np.array(walked, np.int8))
+        home.add(observation, views, labels, "", np.array(actions, np.int8))
         assert home.grid.lookup(home.grid.occupied, ahead).any() == blocked
 
 
@@ -364,7 +379,7 @@ def test_on_the_same_view_the_answer_is_asked_for_again_at_once(two_rooms: str) 
 
 
 class OneLamp(Detector):
-    """Finds a lamp in the middle of every view that is 448 pixels wide."""
+    """Finds a lamp in the middle of every view."""
 
     def find(self, images: Any, names: Any, ids: Any) -> list[Detections]:
         boxes = np.array([[160, 150, 290, 250]], np.float32)
@@ -381,13 +396,13 @@ def test_landmarks_may_come_from_a_detector_and_a_segmenter(two_rooms: str) -> N
 
 def test_the_planner_is_told_what_it_has_decided_unless_it_has_no_memory(two_rooms: str) -> None:
     plans = [command(landmark=1, plan=f"Look at it, {k}.") for k in range(9)]
-    for history, told in ((2, 2), (0, 0), (5, 3)):
+    for history, count in ((2, 2), (0, 0), (5, 3)):
         policy = make_policy(Script(*plans), history=history)
         run(AEQA(two_rooms, actions=8, execute=2), policy, make_episode(two_rooms))
         first, *_, latest = map(words, policy.client.calls)
         assert len(policy.client.calls) == 4 and "decided before" not in first
         assert re.findall(r"after (\d) actions: Look at it, (\d)", latest) == [
-            (str(2 * k), str(k)) for k in range(3 - told, 3)
+            (str(2 * k), str(k)) for k in range(3 - count, 3)
         ]
 
 
@@ -483,12 +498,12 @@ def test_options_out_of_range() -> None:
 
 def test_presets_give_the_policy_its_memory_and_order(two_rooms: str, tmp_path: Path) -> None:
     vlm = {"vlm": {"vlm": "mock", "perception": ByColor()}}
-    for preset, given, expected in (
+    for preset, options, expected in (
         ("paper", {}, (5, "marked_first")),
         ("official", {}, (0, "plain_first")),
         ("official", {"history": 3}, (3, "plain_first")),
     ):
-        recipe = AgentRecipe("vlm", policy_options={"vlm": {**vlm["vlm"], **given}})
+        recipe = AgentRecipe("vlm", policy_options={"vlm": {**vlm["vlm"], **options}})
         policy = agent_for(AEQA(two_rooms, preset=preset), recipe).policy
         assert isinstance(policy, QuestionVLM) and (policy.history, policy.order) == expected
     own = tmp_path / "own.yaml"

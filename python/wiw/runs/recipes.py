@@ -205,10 +205,10 @@ class AgentRecipe(AgentConfig):
 
     def _make_policy(self, policy: Any, space: str, task: Task) -> Any:
         """Return a policy with the options of its name, and the task's; others are made with the agent."""
-        given = (task.policy_options, self.policy_options)
-        if not isinstance(policy, str) or not any(policy in options for options in given):
+        sources = (task.policy_options, self.policy_options)
+        if not isinstance(policy, str) or not any(policy in options for options in sources):
             return policy
-        options = {name: value for own in given for name, value in own.get(policy, {}).items()}
+        options = {name: value for own in sources for name, value in own.get(policy, {}).items()}
         return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
 
 

@@ -77,10 +77,12 @@ def load_policy_options(task: str, preset: str | Path) -> dict[str, dict[str, An
     """
     found: dict[str, dict[str, Any]] = {}
     for path in _chain(task, preset):
-        given = _read(path).get("policies", {})
-        if not isinstance(given, Mapping) or not all(isinstance(options, Mapping) for options in given.values()):
-            raise ArgumentError(f"{path}: policies: expected options by policy, `vlm: {{history: 0}}`, got {given!r}")
-        for policy, options in given.items():
+        policies = _read(path).get("policies", {})
+        if not isinstance(policies, Mapping) or not all(isinstance(own, Mapping) for own in policies.values()):
+            raise ArgumentError(
+                f"{path}: policies: expected options by policy, `vlm: {{history: 0}}`, got {policies!r}"
+            )
+        for policy, options in policies.items():
             found[str(policy)] = {**found.get(str(policy), {}), **options}
     return found
 

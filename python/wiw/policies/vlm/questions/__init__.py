@@ -46,7 +46,7 @@ class QuestionMemory(Memory):
     """Commands of the present decision by the plans that they became."""
     answer: tuple[Key, str] | None = None
     """The planner's latest answer, empty where it gave none, and at which decision."""
-    walked: int = 0
+    executed: int = 0
     """Primitives that had been executed at the latest observation."""
     history: list[str] = field(default_factory=list)
     """The commands that were carried out, in words."""
@@ -69,7 +69,7 @@ class QuestionVLM(VLM):
 
     Raises:
         ArgumentError: see `VLM`; perception that needs the simulator's instance ids.
-        BackendError: torch is not installed.
+        DependencyError: the learned labeller without torch.
     """
 
     frames = FrameSpec("panorama", (432, 768))
@@ -117,16 +117,16 @@ class QuestionVLM(VLM):
     def observe(self, situations: Sequence[Situation]) -> None:
         """Add the real views to the maps, labelled in one batch, and mark the landmarks in them."""
         super().observe(situations)
-        seen = [situation.observation for situation in situations]
-        cut = [cut_views(own.panorama, own.depth, own.odometry) for own in seen]
+        observations = [situation.observation for situation in situations]
+        cut = [cut_views(own.panorama, own.depth, own.odometry) for own in observations]
         labels = self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
         for number, (situation, views) in enumerate(zip(situations, cut, strict=True)):
             memory, rows = situation.memory, slice(4 * number, 4 * number + 4)
             own = SceneLabels(labels.category[rows], labels.confidence[rows], labels.state[rows])
-            stayed = memory.answer is not None and memory.answer[1]  # the task may have asked again at once
-            walked = np.array([] if stayed else situation.executed[memory.walked :], np.int8)
-            memory.sight = memory.home.add(situation.observation, views, own, situation.goal.text or "", walked)
-            memory.walked, memory.commands = len(situation.executed), {}
+            waits = memory.answer is not None and memory.answer[1]  # the task may have asked again at once
+            executed = np.array([] if waits else situation.executed[memory.executed :], np.int8)
+            memory.sight = memory.home.add(situation.observation, views, own, situation.goal.text or "", executed)
+            memory.executed, memory.commands = len(situation.executed), {}
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -196,9 +196,9 @@ class QuestionVLM(VLM):
 
     def _build_walk_request(self, situation: Situation, command: Command) -> Request:
         words = self._render_prompt(situation, "low_level_planner", commands.WALK_ACTIONS, command=command)
-        asked = user(words, prompt_images.render_view(situation.memory.sight, command.view))
+        message = user(words, prompt_images.render_view(situation.memory.sight, command.view))
         seed = derive_seed(situation.key, WALK_SEED)
-        return Request((asked,), schema=commands.walk_schema(), seed=seed, tries=self.tries)
+        return Request((message,), schema=commands.walk_schema(), seed=seed, tries=self.tries)
 
     # -- imagined views ------------------------------------------------------------------------------------------------
 
@@ -288,9 +288,9 @@ class QuestionVLM(VLM):
         return [_make_answer(_get_answer(situation) or "") for situation in situations]
 
     def _build_question(self, situation: Situation) -> Request:
-        asked = user(self._render_prompt(situation, "answerer", 1), *self._show_views(situation))
+        message = user(self._render_prompt(situation, "answerer", 1), *self._show_views(situation))
         seed = derive_seed(situation.key, ANSWER_SEED)
-        return Request((asked,), schema=commands.answer_schema(), seed=seed, tries=self.tries)
+        return Request((message,), schema=commands.answer_schema(), seed=seed, tries=self.tries)
 
     # ------------------------------------------------------------------------------------------------------------------
 

@@ -54,26 +54,26 @@ class HomeMap:
         views: Views,
         labels: SceneLabels,
         question: str,
-        walked: NDArray[np.int8],
+        executed: NDArray[np.int8],
     ) -> Sight:
         """Add an observation with depth; return its views, in which numbers keep off what the question names.
 
-        `walked` has the primitives since the observation before, refused ones too.
+        `executed` has the primitives since the observation before, refused ones too.
         """
         assert observation.depth is not None
         self.grid.add(observation.depth, observation.odometry)
-        self._mark_refusal(observation.odometry, walked)
+        self._mark_refusal(observation.odometry, executed)
         owners = self.objects.add(views, labels)
         landmarks = self.finder.find(views, owners, self.objects, self.grid.openings)
         return Sight(views, draw_marks(views.images, landmarks, find_named(landmarks, question)))
 
-    def _mark_refusal(self, pose: NDArray[np.float64], walked: NDArray[np.int8]) -> None:
+    def _mark_refusal(self, pose: NDArray[np.float64], executed: NDArray[np.int8]) -> None:
         """Mark what has refused all steps ahead, where depth shows no obstacle."""
         before, self._pose = self._pose, pose.copy()
-        steps = np.flatnonzero(walked == int(FORWARD))
+        steps = np.flatnonzero(executed == int(FORWARD))
         if before is None or not len(steps) or np.linalg.norm(pose[:2] - before[:2]) > MOVED:
             return
-        turns = walked[: steps[0]]
+        turns = executed[: steps[0]]
         turned = int((turns == int(TURN_LEFT)).sum() - (turns == int(TURN_RIGHT)).sum())
         self.grid.mark_blocked(np.array([*pose[:2], before[2] + TURN * turned]), STEP)
 
