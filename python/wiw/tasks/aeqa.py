@@ -113,11 +113,12 @@ class AEQA(NavigationTask):
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         horizon = self.rules.horizon - 1 + HALF_TURN
-        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": self.rules.execute}
+        execute = min(self.rules.execute, horizon)
+        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": execute}
 
     def describe(self) -> dict[str, Any]:
         """Return the JSON-able identity: what must be equal for two runs to be comparable."""
-        return {**super().describe(), "judge": self.judge.describe()}
+        return {**super().describe(), "judge": self.judge.describe(), "policies": self.policy_options}
 
     # -- episodes ------------------------------------------------------------------------------------------------------
 

@@ -72,6 +72,11 @@ class Task(ABC):
         return {"candidates": 3, "horizon": 5, "execute": 1}
 
     @property
+    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that named policies are made with on this task, where a run gives no others."""
+        return {}
+
+    @property
     def default_episodes(self) -> int:
         """Default number of episodes of a run."""
         return 20
