@@ -157,7 +157,12 @@ class Explorer(Policy):
 
     def begin(self, goal: Goal, key: Key) -> Memory:
         """Return an empty map."""
-        return Memory(parse(goal.text or ""), ObjectMap(self.labeller.categories, STATES))
+        return Memory(parse(goal.text or ""), ObjectMap(self.map_categories, STATES))
+
+    @property
+    def map_categories(self) -> tuple[str, ...]:
+        """Names of what the map can hold, index 0 is ""."""
+        return self.labeller.categories
 
     # -- real views ----------------------------------------------------------------------------------------------------
 
@@ -179,7 +184,7 @@ class Explorer(Policy):
 
     def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
         """Return looks at floors and walls: patches that are all of one surface, with their colour."""
-        looks, categories = [], self.labeller.categories
+        looks, categories = [], self.map_categories
         half = SURFACE_STRIDE // 2
         for name in SURFACES:
             if name not in categories:

@@ -14,20 +14,22 @@ import numpy as np
 
 from wiw.datasets.questions import ParsedQuestion
 from wiw.datasets.questions.answers import Fact, find_answer
-from wiw.datasets.questions.facts import Room, SceneTable
+from wiw.datasets.questions.facts import SMALL, STRUCTURE, Room, SceneTable
 from wiw.policies.explorer.home import Home
 
 NAMED = ("object", "anchor", "first", "second")
 """Slots of things of which there is one, in most templates."""
 SEVERAL = frozenset({"exists", "where_colored"})
 """Templates whose object may be there more than once, or not at all."""
+ON_ANCHOR = frozenset({"on_top", "count_on"})
+"""Templates that take for granted that something stands on their anchor."""
 LEAST_KIND = 0.02
 """Probability from which on a room may be of a kind that a question names."""
 
 
 def find_likeliest(home: Home, question: ParsedQuestion) -> Fact | None:
     """Return the best supported answer to a question: what hinders one is left out, the weakest first."""
-    for table in _doubt(home, presume(home, question)):
+    for table in _doubt(home, question, presume(home, question)):
         fact = find_answer(table, question.template, question.slots)
         if fact is not None:
             return fact
@@ -81,9 +83,13 @@ def _keep_one(home: Home, table: SceneTable, category: str, room: Room | None) -
     return replace(table, things=(*(thing for thing in table.things if thing.id not in rivals), best))
 
 
-def _doubt(home: Home, table: SceneTable) -> Iterator[SceneTable]:
-    """Yield the table, and then tables with ever more of the weakly supported things left out."""
+def _doubt(home: Home, question: ParsedQuestion, table: SceneTable) -> Iterator[SceneTable]:
+    """Yield the table, then without what else things may stand on, then with ever fewer weakly supported things."""
     yield table
+    anchor = table.find_one(question.slots.get("anchor", ""))
+    if anchor is not None and question.template in ON_ANCHOR:
+        rest = (thing for thing in table.things if thing is anchor or thing.category in SMALL | STRUCTURE)
+        yield replace(table, things=tuple(rest))
     weights = {thing.id: home.weigh(thing) for thing in table.things}
     for least in sorted({weight for weight in weights.values() if np.isfinite(weight)}):
         yield replace(table, things=tuple(thing for thing in table.things if weights[thing.id] > least))

@@ -119,7 +119,10 @@ class QuestionVLM(VLM):
         super().observe(situations)
         observations = [situation.observation for situation in situations]
         cut = [cut_views(own.panorama, own.depth, own.odometry) for own in observations]
-        labels = self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
+        images, depth = (
+            np.concatenate(own) for own in zip(*((views.images, views.depth) for views in cut), strict=True)
+        )
+        labels = self.labeller.label(images, HFOV_DEG, depth=depth)
         for number, (situation, views) in enumerate(zip(situations, cut, strict=True)):
             memory, rows = situation.memory, slice(4 * number, 4 * number + 4)
             own = SceneLabels(labels.category[rows], labels.confidence[rows], labels.state[rows])
