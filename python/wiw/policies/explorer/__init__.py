@@ -27,9 +27,10 @@ from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
 from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
+from wiw.policies.explorer.drawing import draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
-from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Decision, Goal, Key, Proposal, Rollout, TextAnswer
 
 VIEW_SIZE = (192, 224)
 """(H, W) of the views that are labelled."""
@@ -238,6 +239,10 @@ class Explorer(Policy):
             )
             for situation, own in ((situation, situation.memory) for situation in situations)
         ]
+
+    def draw(self, situation: Situation, decision: Decision, north: float) -> dict[str, NDArray[np.uint8]]:
+        """Return the map of real views, and the present view with what it is believed to show."""
+        return draw_beliefs(situation.memory, situation, decision, north)
 
     def _is_final(self, situation: Situation) -> bool:
         """Return whether the present belief is given as the answer: it is sure enough, or time is nearly up."""
