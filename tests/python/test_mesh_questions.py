@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import wiw
 from wiw.cli import main
 from wiw.datasets import episodes as episode_file
 from wiw.datasets.questions import Question
@@ -248,23 +250,15 @@ def test_episodes_of_a_house_are_marked_as_unbalanced(house, tmp_path, capsys):
     assert len(set(texts)) == 8
     task = AEQA(house, backend="cpu", shortest=2, places=160)
     assert [Question.from_info(each.info["question"]).text for each in task.episodes(3)] == texts[:3]
-    run = [
-        "run",
-        "aeqa",
-        "--episode-file",
-        str(out),
-        "--policy",
-        "explorer-oracle",
-        "--episodes",
-        "1",
-        "--backend",
-        "cpu",
-    ]
-    assert main([*run, "--out", str(tmp_path / "run"), "--task-option", "actions=15"]) == 0
-    assert "unbalanced" in capsys.readouterr().out
-    assert (
-        "Scores cannot be compared with those of balanced questions" in load_run(tmp_path / "run").report().read_text()
-    )
+    run = ["run", "aeqa", "--episode-file", str(out), "--policy", "explorer-oracle", "--episodes", "1"]
+    options = ["--backend", "cpu", "--task-option", "actions=15", "--out", str(tmp_path / "run")]
+    assert main([*run, *options]) == 0
+    assert "Unbalanced questions in 1 of the episodes" in " ".join(capsys.readouterr().out.split())
+    remark = "Scores cannot be compared with those of balanced questions"
+    assert remark in load_run(tmp_path / "run").report().read_text()
+    shutil.copytree(tmp_path / "run", tmp_path / "again")
+    both = wiw.compare(tmp_path / "run", tmp_path / "again")
+    assert "Unbalanced questions in 1 of the episodes" in both.remarks()[0]
 
 
 def test_apartments_stay_balanced():

@@ -92,7 +92,7 @@ class Summary:
     """Where each arm stands between "copy" and "oracle", if the run has both."""
     kinds: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     """Success rates by kind of episode, then by arm, where a task has several kinds."""
-    unbalanced: int = 0
+    unbalanced: int = field(default=0, kw_only=True)
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
 
     def groups(self) -> tuple[Group, ...]:
@@ -115,8 +115,8 @@ class Summary:
         if not self.unbalanced:
             return ()
         return (
-            f"Questions of {self.unbalanced} episodes are unbalanced: each is asked in one scene only, so its text may "
-            "give its answer away. Scores cannot be compared with those of balanced questions.",
+            f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its text "
+            "may give its answer away. Scores cannot be compared with those of balanced questions.",
         )
 
     def utility(self, arm: str) -> Utility:
@@ -185,9 +185,13 @@ def summarise_run(run: Run) -> Summary:
     """Return means, intervals and paired differences of a run."""
     config = run.store.config
     policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
-    episodes = run.store.episodes()
-    found = summarise(run.arms, run.store.outcomes(), len(episodes), config["seed"], policies)
-    return replace(found, unbalanced=sum(bool(episode.info.get("unbalanced")) for episode in episodes))
+    found = summarise(run.arms, run.store.outcomes(), len(run.store.episodes()), config["seed"], policies)
+    return replace(found, unbalanced=count_unbalanced(run))
+
+
+def count_unbalanced(run: Run) -> int:
+    """Return the episodes whose question is asked in one scene only."""
+    return sum(bool(episode.info.get("unbalanced")) for episode in run.store.episodes())
 
 
 def arm_table(run: Run) -> Records:
