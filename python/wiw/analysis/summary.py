@@ -7,7 +7,7 @@ import math
 import sys
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache, reduce
 from typing import Any
 
@@ -92,6 +92,8 @@ class Summary:
     """Where each arm stands between "copy" and "oracle", if the run has both."""
     kinds: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
     """Success rates by kind of episode, then by arm, where a task has several kinds."""
+    unbalanced: int = field(default=0, kw_only=True)
+    """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
 
     def groups(self) -> tuple[Group, ...]:
         """Return the differences as tables, one per base."""
@@ -110,7 +112,12 @@ class Summary:
 
     def remarks(self) -> tuple[str, ...]:
         """Return further sentences that a reader of the tables needs."""
-        return ()
+        if not self.unbalanced:
+            return ()
+        return (
+            f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its text "
+            "may give its answer away. Scores cannot be compared with those of balanced questions.",
+        )
 
     def utility(self, arm: str) -> Utility:
         """Return an arm's utility: its share of the gain from floor to ceiling."""
@@ -178,7 +185,13 @@ def summarise_run(run: Run) -> Summary:
     """Return means, intervals and paired differences of a run."""
     config = run.store.config
     policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
-    return summarise(run.arms, run.store.outcomes(), len(run.store.episodes()), config["seed"], policies)
+    found = summarise(run.arms, run.store.outcomes(), len(run.store.episodes()), config["seed"], policies)
+    return replace(found, unbalanced=count_unbalanced(run))
+
+
+def count_unbalanced(run: Run) -> int:
+    """Return the episodes whose question is asked in one scene only."""
+    return sum(bool(episode.info.get("unbalanced")) for episode in run.store.episodes())
 
 
 def arm_table(run: Run) -> Records:

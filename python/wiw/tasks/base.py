@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from wiw.envs.base import Env
@@ -90,6 +90,10 @@ class Task(ABC):
     def stage(self) -> dict[str, Any] | None:
         """Where reports draw plans on front views: "camera" and "ground" (see `wiw.report.stage`); None for nowhere."""
         return None
+
+    def explain_episodes(self, episodes: Sequence[Episode]) -> list[str]:
+        """Return sentences that users of some generated episodes must know; default: none."""
+        return []
 
     @property
     def file_header(self) -> dict[str, Any] | None:

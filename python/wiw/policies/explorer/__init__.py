@@ -29,9 +29,10 @@ from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
 from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
+from wiw.policies.explorer.drawing import draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
-from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Decision, Goal, Key, Proposal, Rollout, TextAnswer
 
 VIEW_SIZE = (192, 224)
 """(H, W) of the views that are labelled."""
@@ -40,6 +41,8 @@ SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
 """Most primitives of a plan that only takes a second look."""
+LAST_ACTIONS = 18
+"""Primitives left from which on an answer is final: those of one more decision, and of the look that confirms it."""
 CLEAR_SHARE = 0.01
 """Share of a view that a wanted thing must fill in an imagined view to count in full."""
 
@@ -309,11 +312,15 @@ class Explorer(Policy):
             for situation, own in ((situation, situation.memory) for situation in situations)
         ]
 
+    def draw(self, situation: Situation, decision: Decision, north: float) -> dict[str, NDArray[np.uint8]]:
+        """Return the map of real views, and the present view with what it is believed to show."""
+        return draw_beliefs(situation.memory, situation, decision, north)
+
     def is_final(self, situation: Situation) -> bool:
         """Return whether the present belief is the answer: it is sure enough, nothing is left to see, or no time."""
         memory = situation.memory
         left = self.budget - len(situation.executed)
-        return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= 2 * LOOK_ACTIONS)
+        return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= LAST_ACTIONS)
 
 
 def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
