@@ -7,6 +7,7 @@ asks ("A-EQA High-Level Planner Additional Prompt").
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -28,7 +29,7 @@ from wiw.perception.colors import name_color
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
-from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
+from wiw.policies.explorer.destinations import Destination, Rate, choose_destinations, plan_route
 from wiw.policies.explorer.drawing import draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
@@ -41,6 +42,8 @@ SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
 """Most primitives of a plan that only takes a second look."""
+PATIENCE = 6
+"""Decisions after which a place that could not be reached is given up; six lead up to 18 m."""
 LAST_ACTIONS = 18
 """Primitives left from which on an answer is final: those of one more decision, and of the look that confirms it."""
 CLEAR_SHARE = 0.01
@@ -82,6 +85,16 @@ class Memory:
     """Primitives until then."""
     destinations: list[Destination] = field(default_factory=list)
     """Places worth going to from there, the most worth first."""
+
+    tries: Counter[tuple[int, int]] = field(default_factory=Counter)
+    """Decisions in which a place, in half metres, was the most worth going to."""
+
+    def choose_destinations(self, rate: Rate) -> None:
+        """Choose where to go from here; places that were the best for long, and never reached, are given up."""
+        found = choose_destinations(self.grid, self.pose, self.belief.things, rate)
+        cells = [(round(2 * place.position[0]), round(2 * place.position[1])) for place in found]
+        self.destinations = [place for place, cell in zip(found, cells, strict=True) if self.tries[cell] < PATIENCE]
+        self.tries.update(next(([cell] for cell in cells if self.tries[cell] < PATIENCE), []))
 
     def align(self, look: Look) -> NDArray[np.float64]:
         """Return x, y, azimuth of a look in the map."""
@@ -182,8 +195,7 @@ class Explorer(Policy):
             self._mark_refused(situation)
             memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
             memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
-            rate = partial(self._rate, memory)
-            memory.destinations = choose_destinations(memory.grid, memory.pose, memory.belief.things, rate)
+            memory.choose_destinations(partial(self._rate, memory))
 
     def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
         """Return looks at floors and walls: patches that are all of one surface, with their colour."""
