@@ -13,6 +13,7 @@ from test_aeqa import SCENE, Records, episode, make_task  # noqa: F401 - a fixtu
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
+from wiw.datasets import episodes
 from wiw.datasets.questions import parse
 from wiw.datasets.questions.blind import blind_answer
 from wiw.datasets.questions.facts import Room, SceneTable, Thing, make_table
@@ -32,11 +33,14 @@ from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
 from wiw.policies import explorer
+from wiw.policies.explorer import confidence
 from wiw.policies.explorer.answering import answer, list_wanted
 from wiw.policies.explorer.home import KNOWLEDGE, Home, believe_home, load_knowledge, to_table_frame
 from wiw.policies.explorer.presuming import find_likeliest
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
 from wiw.tasks.aeqa import AEQA
+from wiw.training.answer_confidence import fit_curve, write_calibration
 from wiw.training.home_knowledge import count_homes, write_knowledge
 from wiw.types import Key, Proposal, Rollout, TextAnswer
 
@@ -291,3 +295,37 @@ def test_queries_carry_the_text_alone(episode):  # noqa: F811
     env = make_task(episode).environment(depth=True)
     query = Query(env.begin(episode), env.goal, Key(0, 0))
     assert query.goal.text == episode.info["question"]["text"] and SCENE not in repr(query.goal)
+
+
+# -- how sure it is ----------------------------------------------------------------------------------------------------
+
+
+def test_curves_of_confidence_never_fall_and_doubt_few_samples():
+    rng = np.random.default_rng(0)
+    support = rng.uniform(0, 1, 3000)
+    many = fit_curve([(s, float(rng.uniform() < s**2), 1.0) for s in support])
+    assert many["support"] == sorted(many["support"]) and many["right"] == sorted(many["right"])
+    assert np.allclose(many["right"], np.square(many["support"]), atol=0.07)
+    assert max(fit_curve([(0.9, 1.0, 1.0)] * 3)["right"]) < 0.85
+    halves = fit_curve([(0.5, 1.0, 0.01)] * 100 + [(0.5, 0.0, 1.0)] * 9)  # one long episode against nine short ones
+    assert max(halves["right"]) < 0.5
+
+
+def test_confidence_is_read_off_the_curve_of_the_answers_type(monkeypatch):
+    curves = {"": {"support": [0.0, 1.0], "right": [0.2, 0.6]}, "color": {"support": [0.5], "right": [0.9]}}
+    monkeypatch.setattr(confidence, "load_curves", lambda: curves)
+    assert confidence.estimate_confidence("color", 0.1) == 0.9
+    assert confidence.estimate_confidence("count", 0.5) == pytest.approx(0.4)
+    assert confidence.estimate_confidence("color", 0.0) == 0.0
+
+
+def test_confidence_is_calibrated_by_a_run(episode, tmp_path):  # noqa: F811
+    options = {"perception": f"{__file__}:RedIsASofa", "calibrated": False}
+    agent = AgentRecipe("explorer-oracle-tour", policy_options={"explorer-oracle-tour": options})
+    file = tmp_path / "asked.json"
+    episodes.save(file, [episode], "aeqa")
+    task = TaskRecipe("aeqa", {"episode_file": str(file)})
+    wiw.evaluate(task, agent, 1, out=tmp_path / "run", progress=False)
+    curves = write_calibration(tmp_path / "run", tmp_path / "own.json")
+    assert set(curves) == {""} and json.loads((tmp_path / "own.json").read_text()) == curves
+    assert 0 < curves[""]["right"][0] < 1 and 0 < curves[""]["support"][0] <= 1

@@ -29,6 +29,7 @@ from wiw.perception.colors import name_color
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
+from wiw.policies.explorer.confidence import estimate_confidence
 from wiw.policies.explorer.destinations import Destination, Rate, choose_destinations, plan_route
 from wiw.policies.explorer.drawing import draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
@@ -114,6 +115,8 @@ class Explorer(Policy):
     Args:
         perception: who labels views: "learned", or a `wiw.perception.scene_labels.Labeller`.
         sure: confidence from which on an answer is final.
+        calibrated: whether confidence is the probability of being right (`wiw.policies.explorer.confidence`), or the
+            support by the map that this is estimated from.
         imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
         path: worth of a metre that need not be walked, in square metres of new floor.
         affinity: worth of a room that is likely to have what is asked about.
@@ -136,6 +139,7 @@ class Explorer(Policy):
         path: float = 0.6,
         affinity: float = 4.0,
         budget: int = 250,
+        calibrated: bool = True,
     ) -> None:
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
@@ -144,6 +148,7 @@ class Explorer(Policy):
                 "policy explorer-oracle is an explorer with true perception"
             )
         self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
+        self.calibrated = bool(calibrated)
         self.knowledge = load_knowledge()
 
     @classmethod
@@ -169,6 +174,7 @@ class Explorer(Policy):
             "path": self.path,
             "affinity": self.affinity,
             "budget": self.budget,
+            "calibrated": self.calibrated,
         }
 
     def begin(self, goal: Goal, key: Key) -> Memory:
@@ -194,7 +200,7 @@ class Explorer(Policy):
                 memory.surfaces += self._look_at_surfaces(views, labels)
             self._mark_refused(situation)
             memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
-            memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
+            memory.belief = self._answer_from_map(memory, situation.goal.text or "")
             memory.choose_destinations(partial(self._rate, memory))
 
     def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
@@ -235,6 +241,13 @@ class Explorer(Policy):
         """Return the four real views of a look around from a pose in the map, and their labels."""
         views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
         return views, self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
+
+    def _answer_from_map(self, memory: Memory, text: str) -> Belief:
+        """Return the answer that the map gives to a text, and how sure it is."""
+        found = answer(memory.question, text, memory.home, memory.grid)
+        if memory.question is None or not self.calibrated:
+            return found
+        return replace(found, confidence=estimate_confidence(memory.question.answer_type, found.confidence))
 
     def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
         """Return the colour word of pixels uint8 [n, 3] of one thing in such views, and its probability."""
