@@ -47,7 +47,7 @@ def calibrate_confidence(run: str | Path) -> dict[str, dict[str, list[float]]]:
     judge = make_judge("rules")
     with RunStore.read(run) as store:
         questions = [Question.from_info(episode.info["question"]) for episode in store.episodes()]
-        rows = [(row["arm"], row["episode"], json.loads(row["answer"])) for row in store.decisions() if row["answer"]]
+        rows = [(row["arm"], row["episode"], row["answer"]) for row in store.decisions() if row["answer"]]
     supported = [(arm, episode, answer) for arm, episode, answer in rows if answer["confidence"] > 0]
     counts = Counter((arm, episode) for arm, episode, _ in supported)
     for arm, episode, answer in supported:
