@@ -13,6 +13,7 @@ from test_aeqa import SCENE, Records, episode, make_task  # noqa: F401 - a fixtu
 
 import wiw
 from wiw.action import FORWARD, TURN_LEFT
+from wiw.analysis.answer_confidence import fit_curve, write_calibration
 from wiw.datasets import episodes
 from wiw.datasets.questions import parse
 from wiw.datasets.questions.blind import blind_answer
@@ -40,7 +41,6 @@ from wiw.policies.explorer.presuming import find_likeliest
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
 from wiw.tasks.aeqa import AEQA
-from wiw.training.answer_confidence import fit_curve, write_calibration
 from wiw.training.home_knowledge import count_homes, write_knowledge
 from wiw.types import Key, Proposal, Rollout, TextAnswer
 

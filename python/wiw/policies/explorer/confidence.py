@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 CURVES = Path(__file__).with_name("confidence.json")
-"""Curves by answer type, and under "" of all; measured on val questions by `wiw.training.answer_confidence`."""
+"""Curves by answer type, and under "" of all; measured on val questions by `wiw.analysis.answer_confidence`."""
 
 
 @cache
