@@ -21,7 +21,7 @@ test:       ## all tests: ctest, then pytest
 	$(BIN)/cmake -S . -B $(TESTS) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DWIW_BUILD_TESTS=ON -DWIW_BUILD_PYTHON=OFF >/dev/null
 	$(BIN)/cmake --build $(TESTS)
 	$(BIN)/ctest --test-dir $(TESTS) --output-on-failure
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadgroup
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 bench:      ## every speed claim, side by side with what a user would pick instead
 	@scripts/setup test

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import gc
 import inspect
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
 from functools import cache
 from importlib import metadata
@@ -48,11 +49,33 @@ BOXES = {  # name: material, least corner, greatest corner; metres, Y up
 }
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Leave what collection makes out of garbage collections: modules and tests live until the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that have slow tests, so that no worker is left alone with one of them at the end."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Imported scenes are kept in a folder of the test run, not in the user's."""
+    """Keep scenes in a folder of the test run, not in the user's: an apartment is generated once for all workers."""
+    cache, run = tmp_path_factory.mktemp("cache"), tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        shared = run.parent / "scenes"
+        shared.mkdir(exist_ok=True)
+        (cache / "scenes").symlink_to(shared)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WIW_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("WIW_CACHE", str(cache))
         yield
 
 

@@ -86,14 +86,23 @@ def export(out, target, kind, **_):
 
 
 WORK = {"evaluate": evaluate, "report": report, "export": export}
+IMPORTS = (
+    *("fakes", "wiw.loop.scheduler", "wiw.studies.evaluate", "wiw.report.recording"),
+    *("pyarrow.parquet", "pyarrow.pandas_compat", "pandas", "rerun"),
+)
+"""All that victims need, imported once: a victim is to die at its work, and imports take ten times as long."""
 
 
 def live(job, said):
     """The victim's whole life; what went wrong goes to the pipe `said`."""
     if "most_bytes" in job:
         resource.setrlimit(resource.RLIMIT_FSIZE, (job["most_bytes"],) * 2)
+    imported = set(sys.modules)
     try:
         WORK[job["what"]](**job)
+        late = [name for name in sys.modules if name not in imported and name.startswith("wiw.")]
+        if late:
+            raise ImportError(f"imported by a victim, not by the server: {late}")
     except BaseException as error:
         os.write(said, f"{type(error).__name__}: {error}".encode())
         os._exit(1)
@@ -104,11 +113,9 @@ def serve():
     import cv2
 
     cv2.setNumThreads(1)
-    import fakes  # noqa: F401 - everything that victims need is imported before they are forked
-
-    for extra in ("pyarrow.parquet", "rerun"):
-        with contextlib.suppress(ModuleNotFoundError):
-            importlib.import_module(extra)
+    for name in IMPORTS:
+        with contextlib.suppress(ModuleNotFoundError):  # of an extra
+            importlib.import_module(name)
 
     print("ready", flush=True)
     for line in sys.stdin:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from wiw import scenes
+from wiw.datasets.questions import grammar
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError, WeightsError
 from wiw.perception.colors import COLORS, FEATURES, PARAMETERS, ColorNamer, compute_features, name_color, to_oklab
@@ -19,6 +21,12 @@ def lit(color: tuple[int, int, int], rng: np.random.Generator) -> Any:
     """Pixels of one colour in light and shade."""
     shade = rng.uniform(0.7, 1.05, (200, 1))
     return np.clip(np.array(color) * shade + rng.normal(0, 2, (200, 3)), 0, 255).astype(np.uint8)
+
+
+def test_the_colors_are_those_that_things_of_apartments_can_have() -> None:
+    edits = [edit.partition("=")[2] for edit in scenes.possible_edits("apartments:val/3") if edit.startswith("color:")]
+    assert sorted(set(edits)) == sorted(scenes.COLORS)
+    assert grammar.COLORS is COLORS is scenes.COLORS
 
 
 def test_oklab_of_known_colors() -> None:

@@ -59,7 +59,7 @@ def reference(tmp_path_factory):
 
 def seconds(victims, what, out, **options):
     begin = time.monotonic()
-    assert victims.run(what, out, **options) == 0
+    assert victims.run(what, out, **options) == 0, victims.said
     return time.monotonic() - begin
 
 

@@ -41,6 +41,11 @@ def picture(pose: Any, target: Any) -> Any:
     return image
 
 
+def front_view(pose: Any, target: Any) -> Any:
+    """The picture, enlarged to 480x480."""
+    return picture(pose, target).repeat(10, axis=0).repeat(10, axis=1)
+
+
 @dataclass
 class Fork:
     pose: Any
@@ -51,7 +56,7 @@ class Fork:
 
     def render_fronts_after(self, poses: Any, size: Any) -> Any:
         assert size == (480, 480)
-        return np.stack([np.kron(picture(pose, self.target), np.ones((10, 10, 1), np.uint8)) for pose in poses])
+        return np.stack([front_view(pose, self.target) for pose in poses])
 
 
 class DotEnv(Env):
@@ -68,7 +73,7 @@ class DotEnv(Env):
 
     @property
     def observation(self) -> ArmObservation:
-        return ArmObservation(np.kron(picture(self.pose, self.target), np.ones((10, 10, 1), np.uint8)), self.pose)
+        return ArmObservation(front_view(self.pose, self.target), self.pose)
 
     def fork(self) -> Fork:
         return Fork(self.pose, self.target)

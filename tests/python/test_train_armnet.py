@@ -165,13 +165,13 @@ def test_demonstrations_are_plays_too(tmp_path: Path, plays: Plays) -> None:
 def test_the_command_makes_a_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("wiw.training.armnet.HELD_OUT", 25)
+    monkeypatch.setattr("wiw.training.armnet.HELD_OUT", 8)
     out, cache = tmp_path / "weights.safetensors", tmp_path / "plays"
-    command = ["train", "armnet", "--plays", "25", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
+    command = ["train", "armnet", "--plays", "20", "--epochs", "8", "--out", str(out), "--cache", str(cache)]
     assert main(command) == 0
     assert "poses ahead" in capsys.readouterr().out
     card = ArmNet(out).card
-    assert card["plays"] == 25 and card["recipe"]["epochs"] == 8
+    assert card["plays"] == 20 and card["recipe"]["epochs"] == 8
     changed = card["held_out"]["changed"]
     assert changed["armnet"]["1"] < changed["arm"]["1"]
 

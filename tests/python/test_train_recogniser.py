@@ -135,9 +135,9 @@ def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.Capture
 
     names = ["bed", "chair", "plant", "shower", "television", "toilet"]
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
-    command = ["train", "recogniser", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "20"]
+    command = ["train", "recogniser", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "14"]
     options = ["--out", str(out), "--cache", str(cache), "--workers", "1", "--categories", *names]
-    assert main([*command, *options, "--epochs", "60", "--minutes", "None"]) == 0
+    assert main([*command, *options, "--epochs", "40", "--minutes", "None"]) == 0
     assert "calibration error" in capsys.readouterr().out
     card = Recogniser.load(out).card
     assert card["accuracy"]["start"] > 2.5 / len(names)

@@ -132,6 +132,7 @@ class InstanceBaker {
     scene::Mesh mesh = to_mesh(part);
     if (light_ == nullptr) {
       std::vector<Bytes4> tints;
+      tints.reserve(part.tint.size());
       for (const Rgb& tint : part.tint)
         tints.emplace_back(to_byte(tint.x()), to_byte(tint.y()), to_byte(tint.z()), std::uint8_t{255});
       mesh.colors = std::move(tints);

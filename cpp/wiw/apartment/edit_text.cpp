@@ -71,6 +71,7 @@ std::string to_text(const Edit& edit) {
 
 std::vector<Edit> parse_edits(const std::vector<std::string>& texts) {
   std::vector<Edit> edits;
+  edits.reserve(texts.size());
   for (const std::string& text : texts) edits.push_back(parse_edit(text));
   std::sort(edits.begin(), edits.end(), [](const Edit& a, const Edit& b) { return to_text(a) < to_text(b); });
   for (std::size_t i = 0; i < edits.size(); ++i) {

@@ -76,6 +76,12 @@ std::uint64_t text_key(const std::string& text) {
   return key;
 }
 
+/// The design of a piece of furniture. Walls, doors and the like have none, and are asked for none.
+const Design& design_of(const Object& object) {
+  if (!object.design) throw std::logic_error(object.name + " has no design");
+  return *object.design;
+}
+
 enum class Stand { kFloor, kTop, kHung, kFixed };
 
 Stand stand_of(const Object& object) {
@@ -89,7 +95,7 @@ Stand stand_of(const Object& object) {
 /// Place of `a` where `b` is: backs in line at walls, middles on tables; pictures hang by their middles.
 Eigen::Affine3f pose_in_place_of(const Object& a, const Object& b) {
   const Stand stand = stand_of(a);
-  const Vec3 more = a.design->size - b.design->size;
+  const Vec3 more = design_of(a).size - design_of(b).size;
   const float forward = stand == Stand::kTop ? 0.f : 0.5f * more.z();
   const float down = stand == Stand::kHung ? 0.5f * more.y() : 0.f;
   return b.pose * Eigen::Translation3f(0.f, -down, forward);
@@ -249,7 +255,7 @@ class Editor {
     if (std::find(others.begin(), others.end(), state) == others.end())
       return "expected " + listed(others) + did_you_mean(state, others);
     MaterialTable scratch = draft_.materials;
-    const BuiltPiece built = build_piece(*changed.design, state, scratch, draft_.palette);
+    const BuiltPiece built = build_piece(design_of(changed), state, scratch, draft_.palette);
     for (const WorldBox& leaf : built.object.leaves) {
       const std::string hit = leaf_obstacle(index, leaf.transformed(changed.pose));
       if (!hit.empty()) return "its door " + hit;
@@ -279,7 +285,7 @@ class Editor {
 
   void set_state(std::size_t index, const std::string& state) {
     Object& changed = object(index);
-    BuiltPiece built = build_piece(*changed.design, state, draft_.materials, draft_.palette);
+    BuiltPiece built = build_piece(design_of(changed), state, draft_.materials, draft_.palette);
     changed.attributes = built.object.attributes;
     changed.shape = std::move(built.object.shape);
     changed.leaves = std::move(built.object.leaves);
@@ -345,7 +351,7 @@ class Editor {
     const Stand stand = stand_of(first);
     if (stand == Stand::kFixed || stand_of(second) != stand)
       return "expected two movable things that both stand on the floor, stand on furniture or hang on walls";
-    const Vec3 unlike = (first.design->size - second.design->size).cwiseAbs();
+    const Vec3 unlike = (design_of(first).size - design_of(second).size).cwiseAbs();
     const float across = stand == Stand::kHung ? std::max(unlike.x(), unlike.y()) : std::max(unlike.x(), unlike.z());
     const float most = stand == Stand::kTop ? 0.08f : stand == Stand::kHung ? 0.2f : 0.15f;
     if (across > most) return "expected two things of one size; these differ by more than " + centimetres(most);
@@ -391,8 +397,8 @@ class Editor {
 
   static Rect area_under(const Object& piece, const Eigen::Affine3f& pose) {
     const Vec3 front = pose.linear() * Vec3::UnitZ();
-    PlacedPiece placed{piece.design->category, piece.room, piece.design->size, pose.translation(),
-                       std::atan2(front.x(), front.z())};
+    const Design& design = design_of(piece);
+    PlacedPiece placed{design.category, piece.room, design.size, pose.translation(), std::atan2(front.x(), front.z())};
     return footprint(placed);
   }
 

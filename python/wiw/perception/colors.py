@@ -14,12 +14,8 @@ from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.files import atomic_file
+from wiw.scenes import COLORS
 
-COLORS = (
-    "white", "grey", "black", "brown", "beige", "red", "orange", "yellow", "green", "turquoise", "blue", "purple",
-    "pink",
-)  # fmt: skip
-"""Colour words, as apartments use them."""
 PARAMETERS = Path(__file__).parent / "colors.json"
 QUANTILES = (0.1, 0.3, 0.5, 0.7, 0.9)
 HUES = 8

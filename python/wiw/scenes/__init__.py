@@ -23,6 +23,7 @@ from wiw.suggestions import did_you_mean
 Scene = _core.scene.Scene
 
 __all__ = [
+    "COLORS",
     "Scene",
     "absolute",
     "apartment",
@@ -33,6 +34,12 @@ __all__ = [
     "possible_edits",
     "resolve",
 ]
+
+COLORS = (
+    "white", "grey", "black", "brown", "beige", "red", "orange", "yellow", "green", "turquoise", "blue", "purple",
+    "pink",
+)  # fmt: skip
+"""Colour words of apartments. Weights count classes by their order."""
 
 _log = logging.getLogger("wiw.scenes")
 

@@ -139,6 +139,7 @@ void add_larder(FurnitureBuilder& m, MaterialId body, const Vec3& low, const Vec
   for (int s = 0; s < shelves; ++s) {
     const float y = a.y() + up.y() * static_cast<float>(s) / static_cast<float>(shelves);
     if (s > 0) m.shape.box(glass, {a.x(), y - 0.008f, a.z()}, {b.x(), y, b.z() - 0.06f});
+    // NOLINTNEXTLINE(bugprone-float-loop-counter,clang-analyzer-security.FloatLoopCounter)
     for (float x = a.x() + 0.08f; x < b.x() - 0.06f; x += range(m.rng, 0.11f, 0.18f)) {
       m.shape.set_tint(oklch(range(m.rng, 0.5f, 0.9f), range(m.rng, 0.04f, 0.15f), range(m.rng, 0.f, 360.f)));
       const float tall = range(m.rng, 0.08f, 0.2f), z = b.z() - range(m.rng, 0.13f, 0.2f);
@@ -201,6 +202,7 @@ void add_crockery(FurnitureBuilder& m, MaterialId board, const Vec3& low, const 
   m.shape.box(board, {low.x(), middle - 0.016f, low.z()}, {high.x(), middle, high.z()});
   const MaterialId glaze = m.plain("ceramic", Rgb::Ones());
   for (const float y : {low.y(), middle}) {
+    // NOLINTNEXTLINE(bugprone-float-loop-counter,clang-analyzer-security.FloatLoopCounter)
     for (float x = low.x() + 0.1f; x < high.x() - 0.07f; x += range(m.rng, 0.16f, 0.22f)) {
       m.shape.set_tint(oklch(range(m.rng, 0.6f, 0.95f), range(m.rng, 0.01f, 0.12f), range(m.rng, 0.f, 360.f)));
       const float tall = range(m.rng, 0.06f, 0.2f);

@@ -25,7 +25,7 @@ constexpr std::string_view kTransform = "KHR_texture_transform";
 
 std::optional<std::size_t> index_of(const Json& object, std::string_view name, std::size_t size) {
   const auto index = object[name].whole();
-  return index && *index < size ? std::optional<std::size_t>(*index) : std::nullopt;
+  return index && *index < size ? index : std::nullopt;
 }
 
 /// The name of texture coordinates, normals, ... that the scene has use for.

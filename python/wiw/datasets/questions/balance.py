@@ -133,8 +133,8 @@ def pair_questions(
     rules: EpisodeRules,
     per_scene: int,
     backend: Backend = "auto",
-) -> list[Pair]:
-    """Return the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
+) -> Iterator[Pair]:
+    """Yield the pairs of a block: about `per_scene` questions for each of its scenes, or as many as there are.
 
     Categories and templates take turns, and so do answers: what is a rare answer to a template is taken first, and once
     the most frequent answers of train apartments are worth `rules.guessing` in a category, pairs with other answers.
@@ -152,7 +152,7 @@ def pair_questions(
         if pair is None:
             break
         tally.add(pair)
-    return tally.pairs
+        yield pair
 
 
 def guess_value(pair: Pair) -> float:

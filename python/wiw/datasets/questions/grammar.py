@@ -12,22 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 
 from wiw.errors import ArgumentError
+from wiw.scenes import COLORS
 
-COLORS = (
-    "white",
-    "grey",
-    "black",
-    "brown",
-    "beige",
-    "pink",
-    "red",
-    "orange",
-    "yellow",
-    "green",
-    "turquoise",
-    "blue",
-    "purple",
-)
 STATES = ("on", "off", "open", "closed")
 
 ACTIVITIES: Mapping[str, tuple[str, ...]] = {
