@@ -203,6 +203,8 @@ class TableSpec:
     """Metrics that depend on a judge's marks."""
     cuts: tuple[int, ...] = ()
     """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on."""
+    kind: str = "kind of task"
+    """What a kind is called."""
 
 
 @dataclass(frozen=True)

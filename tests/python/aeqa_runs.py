@@ -48,7 +48,7 @@ def make_episodes(questions: Sequence[Question], scenes: Sequence[str]) -> list[
             0.0,
             (1.0, 0.0, 0.0),
             0.0,
-            4.0,
+            4.0 + index % 5,
             {"question": question.to_info(), "task": question.category, "instruction": question.text},
         )
         for index, (question, scene) in enumerate(zip(questions, scenes, strict=True))

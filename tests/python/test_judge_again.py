@@ -71,7 +71,7 @@ def test_marks_are_stored_beside_the_runs_own(run: Path) -> None:
     assert now["none", 0] == before["none", 0], "typed questions are judged by rules"
     assert (before["warp", 1]["mark"], now["warp", 1]["mark"], now["warp", 2]["mark"]) == (3, 5, 3)
     assert now["warp", 1]["success"] == 1 and now["warp", 1]["answer_score"] == 1.0
-    assert now["warp", 1]["spl"] == pytest.approx(4.0 / 8.0)
+    assert now["warp", 1]["spl"] == pytest.approx(5.0 / 8.0)
     cuts = [now["warp", 1][f"score_at_{cut}"] for cut in (30, 60, 120, 250)]
     assert cuts == [0.0, 1.0, 1.0, 1.0], "what is computed from marks follows them"
     assert now["warp", 2]["answer_score"] == 0.5 and now["none", 2]["answered"] == 0 and now["none", 2]["spl"] == 0

@@ -19,6 +19,8 @@ JUDGE_ERROR = "judge/"
 """What kinds of errors of a judge begin with."""
 NOT_JUDGED = "judge/missing"
 """Kind of an outcome that a judge has not been asked about."""
+_SHORT_NAMES = {"rules": "rules+approximate"}
+"""Names of judges as they are asked for, where they differ from what these call themselves."""
 OWN = "own"
 """Names the judge that the run was made with."""
 
@@ -100,7 +102,8 @@ def find_judge(judges: Sequence[JudgeRecord], name: str | None, place: str) -> J
         return own
     if not judges:
         raise ArgumentError(f"judge '{name}': the outcomes of {place} do not depend on a judge; leave --judge out")
-    found = [judge for judge in judges if name in (judge.name, judge.label, judge.digest)]
+    names = {name, _SHORT_NAMES.get(name, name)}
+    found = [judge for judge in judges if names & {judge.name, judge.label, judge.digest}]
     if not found and len(name) >= SHORTEST_PREFIX:
         found = [judge for judge in judges if judge.digest.startswith(name.lower())]
     if len(found) == 1:

@@ -32,6 +32,7 @@ __all__ = [
     "open_scene",
     "possible_edits",
     "resolve",
+    "strip_edits",
 ]
 
 _log = logging.getLogger("wiw.scenes")
@@ -153,6 +154,11 @@ _FORMS = (
 def is_generated(spec: str) -> bool:
     """Return whether a scene spec names generated apartments rather than a file."""
     return spec.startswith("apartments:")
+
+
+def strip_edits(spec: str) -> str:
+    """Return the apartment that an edited one is a copy of: "apartments:val/7" for "apartments:val/7?remove:tv_1"."""
+    return spec.partition("?")[0] if is_generated(spec) else spec
 
 
 def absolute(spec: str | PathLike[str]) -> str:

@@ -46,6 +46,15 @@ class RunLog(Run):
         """Return what each arm cost: one dict per arm, totals and per success; see `wiw.analysis.costs.Costs`."""
         return Records(line.as_dict() for line in costs(self))
 
+    def breakdown(self, name: str) -> Records:
+        """Return a further table as plain values: one dict per estimate, with value, low, high and n.
+
+        Args:
+            name: "kinds" (by kind of episode), "anytime" (scores if cut after so many primitives),
+                "anytime_differences" (paired), or "twins"; empty where the task has no such table.
+        """
+        return Records(line for each in self.numbers().breakdowns if each.name == name for line in each.list_cells())
+
     def fidelity(self) -> Records:
         """Return how true imagination was in each arm that was run with `fidelity=True`: one dict per arm.
 

@@ -81,7 +81,7 @@ class AEQA(NavigationTask):
         way="to the nearest viewpoint",
         asked="The question",
     )
-    tables = TableSpec(kinds=("answer_score", "spl"), judged=MARK_METRICS, cuts=CUTS)
+    tables = TableSpec(kinds=("answer_score", "spl"), judged=MARK_METRICS, cuts=CUTS, kind="category")
 
     def __init__(self, *args: Any, judge: str | Judge = "rules", **options: Any) -> None:
         super().__init__(*args, **options)

@@ -104,6 +104,12 @@ def read_judgements(details: Mapping[str, Any]) -> dict[str, Judgement]:
     return {answer: Judgement.from_info(info) for answer, info in pairs if answer and info}
 
 
+def read_blind_judgement(details: Mapping[str, Any]) -> Judgement | None:
+    """Return the judgement of the answer from the text alone that an outcome's details hold, if they do."""
+    info = (details.get("blind") or {}).get("judgement")
+    return Judgement.from_info(info) if info else None
+
+
 def map_mark(mark: float) -> float:
     """Return a mark from 1 to 5 as a share (paper, "Answering Score")."""
     return (mark - LOWEST_MARK) / (HIGHEST_MARK - LOWEST_MARK)
