@@ -257,6 +257,33 @@ def test_a_run_that_is_being_written_is_left_alone(run: Path) -> None:
         wiw.judge(run, progress=False)
 
 
+@pytest.mark.parametrize(
+    ("column", "value", "expected"),
+    [
+        ("details", "{}", "no 'answer'"),
+        ("details", '{"answer": 3, "blind": {"answer": "x"}}', "no answer in words"),
+        ("metrics", "{}", "no 'path_length'"),
+        ("metrics", '{"path_length": null, "shortest": 1, "primitives": 3}', "no number path_length"),
+    ],
+)
+def test_a_store_that_was_edited_is_an_error_that_names_the_place(
+    run: Path, column: str, value: str, expected: str
+) -> None:
+    with RunStore.annotate(run) as store, store._writing() as connection:
+        connection.execute(f"UPDATE outcome SET {column} = ? WHERE arm = 'warp' AND episode = 1", (value,))
+    with pytest.raises(StoreError, match=f"outcome of warp in episode 1: {expected}; the run store was edited"):
+        wiw.judge(run, Grumpy(), progress=False)
+
+
+def test_a_stored_judgement_that_was_edited_is_an_error(run: Path) -> None:
+    wiw.judge(run, Grumpy(), progress=False)
+    for value in ('{"mark": 6, "judge": "grumpy"}', '{"marks": 5}'):
+        with RunStore.annotate(run) as store, store._writing() as connection:
+            connection.execute("UPDATE judged SET details = json_set(details, '$.judgement', json(?))", (value,))
+        with pytest.raises(StoreError, match="expected a judgement with a mark"):
+            load_run(run, judge="grumpy").numbers()
+
+
 def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["judge", str(run)]) == 0
     assert "0 judged now" in capsys.readouterr().out, "these are the run's own marks"

@@ -9,7 +9,7 @@ from typing import Any
 
 from wiw.metrics.metric import Metric
 from wiw.runs.judges import JUDGE_ERROR, JudgeRecord
-from wiw.tasks.answer_record import map_mark, read_blind_judgement
+from wiw.tasks.answer_record import map_mark, read_blind_judgement, read_end_judgement
 from wiw.types import TableSpec
 
 BLIND = "blind"
@@ -47,10 +47,10 @@ class Marks:
         found = [f"Marks by judge {self.judge.full_label}{own}."]
         if self.is_approximate:
             counts = ", ".join(f"{count} of {arm}" for arm, count in self.approximate.items() if count)
+            found.append(f"{APPROXIMATE}: with approximate marks, free text compared by its words alone ({counts}).")
             found.append(
-                f"{APPROXIMATE}: episodes with approximate marks, {counts}: free text compared by its words alone. "
-                "Nobody has shown that such marks agree with people or language models; "
-                "`wiw judge RUN --llm URL` asks one."
+                "Nobody has shown that approximate marks agree with people or language models; `wiw judge RUN --llm "
+                "URL` asks one."
             )
         if self.missing:
             count = "1 episode has" if self.missing == 1 else f"{self.missing} episodes have"
@@ -93,5 +93,5 @@ def answer_blind(
 
 
 def _is_approximate(details: Mapping[str, Any]) -> bool:
-    blind = details.get("blind") or {}
-    return any(bool(each.get("approximate")) for each in (details.get("judgement"), blind.get("judgement")) if each)
+    found = (read_end_judgement(details), read_blind_judgement(details))
+    return any(each is not None and each.approximate for each in found)

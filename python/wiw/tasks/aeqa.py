@@ -18,7 +18,7 @@ from wiw.datasets.questions.generate import EpisodeRules
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
-from wiw.errors import ArgumentError, JudgeError, VlmError
+from wiw.errors import ArgumentError, JudgeError, StoreError, VlmError
 from wiw.judging import Judge, Judgement, make_judge
 from wiw.judging.judge import HIGHEST_MARK
 from wiw.scenes import resolve
@@ -208,15 +208,25 @@ class AEQA(NavigationTask):
 
     @classmethod
     def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
-        """Return the answers of a stored outcome; None where it has none because something other than a judge broke."""
+        """Return the answers of a stored outcome; None where it has none because something other than a judge broke.
+
+        Raises:
+            StoreError: the outcome lacks what its marks are computed from.
+        """
         details, metrics = outcome["details"], outcome["metrics"]
         walk = details.get("measured") if outcome["status"] == "error" else metrics
         if walk is None:
             return None
         measured = {name: value for name, value in walk.items() if name not in MARK_METRICS}
         question = read_question(episode)
-        blind = details.get("blind") or {"answer": blind_answer(question.text)}
-        return AnswerRecord(question, str(details["answer"]), str(blind["answer"]), task["unanswered"], measured)
+        try:
+            blind = details.get("blind", {"answer": blind_answer(question.text)})["answer"]
+            record = AnswerRecord(question, details["answer"], blind, task["unanswered"], measured)
+            record.require_whole()
+        except (KeyError, TypeError) as error:
+            place = f"outcome of {outcome['arm']} in episode {outcome['episode']}"
+            raise StoreError(f"{place}: no {error}; the run store was edited: bring back a copy of it") from error
+        return record
 
     def _make_record(self, state: EpisodeState) -> AnswerRecord:
         """Return an ended episode with all that no mark changes."""

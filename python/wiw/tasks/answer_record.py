@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from wiw.datasets.questions import Question
+from wiw.errors import ArgumentError, StoreError
 from wiw.judging import Judgement, Reference
 from wiw.judging.judge import HIGHEST_MARK, LOWEST_MARK
 from wiw.metrics import path_efficiency
@@ -43,6 +44,19 @@ class AnswerRecord:
     def answers(self) -> tuple[str, ...]:
         """The different answers to be judged: the agent's, if it gave one, and the one from the text alone."""
         return tuple(dict.fromkeys(text for text in (self.answer, self.blind) if text))
+
+    def require_whole(self) -> None:
+        """Check that there is all that metrics are computed from.
+
+        Raises:
+            KeyError: a metric is missing.
+            TypeError: one is no number, or an answer no text.
+        """
+        for name in ("path_length", "shortest", "primitives"):
+            if not isinstance(self.measured[name], int | float):
+                raise TypeError(f"number {name}")
+        if not isinstance(self.answer, str) or not isinstance(self.blind, str):
+            raise TypeError("answer in words")
 
     def compute_metrics(self, judgements: Mapping[str, Judgement]) -> dict[str, float]:
         """Return all metrics of the episode; see `wiw.tasks.aeqa.AEQA.measure`.
@@ -97,17 +111,48 @@ def make_reference(question: Question) -> Reference:
 
 
 def read_judgements(details: Mapping[str, Any]) -> dict[str, Judgement]:
-    """Return the judgements that an outcome's details hold, by answer."""
-    pairs = [(details.get("answer", ""), details.get("judgement"))] if details.get("answer") else []
-    blind = details.get("blind") or {}
-    pairs.append((blind.get("answer", ""), blind.get("judgement")))
-    return {answer: Judgement.from_info(info) for answer, info in pairs if answer and info}
+    """Return the judgements that an outcome's details hold, by answer.
+
+    Raises:
+        StoreError: one of them is none.
+    """
+    blind = _read_mapping(details, "blind")
+    pairs = ((details.get("answer"), read_end_judgement(details)), (blind.get("answer"), read_blind_judgement(details)))
+    return {str(answer): judgement for answer, judgement in pairs if answer and judgement is not None}
+
+
+def read_end_judgement(details: Mapping[str, Any]) -> Judgement | None:
+    """Return the judgement that an outcome's marks follow from, if its details hold one.
+
+    Raises:
+        StoreError: it is none.
+    """
+    return _read_judgement(_read_mapping(details, "judgement"))
 
 
 def read_blind_judgement(details: Mapping[str, Any]) -> Judgement | None:
-    """Return the judgement of the answer from the text alone that an outcome's details hold, if they do."""
-    info = (details.get("blind") or {}).get("judgement")
-    return Judgement.from_info(info) if info else None
+    """Return the judgement of the answer from the text alone, if an outcome's details hold one.
+
+    Raises:
+        StoreError: it is none.
+    """
+    return _read_judgement(_read_mapping(_read_mapping(details, "blind"), "judgement"))
+
+
+def _read_mapping(values: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+    """Return a mapping within details; an empty one where a task of the user's own has something else there."""
+    found = values.get(name)
+    return found if isinstance(found, Mapping) else {}
+
+
+def _read_judgement(info: Mapping[str, Any]) -> Judgement | None:
+    try:
+        return Judgement.from_info(info) if info else None
+    except (TypeError, ArgumentError) as error:
+        raise StoreError(
+            f"expected a judgement with a mark, got {dict(info)!r:.120} ({error}); the run store was edited: bring "
+            "back a copy of it"
+        ) from error
 
 
 def map_mark(mark: float) -> float:
