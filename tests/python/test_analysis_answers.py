@@ -205,6 +205,7 @@ def test_report_view_and_export_take_a_judge(run: Path, tmp_path: Path, capsys: 
     assert judged.digest in (run / "report.html").read_text()
     assert main(["report", str(run), "--judge", "nobody"]) == 2
     assert main(["view", str(run), "--judge", judged.digest]) == 0
+    assert f"Marks by judge fixed5, {judged.digest}." in (run / "view" / "index.html").read_text()
     assert main(["export", str(run), "--csv", str(tmp_path / "csv"), "--judge", "fixed5"]) == 0
     assert "100.0" in (tmp_path / "csv" / "anytime.csv").read_text()
 

@@ -286,13 +286,17 @@ def test_a_stored_judgement_that_was_edited_is_an_error(run: Path) -> None:
 
 def test_the_command(run: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["judge", str(run)]) == 0
-    assert "0 judged now" in capsys.readouterr().out, "these are the run's own marks"
+    assert "0 asked about now" in capsys.readouterr().out, "these are the run's own marks"
     client = MockClient(lambda call: Completion("", "stop") if "it is night" in said(call) else reply(call), model="m")
     with VlmServer(client) as server:
         arguments = ["judge", str(run), "--llm", server.url, "--model", "m", "--judge-option", "cache=off"]
         assert main(arguments) == 1
         shown = capsys.readouterr()
-        assert "judge   rules+llm (m), " in shown.out and "warp episode 2" in shown.err and "same command" in shown.err
+        assert (
+            "judge   rules+llm (m), " in shown.out
+            and "no marks: warp 2: JudgeError" in shown.err
+            and "same command" in shown.err
+        )
         assert "/7 answers" in shown.err, "progress is shown, also where there is no terminal"
         client.script = reply
         assert main(arguments) == 0

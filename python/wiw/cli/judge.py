@@ -4,18 +4,22 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
-from wiw.cli.stop import stoppable
+from wiw.cli.stop import announce_resume
 from wiw.cli.terminal import printable
 from wiw.errors import ArgumentError
 
+if TYPE_CHECKING:
+    from wiw.studies.judge import MissingMarks
+
 MOST_LISTED = 10
-"""Episodes without marks that are listed."""
+"""Episodes without marks that are listed for each error."""
 
 
 def judge(
@@ -59,11 +63,12 @@ def judge(
 
     options = parse_options(judge_option, LanguageModelJudge, "--judge-option")
     spec = make_spec(judge, llm, model)
-    found = stoppable(lambda: judge_run(run, spec, **options), run, "judge")
+    with announce_resume():
+        found = judge_run(run, spec, **options)
     found.log.summary()
-    print(f"\njudge   {found.judge.full_label}\nanswers {found.asked} judged now, {found.known} known before")
-    for each in found.missing[:MOST_LISTED]:
-        print(f"no marks: {each.arm} episode {each.episode}: {printable(each.error)}", file=sys.stderr)
+    print(f"\njudge   {found.judge.full_label}\nanswers {found.asked} asked about now, {found.known} known before")
+    for line in list_missing(found.missing):
+        print(printable(line), file=sys.stderr)
     if found.missing:
         more = f"; {printable(found.stopped)}" if found.stopped else ""
         print(
@@ -72,6 +77,19 @@ def judge(
             file=sys.stderr,
         )
     return 0 if found.complete else 1
+
+
+def list_missing(missing: Sequence[MissingMarks]) -> list[str]:
+    """Return a line per error, with the episodes that it left without marks."""
+    by_error: dict[str, list[str]] = {}
+    for each in missing:
+        by_error.setdefault(each.error, []).append(f"{each.arm} {each.episode}")
+    return [
+        f"no marks: {', '.join(places[:MOST_LISTED])}"
+        + (f" and {len(places) - MOST_LISTED} more" if len(places) > MOST_LISTED else "")
+        + f": {error}"
+        for error, places in by_error.items()
+    ]
 
 
 def make_spec(judge: str | None, llm: str | None, model: str | None) -> str:

@@ -217,8 +217,9 @@ def anytime_curve(found: Breakdown) -> Markup:
         level = blind[str(cuts[0])].value
         axes.plot([0, cuts[-1]], [level, level], color=colors[BLIND], lw=1.4, ls=(0, (4, 3)), label=BLIND)
         for arm, estimates in found.estimates.items():
-            if arm != BLIND:  # nothing is answered before anything is done
-                axes.plot([0, cuts[0]], [level, estimates[str(cuts[0])].value], color=colors[arm], lw=1.2, alpha=0.6)
+            first = estimates[str(cuts[0])]
+            if arm != BLIND and first.n == blind[str(cuts[0])].n:  # nothing is answered before anything is done
+                axes.plot([0, cuts[0]], [level, first.value], color=colors[arm], lw=1.2, alpha=0.6)
     axes.set_ylim(-3, 103)
     axes.set_ylabel(f"{found.metric.label.lower()}, %")
     _legend(axes)

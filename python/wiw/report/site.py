@@ -178,6 +178,7 @@ def _common(run: Run) -> dict[str, Any]:
         "whole": PictureFolder.whole,
         "words": wording(run.store),
         "choices": task.get("categories", ()),
+        "judge": run.store.judge,
     }
 
 
