@@ -246,10 +246,17 @@ def test_a_run_without_answers_in_words_has_no_judge(tmp_path: Path) -> None:
     from wiw.studies.evaluate import run_arms
 
     run = run_arms(LineTask(), {"none": LineAgent()}, 1, out=tmp_path / "run", progress=False).path
-    with pytest.raises(StoreError, match="'line', that is not registered"):
+    with pytest.raises(StoreError, match="task 'line', whose outcomes do not depend on a judge"):
         wiw.judge(run, progress=False)
     with pytest.raises(ArgumentError, match="do not depend on a judge"):
         load_run(run, judge="rules")
+
+
+def test_a_task_that_is_not_known_here_cannot_be_judged(run: Path) -> None:
+    with RunStore.annotate(run) as store, store._writing() as connection:
+        connection.execute("UPDATE run SET config = json_set(config, '$.task.task', 'mine')")
+    with pytest.raises(StoreError, match="task in memory, 'mine', that is not registered"):
+        wiw.judge(run, progress=False)
 
 
 def test_a_run_that_is_being_written_is_left_alone(run: Path) -> None:

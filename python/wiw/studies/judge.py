@@ -238,17 +238,15 @@ def _find_task(store: RunStore) -> Any:
     Raises:
         StoreError: it has no answers in words, or is not known here.
     """
-    config = store.config["task"]
-    recipe = store.info["task"]
-    name = recipe["name"] if recipe else str(config.get("task"))
-    if not recipe and name not in TASKS.names():
-        raise StoreError(
-            f"{store.path} was begun with a task in memory, '{name}', that is not registered; register it in the entry "
-            "points 'wiw.tasks' (docs/write-your-own-task.md)"
-        )
+    task, recipe = store.config["task"].get("task"), store.info["task"]
     if not store.judges:
         raise StoreError(
-            f"{store.path.parent} is a run of task '{config.get('task')}', whose outcomes do not depend on a judge; "
-            "expected one with answers in words, such as aeqa"
+            f"{store.path.parent} is a run of task '{task}', whose outcomes do not depend on a judge; expected one "
+            "with answers in words, such as aeqa"
         )
-    return task_class(name)
+    if not recipe and task not in TASKS.names():
+        raise StoreError(
+            f"{store.path.parent} was begun with a task in memory, '{task}', that is not registered; register it in "
+            "the entry points 'wiw.tasks' (docs/write-your-own-task.md)"
+        )
+    return task_class(recipe["name"] if recipe else task)
