@@ -109,8 +109,8 @@ def test_the_anytime_curve_is_the_score_if_cut_there(run: Path) -> None:
 
 def test_twins_count_as_right_together(run: Path) -> None:
     found = cells(run, "twins")
-    assert [found["warp", key, "twins"] for key in ("both right", "one right", "none right")] == [100, 0, 0]
-    assert [found["none", key, "twins"] for key in ("both right", "one right", "none right")] == [0, 100, 0]
+    assert [found["warp", key, "twins"] for key in ("both right", "one right", "neither right")] == [100, 0, 0]
+    assert [found["none", key, "twins"] for key in ("both right", "one right", "neither right")] == [0, 100, 0]
     assert found["blind", "both right", "twins"] == 0
     (row,) = (
         row for row in load_run(run).breakdown("twins") if row["arm"] == "warp" and row["outcome"] == "both right"

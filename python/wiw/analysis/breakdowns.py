@@ -14,7 +14,7 @@ from wiw.types import Episode
 
 Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
 """By arm, scored episodes by index with "scene", "metrics", and "task" where there are kinds."""
-BOTH, ONE, NEITHER = "both right", "one right", "none right"
+BOTH, ONE, NEITHER = "both right", "one right", "neither right"
 PAIRS = Metric("twins", "Twins", "rate", True, about="Percent of pairs of twins of which both are answered rightly.")
 
 
