@@ -12,7 +12,7 @@ help:       ## this list
 setup:      ## Debian packages, .venv, the package in editable mode
 	@scripts/setup
 
-demo:       ## the main job: navigation with five world models and an arm at a table with three, tables and reports
+demo:       ## the main job: four tasks with two to five world models each, tables and reports
 	@scripts/setup torch
 	$(BIN)/wiw demo
 

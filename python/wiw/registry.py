@@ -244,7 +244,9 @@ POLICIES = Registry(
         "scripted": "wiw.policies.scripted:Scripted",
         "diffuser": "wiw.policies.diffuser:Diffuser",
         "explorer": "wiw.policies.explorer:Explorer",
-        "explorer-oracle": "wiw.experiments.true_perception:OracleExplorer",
+        "explorer-oracle": "wiw.experiments.privileged_explorers:OracleExplorer",
+        "explorer-tour": "wiw.experiments.privileged_explorers:TourExplorer",
+        "explorer-oracle-tour": "wiw.experiments.privileged_explorers:OracleTourExplorer",
     },
     "wiw.policies.base:Policy",
 )

@@ -412,6 +412,8 @@ class Decision:
     """
     exchanges: tuple[Exchange, ...] = ()
     """What a language model was asked, and what it said."""
+    pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    """What the policies believe, uint8 [H, W, 3] by name (`Policy.draw`); empty where the record keeps no pictures."""
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,12 @@ pytest.importorskip("pydantic")
 pytest.importorskip("openai")
 pytest.importorskip("json_repair")
 
+import question_file
 import wiw
 from recognition_file import CHOICES, a_file
 from wiw import panorama
 from wiw.errors import ArgumentError
+from wiw.mapping.views import HFOV_DEG, SIZE, VIEW_YAWS_DEG
 from wiw.policies.vlm.prompt_images import VIEW
 from wiw.runs.recipes import AgentRecipe
 from wiw.serving.background import serve_in_background
@@ -43,6 +45,8 @@ def script(call: Call) -> Any:
     """The same two plans at every decision, and a doubtful liking for whatever comes first."""
     if call.schema is None:
         return {label: 0.5 / 2**k for k, label in enumerate(call.labels)}
+    if call.schema["title"] in ("Command", "Commands", "Walk"):
+        return json.dumps(_at_a_question(call.schema))
     plans = (
         [_at_the_table(plan) for plan in POSES]
         if "Step" in call.schema.get("$defs", {})
@@ -53,6 +57,16 @@ def script(call: Call) -> Any:
 
 def _in_a_home(plan: list[str]) -> Any:
     return {"reason": "free floor", "actions": plan}
+
+
+def _at_a_question(schema: Any) -> Any:
+    if schema["title"] == "Walk":
+        return {"reason": "free floor", "actions": [{"action": "forward", "times": 2}]}
+    plans = [
+        {"reason": "free floor", "action_plan": "Go on.", "chosen_view": view, "chosen_landmark": mark}
+        for view, mark in (("front", 1), ("right", None), ("back", None))
+    ]
+    return {"plans": [{**plan, "answer": None} for plan in plans]} if schema["title"] == "Commands" else plans[1]
 
 
 def _at_the_table(plan: list[list[int]]) -> Any:
@@ -284,3 +298,52 @@ def check_target(shown: Any, control: Any, episode: Any) -> None:
         looked = view[VIEW // 2 - 1 : VIEW // 2 + 1, VIEW // 2 - 1 : VIEW // 2 + 1].mean((0, 1)) - 127.5
         cosine = direction @ looked / np.linalg.norm(direction) / np.linalg.norm(looked)
         assert np.degrees(np.arccos(cosine)) < 6
+
+
+@pytest.mark.parametrize("kind", [None, *KINDS], ids=str)
+def test_questions_with_every_kind(kind: Any, server: VlmServer, two_rooms: str, tmp_path: Path) -> None:
+    """Three commands: to the table ahead, into the view on the right, and into the one behind."""
+    server.client.calls.clear()
+    model = None if kind is None else Compass(*kind)
+    asked: Any = {"model": "scripted", "dialect": "vllm", "proposals": "listed", "cache": "off"}
+    policy = wiw.policy("vlm", task="aeqa", vlm=server.url, perception=question_file.ByColor(), **asked)
+    labels = "simulator" if model is not None and "semantic" in model.accepts.needs else None
+    how: Any = {"progress": False, "keep_images": 0, "cache": "off", "actions": 8}
+    file = question_file.a_file(tmp_path, two_rooms)
+    log = wiw.evaluate(
+        "aeqa", AgentRecipe(policy, model, semantics=labels), 1, seed=0, out=tmp_path / "run", episode_file=file, **how
+    )
+    (episode,) = log.episodes
+    assert episode["status"] == "done", episode["error"]
+    decisions = list(log.store.decisions(episode["arm"]))
+    assert decisions and all(row["exchanges"] for row in decisions)
+    if model is None:
+        assert not any(strips(call) for call in server.client.calls)
+        return
+    made = wiw.registry.TASKS.make("aeqa", episode_file=file)
+    env = made.environment(depth=True)
+    env.begin(made.episode(0))
+    first = model.handed[: len(model.handed) // len(decisions)]
+    assert len(first) == 3 and [row[0].length for row in first[1:]] == [2, 2]
+    for row, turn in zip(first[1:], (-90.0, 180.0), strict=True):
+        check_handed(row, turn, env, model.accepts)
+    for call in filter(strips, server.client.calls):
+        assert len(strips(call)) == 3
+        for end in strips(call):
+            check_end(end, model.accepts)
+
+
+def check_end(end: Any, accepts: Any) -> None:
+    """What a plan ends with: the front view that was imagined, or four views around."""
+    if accepts.view == "perspective":
+        assert end.shape[1] == VIEW
+        check_front(end[-VIEW:], accepts)
+        return
+    height, width = SIZE
+    focal = width / 2 / np.tan(np.radians(HFOV_DEG) / 2)
+    x, y = np.meshgrid(np.arange(width) + 0.5 - width / 2, height / 2 - np.arange(height) - 0.5)
+    for number, yaw in enumerate(np.radians(VIEW_YAWS_DEG)):
+        turned = np.stack([np.cos(yaw) * x - np.sin(yaw) * focal, y, -np.sin(yaw) * x - np.cos(yaw) * focal], -1)
+        left = number * (end.shape[1] - width) // 3
+        wrong = np.abs(end[-height:, left : left + width].astype(int) - colours(turned)).max(-1) > 4
+        assert wrong.mean() < 0.02

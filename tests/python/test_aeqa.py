@@ -308,6 +308,7 @@ def test_runs_keep_answers_and_judgements_apart_from_numbers(episode, tmp_path):
 def test_presets_differ_in_what_the_published_code_does():
     paper, official = AEQA(SCENE), AEQA(SCENE, preset="official")
     assert paper.defaults == {"candidates": 3, "horizon": 21, "execute": 15} and paper.limit == 250
-    assert official.defaults["execute"] == 50
+    assert official.defaults["execute"] == 21, "the whole plan"
     changed = {name for name, value in official.describe().items() if value != paper.describe()[name]}
-    assert changed == {"execute", "confirm", "unanswered", "turns"}
+    assert changed == {"execute", "confirm", "unanswered", "turns", "policies"}
+    assert wiw.Agent("heuristic", **official.defaults).config.execute == 21

@@ -13,7 +13,9 @@ import pytest
 
 from wiw import errors
 from wiw.cli import main
+from wiw.cli.demo import PARTS
 from wiw.errors import VlmError
+from wiw.registry import TASKS
 from wiw.vlm.openai import OpenAIClient
 
 FAKES = Path(__file__).with_name("fakes.py")
@@ -103,8 +105,11 @@ def test_the_demo_ends_with_its_pages_and_the_ready_report(
     assert main(["demo", "--out", str(tmp_path)]) == 0
     shown = capsys.readouterr().out
     ready = "docs/report-imagenav.html"
-    assert ready in " ".join(shown.split()) and all(ready in remark for remark in reports) and len(reports) == 2
-    assert f"{tmp_path}/imagenav/report.html" in shown
+    assert (
+        ready in " ".join(shown.split()) and all(ready in remark for remark in reports) and len(reports) == len(PARTS)
+    )
+    assert {part.task for part in PARTS} == set(TASKS.names())
+    assert all(f"{tmp_path}/{part.task}/report.html" in shown for part in PARTS)
     text = [line for line in shown.splitlines() if not line.startswith("        ")]
     assert max(map(len, text)) < 80
     assert Path(__file__).parents[2].joinpath(ready).stat().st_size <= 10**6

@@ -12,24 +12,37 @@ import pytest
 from test_aeqa import SCENE, Records, episode, make_task  # noqa: F401 - a fixture
 
 import wiw
+from wiw.action import FORWARD, TURN_LEFT
+from wiw.analysis.answer_confidence import fit_curve, write_calibration
+from wiw.datasets import episodes
 from wiw.datasets.questions import parse
 from wiw.datasets.questions.blind import blind_answer
-from wiw.datasets.questions.facts import make_table
+from wiw.datasets.questions.facts import Room, SceneTable, Thing, make_table
 from wiw.errors import ArgumentError
-from wiw.experiments.true_perception import OracleExplorer
+from wiw.experiments.privileged_explorers import (
+    SPACING,
+    OracleExplorer,
+    OracleTourExplorer,
+    choose_places,
+    look_from,
+    take_tour,
+)
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
 from wiw.loop.scheduler import run_episodes
-from wiw.mapping.object_map import ObjectMap
+from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
 from wiw.policies import explorer
+from wiw.policies.explorer import confidence
 from wiw.policies.explorer.answering import answer, list_wanted
-from wiw.policies.explorer.home import KNOWLEDGE, believe_home, load_knowledge, to_table_frame
+from wiw.policies.explorer.home import KNOWLEDGE, Home, believe_home, load_knowledge, to_table_frame
+from wiw.policies.explorer.presuming import find_likeliest
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.scenes import apartment_table
 from wiw.tasks.aeqa import AEQA
 from wiw.training.home_knowledge import count_homes, write_knowledge
-from wiw.types import Key, Proposal, Rollout
+from wiw.types import Key, Proposal, Rollout, TextAnswer
 
 PALETTE = {
     "white": (230, 228, 222), "grey": (128, 128, 128), "black": (30, 30, 30), "brown": (110, 75, 45),
@@ -42,7 +55,7 @@ class RedIsASofa(Labeller):
 
     categories = CATEGORIES
 
-    def compute_labels(self, images: np.ndarray, hfov_deg: float, ids: Any) -> SceneLabels:
+    def compute_labels(self, images: np.ndarray, hfov_deg: float, ids: Any, depth: Any) -> SceneLabels:
         sofa = (images == (255, 0, 0)).all(axis=-1)
         category = np.where(sofa, CATEGORIES.index("sofa"), 0).astype(np.uint8)
         return SceneLabels(category, sofa.astype(np.float32), np.zeros_like(category))
@@ -117,6 +130,88 @@ def test_an_empty_map_leaves_the_guess_from_the_text():
         assert (belief.text, belief.confidence) == (blind_answer(text), 0.0)
 
 
+# -- what questions take for granted -----------------------------------------------------------------------------------
+
+
+def make_thing(number: int, category: str, room: str, color: str = "", x: float = 0.0) -> Thing:
+    low = np.array([x, 0.0, 0.0])
+    return Thing(number, f"{category} {number}", category, color, "", "", room, low, low + 0.5, np.array([0.0, 0, 1]))
+
+
+def make_home(things: list[Thing], kinds: dict[str, dict[str, float]], weights: dict[int, float]) -> Home:
+    rooms = tuple(
+        Room(name, max(shares, key=lambda kind: shares[kind]), np.zeros(3), np.ones(3))
+        for name, shares in kinds.items()
+    )
+    votes, voxels = np.ones(1), np.zeros(1, np.int64)
+    objects = {
+        number: MapObject(number, voxels, votes, votes, (), "", "", "", weight, 1.0, 1, 0, 0)
+        for number, weight in weights.items()
+    }
+    return Home(SceneTable("", tuple(things), rooms), objects, {}, kinds)
+
+
+def ask(home: Home, text: str) -> str | None:
+    question = parse(text)
+    assert question is not None
+    fact = find_likeliest(home, question)
+    return fact.answer if fact is not None else None
+
+
+def test_of_two_things_that_a_question_takes_for_one_the_better_supported_counts():
+    things = [make_thing(1, "sofa", "a", "red"), make_thing(2, "sofa", "a", "blue")]
+    kinds = {"a": {"living room": 0.9, "study": 0.1}}
+    assert ask(make_home(things, kinds, {1: 0.01, 2: 0.2}), "What color is the sofa?") == "blue"
+    assert ask(make_home(things, kinds, {1: 0.2, 2: 0.01}), "What color is the sofa?") == "red"
+
+
+def test_the_room_that_a_question_names_is_the_likeliest_one():
+    things = [make_thing(1, "sofa", "a", "red"), make_thing(2, "sofa", "b", "blue")]
+    weights = {1: 0.1, 2: 0.1}
+    kinds = {"a": {"study": 0.6, "living room": 0.3, "kitchen": 0.1}, "b": {"study": 0.9, "living room": 0.1}}
+    assert ask(make_home(things, kinds, weights), "What color is the sofa in the study?") == "blue"
+    assert ask(make_home(things, kinds, weights), "What color is the sofa in the living room?") == "red"
+    assert ask(make_home(things, kinds, weights), "What color is the sofa in the bathroom?") is None
+
+
+def test_what_hinders_an_answer_is_doubted_the_weakest_first():
+    things = [make_thing(1, "armchair", "a"), make_thing(2, "pouf", "a"), make_thing(3, "stool", "b")]
+    kinds = {"a": {"bedroom": 1.0}, "b": {"kitchen": 1.0}}
+    text = "What can I sit on in the bedroom?"
+    assert ask(make_home(things, kinds, {1: 0.3, 2: 0.02, 3: 0.01}), text) == "armchair"
+    assert ask(make_home(things, kinds, {1: 0.02, 2: 0.3, 3: 0.01}), text) == "pouf"
+
+
+# -- tours -------------------------------------------------------------------------------------------------------------
+
+
+def test_a_tour_passes_everything_and_shows_what_stands_there(episode):  # noqa: F811
+    env = make_task(episode).environment(depth=True)
+    env.begin(episode)
+    state = env.state
+    places = choose_places(state.world, state.positions[-1])
+    survey = state.world.navmesh.sample(200, 5, int(state.world.navmesh.island_of(state.positions[-1])))
+    everywhere = np.concatenate([places, state.positions[-1][None]])
+    away = np.linalg.norm(survey[:, None, [0, 2]] - everywhere[:, [0, 2]], axis=2).min(axis=1)
+    assert away.max() < SPACING + 0.6 and len(places) > 5
+    looks = list(take_tour(env, ids=True))
+    assert len(looks) == len(places) and np.allclose(env.state.positions[-1], state.positions[-1])
+    # A walk of the environment itself ends where the odometry of a look at its end says.
+    walked = make_task(episode).environment(depth=True)
+    walked.begin(episode)
+    seen = walked.run([int(TURN_LEFT), int(FORWARD), int(FORWARD)], TextAnswer("", 0.0)).observation
+    (look,) = (each for each in look_from(env, [walked.state.positions[-1]], ids=False))
+    assert np.allclose(look.odometry[:2], seen.odometry[:2], atol=0.02) and look.odometry[2] == 0
+
+
+def test_after_a_tour_the_first_answer_is_final(episode):  # noqa: F811
+    task, sink = make_task(episode), Records()
+    agent = wiw.Agent(OracleTourExplorer(perception=RedIsASofa()), **task.defaults)
+    run_episodes(task, agent, [(0, episode)], seed=0, live=1, sink=sink)
+    assert sink.results[0].status == "done", sink.results[0].error
+    assert sink.answers[0].final and len(sink.answers) == 2 and sink.results[0].metrics["primitives"] <= 3
+
+
 # -- episodes ----------------------------------------------------------------------------------------------------------
 
 
@@ -188,7 +283,8 @@ def test_a_plan_whose_imagined_end_shows_the_thing_scores_higher(episode):  # no
 
 
 def test_true_perception_is_told_apart():
-    assert make_explorer().describe()["privileged"] == "perception"
+    assert make_explorer().describe()["privileged"] == ["perception"]
+    assert OracleTourExplorer(perception=RedIsASofa()).describe()["privileged"] == ["perception", "tour"]
     with pytest.raises(ArgumentError, match="explorer-oracle"):
         wiw.policy("explorer", perception=wiw.registry.LABELLERS.make("oracle", instances=[]))
     with pytest.raises(ArgumentError, match="use it with task aeqa"):
@@ -199,3 +295,37 @@ def test_queries_carry_the_text_alone(episode):  # noqa: F811
     env = make_task(episode).environment(depth=True)
     query = Query(env.begin(episode), env.goal, Key(0, 0))
     assert query.goal.text == episode.info["question"]["text"] and SCENE not in repr(query.goal)
+
+
+# -- how sure it is ----------------------------------------------------------------------------------------------------
+
+
+def test_curves_of_confidence_never_fall_and_doubt_few_samples():
+    rng = np.random.default_rng(0)
+    support = rng.uniform(0, 1, 3000)
+    many = fit_curve([(s, float(rng.uniform() < s**2), 1.0) for s in support])
+    assert many["support"] == sorted(many["support"]) and many["right"] == sorted(many["right"])
+    assert np.allclose(many["right"], np.square(many["support"]), atol=0.07)
+    assert max(fit_curve([(0.9, 1.0, 1.0)] * 3)["right"]) < 0.85
+    halves = fit_curve([(0.5, 1.0, 0.01)] * 100 + [(0.5, 0.0, 1.0)] * 9)  # one long episode against nine short ones
+    assert max(halves["right"]) < 0.5
+
+
+def test_confidence_is_read_off_the_curve_of_the_answers_type(monkeypatch):
+    curves = {"": {"support": [0.0, 1.0], "right": [0.2, 0.6]}, "color": {"support": [0.5], "right": [0.9]}}
+    monkeypatch.setattr(confidence, "load_curves", lambda: curves)
+    assert confidence.estimate_confidence("color", 0.1) == 0.9
+    assert confidence.estimate_confidence("count", 0.5) == pytest.approx(0.4)
+    assert confidence.estimate_confidence("color", 0.0) == 0.0
+
+
+def test_confidence_is_calibrated_by_a_run(episode, tmp_path):  # noqa: F811
+    options = {"perception": f"{__file__}:RedIsASofa", "calibrated": False}
+    agent = AgentRecipe("explorer-oracle-tour", policy_options={"explorer-oracle-tour": options})
+    file = tmp_path / "asked.json"
+    episodes.save(file, [episode], "aeqa")
+    task = TaskRecipe("aeqa", {"episode_file": str(file)})
+    wiw.evaluate(task, agent, 1, out=tmp_path / "run", progress=False)
+    curves = write_calibration(tmp_path / "run", tmp_path / "own.json")
+    assert set(curves) == {""} and json.loads((tmp_path / "own.json").read_text()) == curves
+    assert 0 < curves[""]["right"][0] < 1 and 0 < curves[""]["support"][0] <= 1

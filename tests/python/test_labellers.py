@@ -84,7 +84,7 @@ def test_the_oracle_needs_ids_of_its_scene() -> None:
 class Careless(Labeller):
     categories = ("", "wall")
 
-    def compute_labels(self, images: Any, hfov_deg: float, ids: Any) -> SceneLabels:
+    def compute_labels(self, images: Any, hfov_deg: float, ids: Any, depth: Any) -> SceneLabels:
         assert ids is None  # it does not ask for them
         empty = np.zeros(images.shape[:3], np.int64)
         return SceneLabels(empty, empty, empty)

@@ -7,14 +7,15 @@ import copy
 
 import numpy as np
 import pytest
-from mapping_tours import Mapped, Tour, add_all, mapped
+from mapping_tours import Mapped, Tour, add_all, mapped, walk
 from numpy.typing import NDArray
 
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_trajectory
 from wiw.errors import ArgumentError
+from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
 from wiw.mapping.occupancy import CELL, OccupancyGrid
 from wiw.mapping.openings import name_openings
-from wiw.mapping.routes import RADIUS, STEP, follow_heading, measure_distances, route
+from wiw.mapping.routes import RADIUS, STEP, find_refused, follow_heading, measure_distances, route
 
 SCENES = ["apartments:val/3", "apartments:val/12"]
 
@@ -228,6 +229,41 @@ def test_following_a_heading_stops_before_a_wall() -> None:
     found = follow_heading(grid, np.array([1.0, 2.0, np.pi / 2]), 0.0, 3.0)
     assert found.actions.tolist() == [TURN_RIGHT] * 4 + [FORWARD] * 4 and not found.reached
     assert follow_heading(grid, np.array([1.0, 2.0, 0.0]), 0.0, 0.6).reached
+
+
+@pytest.mark.parametrize("blocked", [None, 0, 2, 4])
+def test_the_step_that_was_refused_is_found(blocked: int | None) -> None:
+    actions = [int(a) for a in (FORWARD, FORWARD, FORWARD, TURN_LEFT, FORWARD, FORWARD, TURN_RIGHT)]
+    x, y, azimuth = 1.0, -2.0, 0.3
+    refused, expected = False, None
+    for number, action in enumerate(actions):
+        if action == int(FORWARD):
+            if number == blocked:
+                refused, expected = True, np.array([x, y, azimuth])
+            if not refused:
+                x, y = x + 0.2 * np.cos(azimuth), y + 0.2 * np.sin(azimuth)
+        else:
+            azimuth += np.radians(22.5) * (1 if action == int(TURN_LEFT) else -1)
+            refused = False
+    found = find_refused(np.array([1.0, -2.0, 0.3]), actions, np.array([x, y, azimuth]))
+    assert (found is None) == (expected is None)
+    assert expected is None or np.allclose(found, expected)
+
+
+@pytest.mark.parametrize("turn_deg", [-40.0, 0.0, 17.0, 44.0])
+def test_the_walls_azimuth_is_found_whatever_the_heading(turn_deg: float) -> None:
+    tour = walk("apartments:val/3", 4)
+    turn = np.radians(turn_deg)
+    for observation in tour.observations:
+        odometry = observation["odometry"] + np.array([0.0, 0.0, turn])
+        # The start's axes are turned from the world's, along which all walls stand, by the start's heading.
+        expected = turn - tour.yaw
+        found = find_wall_azimuth(observation["depth"], odometry)
+        off = (found - expected + np.pi / 4) % (np.pi / 2) - np.pi / 4
+        assert abs(np.degrees(off)) < 1.0 and abs(found) <= np.pi / 4
+        along = turn_odometry(odometry, found)
+        assert np.allclose(np.hypot(*along[:2]), np.hypot(*odometry[:2]))
+        assert abs(find_wall_azimuth(observation["depth"], along)) < 1e-6
 
 
 def test_a_target_of_another_kind_is_refused() -> None:

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 from mapping_tours import Tour, mapped, walk
 from numpy.typing import NDArray
 
-from wiw.mapping.landmarks import OPENING_IDS, VISITED, Landmark, LandmarkFinder, draw_opening
+from wiw.mapping.landmarks import OPENING_IDS, VISITED, Landmark, LandmarkFinder, draw_opening, find_place_behind
 from wiw.mapping.marks import LabelBox, draw_marks, place_labels
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
+from wiw.mapping.openings import Opening
 from wiw.mapping.views import unproject
 
 SHAPE = (120, 160)
@@ -154,3 +155,30 @@ def test_the_pixels_of_an_opening_show_what_is_behind_it(index: int) -> None:
             behind = np.linalg.norm(points - [*views.odometry[:2], 1.0], axis=1)
             nearest = np.linalg.norm(opening.edges - views.odometry[:2], axis=1).min()
             assert (behind > nearest - 0.6).mean() > 0.95
+
+
+def test_a_way_to_an_opening_leads_through_it() -> None:
+    opening = Opening(1, np.array([[2.0, -0.5], [2.0, 0.5]]))
+    for pose, behind in (
+        ((0.0, 0.3, 0.0), 2.6),
+        ((4.0, -1.0, 3.0), 1.4),
+        ((1.95, 0.0, 0.0), 2.6),
+        ((2.0, 0, 3.1), 1.4),
+    ):
+        np.testing.assert_allclose(find_place_behind(opening, np.array(pose)), [behind, 0.0], atol=1e-9)
+
+
+def test_landmarks_say_where_a_way_to_them_leads() -> None:
+    known = mapped()
+    views, ids = known.tour.cut(2)
+    objects = ObjectMap(known.tour.categories)
+    owners = objects.add(views, known.tour.label(ids))
+    marks = LandmarkFinder().find(views, owners, objects, known.grid.openings)
+    kinds = {mark.id > OPENING_IDS for mark in marks}
+    assert kinds == {True, False}
+    for mark in marks:
+        if mark.id > OPENING_IDS:
+            assert np.linalg.norm(mark.destination - mark.position[:2]) == pytest.approx(0.6) and mark.radius == 0.25
+        else:
+            np.testing.assert_array_equal(mark.destination, objects[mark.id].center[:2])
+            assert 0.8 < mark.radius == 0.8 + objects[mark.id].extent[:2].min() / 2

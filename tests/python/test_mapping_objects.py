@@ -13,7 +13,7 @@ from mapping_tours import Tour, add_all, mapped, walk
 from numpy.typing import NDArray
 
 from wiw.errors import ArgumentError
-from wiw.mapping.fragments import VOXEL, cut_depth_steps, pack_voxels, unpack_voxels
+from wiw.mapping.fragments import VOXEL, cut_depth_steps, pack_voxels, split_voxels, unpack_voxels
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.relations import find_around, find_support, hangs_above, is_beside, measure_gap, share_room
 from wiw.mapping.views import (
@@ -324,3 +324,23 @@ def test_rooms_of_things_are_those_of_the_table() -> None:
         for other, b in pairs[i + 1 :]
     ]
     assert len(agree) > 500 and np.mean(agree) > 0.95
+
+
+# -- taking apart ------------------------------------------------------------------------------------------------------
+
+
+def fill(low: tuple[float, float, float], high: tuple[float, float, float]) -> np.ndarray:
+    axes = [np.arange(a + 0.025, b, 0.05) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def test_what_stands_apart_on_the_floor_or_above_is_taken_apart() -> None:
+    seat = [fill((x, 0, 0.4), (x + 0.4, 0.4, 0.5)) for x in (0.0, 0.45)]
+    backs = [fill((x, 0, 0.5), (x + 0.2, 0.1, 0.95)) for x in (0.0, 0.65)]
+    apart = split_voxels(np.unique(pack_voxels(np.concatenate([seat[0], seat[1] + [0.3, 0, 0]]))))
+    assert sorted(map(len, apart)) == [len(part) for part in seat]
+    by_backs = split_voxels(np.unique(pack_voxels(np.concatenate([*seat, *backs]))))
+    assert len(by_backs) == 2 and sum(map(len, by_backs)) == len(np.concatenate([*seat, *backs]))
+    scrap = seat[0][:3] + np.array([0.6, 0, 0])
+    one = np.unique(pack_voxels(np.concatenate([seat[0], backs[0], scrap])))
+    assert len(split_voxels(one)) == 1

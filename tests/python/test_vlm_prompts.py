@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from wiw.errors import PromptError
-from wiw.policies.vlm.prompts import ARM_SLOTS, FOLDER, SLOTS, Prompts, list_tasks
+from wiw.policies.vlm.prompts import FOLDER, SLOTS, Prompts, get_slots, list_tasks
 
 LOOP = "{% for a in range(99999) %}"
 
@@ -62,7 +62,7 @@ def test_raw_and_comment_blocks_that_end_are_fine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("task", list_tasks())
 def test_shipped_templates_say_the_same_as_a_users(tmp_path: Path, task: str) -> None:
-    slots = ARM_SLOTS if task == "manipulation" else SLOTS
+    slots = get_slots(task)
     (tmp_path / task).mkdir()
     for file in (FOLDER / task).glob("*.j2"):
         (tmp_path / task / file.name).write_text(file.read_text())

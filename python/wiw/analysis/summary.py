@@ -7,7 +7,7 @@ import math
 import sys
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cache, reduce
 from typing import Any
 
@@ -110,6 +110,9 @@ class Summary:
     marks: Marks | None = None
     """Whose marks scores rest on, where answers are judged."""
 
+    unbalanced: int = field(default=0, kw_only=True)
+    """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
+
     @property
     def lines(self) -> tuple[ArmSummary, ...]:
         """All lines of the table: arms, then baselines."""
@@ -137,7 +140,12 @@ class Summary:
 
     def remarks(self) -> tuple[str, ...]:
         """Return further sentences that a reader of the tables needs."""
-        return ()
+        if not self.unbalanced:
+            return ()
+        return (
+            f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its text "
+            "may give its answer away. Scores cannot be compared with those of balanced questions.",
+        )
 
     def utility(self, arm: str) -> Utility:
         """Return an arm's utility: its share of the gain from floor to ceiling."""
@@ -222,7 +230,7 @@ def summarise_run(run: Run) -> Summary:
     config = run.store.config
     policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
     episodes = run.store.episodes()
-    return summarise(
+    found = summarise(
         run.arms,
         run.store.outcomes(),
         len(episodes),
@@ -232,6 +240,12 @@ def summarise_run(run: Run) -> Summary:
         twins=find_twins(episodes),
         judge=run.store.judge,
     )
+    return replace(found, unbalanced=count_unbalanced(run))
+
+
+def count_unbalanced(run: Run) -> int:
+    """Return the episodes whose question is asked in one scene only."""
+    return sum(bool(episode.info.get("unbalanced")) for episode in run.store.episodes())
 
 
 def arm_table(run: Run) -> Records:

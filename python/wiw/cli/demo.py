@@ -30,8 +30,11 @@ class Part:
     """A command for more of the same."""
     options: dict[str, Any] = field(default_factory=dict)
     """Of the task."""
+    requires: Requirements = field(default_factory=Requirements)
+    """What the policy needs."""
 
 
+TORCH = Requirements(("torch", "safetensors"), "torch")
 PARTS = (
     Part(
         "imagenav",
@@ -41,6 +44,26 @@ PARTS = (
         "An agent looks for the place where a photograph was taken: 4 episodes in 2 generated apartments",
         "wiw run imagenav --arms none,copy,warpnet,warp,oracle --episodes 100",
         {"scenes": "apartments:val:2", "per_scene": 2},
+    ),
+    Part(
+        "ar",
+        "recogniser",
+        ("none", "warp", "oracle"),
+        4,
+        "An agent looks at an object from other sides until it recognises it: 4 episodes in 2 generated apartments",
+        "wiw run ar --arms none,copy,warp,oracle --episodes 100",
+        {"scenes": "apartments:val:2", "per_scene": 2},
+        TORCH,
+    ),
+    Part(
+        "aeqa",
+        "explorer",
+        ("none", "oracle"),
+        4,
+        "An agent explores a home until it can answer a question about it: 4 questions in 2 generated apartments",
+        "wiw run aeqa --arms none,warp,oracle --episodes 100",
+        {"scenes": "apartments:val:2", "per_scene": 2},
+        TORCH,
     ),
     Part(
         "manipulation",
@@ -60,7 +83,9 @@ WORKERS = 2
 
 
 def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
-    """Image-Goal Navigation in generated apartments and a robot arm at a table, with several world models each.
+    """All four tasks, with several world models each: three in generated apartments, and a robot arm at a table.
+
+    Image-Goal Navigation, Active Recognition, Active Embodied Question Answering, Robotic Manipulation.
 
     Before each decision an agent imagines where its candidate plans would lead: not at all (none), into a world where
     nothing moves (copy, the floor), into what a small network makes of its view (warpnet; needs torch), into its view
@@ -73,15 +98,27 @@ def demo(*, out: Annotated[Path | None, arg(metavar="DIR")] = None) -> int:
     """
     begin = time.perf_counter()
     folder = out or Path("runs") / f"demo-{datetime.now():%Y%m%d-%H%M%S}"
-    codes = [_run(part, folder / part.task) for part in PARTS]
+    parts = [part for part in PARTS if _can_run(part)]
+    codes = [_run(part, folder / part.task) for part in parts]
     print(f"\ntook    {time.perf_counter() - begin:.0f} s\n")
     _print_wrapped(f"Open these pages in a browser. {READY}")
-    for part in PARTS:
+    for part in parts:
         print(f"        {folder / part.task / 'report.html'}")
     print("\nMore episodes say more:")
-    for part in PARTS:
+    for part in parts:
         print(f"        {part.more}")
     return max(codes)
+
+
+def _can_run(part: Part) -> bool:
+    """Return whether a part's policy can run here; say what is missing otherwise."""
+    if missing := part.requires.missing():
+        _print_left_out(f"{part.task} with policy {part.policy}", missing, part.requires.extra)
+    return not missing
+
+
+def _print_left_out(what: str, missing: list[str], extra: str) -> None:
+    print(f"{what} is left out: {', '.join(missing)} not installed (pip install 'wiw[{extra}]')\n")
 
 
 def _print_wrapped(text: str) -> None:
@@ -116,7 +153,7 @@ def _arms(names: tuple[str, ...]) -> list[str]:
     for name in names:
         requires = getattr(WORLD_MODELS.find(name), "requires", Requirements())
         if missing := requires.missing():
-            print(f"{name} is left out: {', '.join(missing)} not installed (pip install 'wiw[{requires.extra}]')\n")
+            _print_left_out(name, missing, requires.extra)
         else:
             arms.append(name)
     return arms

@@ -21,6 +21,7 @@ def episodes(
     per_scene: Annotated[int | None, arg(metavar="N")] = None,
     seed: Annotated[int, arg(metavar="N")] = 0,
     backend: Literal["auto", "cpu", "gpu"] | None = None,
+    attributes: Annotated[Path | None, arg(metavar="FILE")] = None,
     task_option: Options = (),
     overwrite: bool = False,
 ) -> int:
@@ -29,6 +30,7 @@ def episodes(
     $ wiw episodes imagenav --scenes apartments:val:20 --episodes 100 --out val.json.gz
     $ wiw episodes imagenav --scenes house.glb --per-scene 10 --episodes 10 --out house.json
     $ wiw run imagenav --episode-file house.json --world-model warp
+    $ wiw episodes aeqa --scenes house.world --attributes house.json --episodes 40 --out house_questions.json
     $ wiw episodes ar --task-option categories=bed,sofa,desk --out three.json
 
     Scenes inside the file's folder are named by relative paths, so that the folder can be moved or shared.
@@ -42,6 +44,8 @@ def episodes(
         per_scene: Episodes per scene; the task's own number if not given.
         seed: Seed; with the scenes, it determines the episodes.
         backend: Renderer, for checking that goals are out of sight; auto if not given.
+        attributes: For aeqa and a scene from a file: JSON of what more is known of its instances, by their names, such
+            as {"Desk_01": {"color": "brown", "state": "open"}}.
         task_option: Another option of the task, such as categories=bed,sofa or, for scans, goal_instances=1; may be
             given again.
         overwrite: Whether to replace an existing file.
@@ -52,7 +56,8 @@ def episodes(
 
     if out.exists() and not overwrite:
         raise ArgumentError(f"{out} is there already; give --overwrite to replace it, or another name with --out")
-    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene}
+    more = {} if attributes is None else {"attributes": str(attributes)}
+    flags = {"scenes": scenes, "seed": seed, "backend": backend, "per_scene": per_scene, **more}
     made = TASKS.make(task, **task_options(task, task_option, flags))
     if made.file_header is None:
         raise ArgumentError(
@@ -69,5 +74,7 @@ def episodes(
     print(
         f"{len(found)} episodes in {places} scene{'s' if places > 1 else ''}, {lengths[0]:.1f} to {lengths[-1]:.1f} m"
     )
+    for remark in made.explain_episodes(found):
+        print(remark)
     print(f"episodes  {out}")
     return 0

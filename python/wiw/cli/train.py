@@ -238,9 +238,9 @@ def _train_perception(
     from wiw.training.labelled_views import HELD_OUT_FIELD, ViewRules
 
     rules, recipe = ViewRules(**rule_options), training.Recipe(seed=data.seed, **recipe_options)
-    views = gather_views(data.scenes, data.seed, rules, **data.gathering)
+    views = gather_views(data.scenes, data.seed, rules, **data.gathering, change=True)
     held_out_rules = replace(rules, fields=(HELD_OUT_FIELD, HELD_OUT_FIELD))
-    held_out = gather_views(data.val, data.seed, held_out_rules, **data.gathering)
+    held_out = gather_views(data.val, data.seed, held_out_rules, **data.gathering, change=True)
     card: dict[str, Any] = {"scenes": data.scenes, "val": data.val, "views": len(views), "sampling": asdict(rules)}
     identity = {**card, "recipe": asdict(recipe), "minutes": minutes}
     checkpoint = Checkpoint(out.with_name(f"{out.name}.checkpoint"), identity)

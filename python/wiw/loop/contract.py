@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -141,6 +141,24 @@ def check_answers(policy: Policy, answers: Any, situations: Sequence[Situation])
         elif situation.goal.choices or answer is not None:
             _check_choice(name, answer, situation.goal.choices)
     return list(answers)
+
+
+def check_pictures(policy: Policy, pictures: Any) -> dict[str, NDArray[np.uint8]]:
+    """Return the pictures of a policy, uint8 [H, W, 3] by name.
+
+    Raises:
+        ContractError: an array of another shape, or a name that is no identifier.
+    """
+    name = f"{type(policy.unwrapped).__name__}.draw"
+    if not isinstance(pictures, Mapping):
+        raise ContractError(f"{name}: expected pictures by name, got {type(pictures).__name__}")
+    for title, picture in pictures.items():
+        if not isinstance(title, str) or not title.isidentifier():
+            raise ContractError(f"{name}: expected names of letters, digits and underscores, got {title!r}")
+        image = np.asarray(picture)
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+            raise ContractError(f"{name}: expected '{title}' as uint8 [H, W, 3], got {image.dtype} {list(image.shape)}")
+    return dict(pictures)
 
 
 def _check_choice(name: str, answer: Any, choices: tuple[str, ...]) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.loop.config import AgentConfig
-from wiw.loop.contract import check_answers, check_depth, check_proposals, check_scores
+from wiw.loop.contract import check_answers, check_depth, check_pictures, check_proposals, check_scores
 from wiw.loop.imagination import Imagination, Imaginer, ModelInput, NoImagination, Request
 from wiw.loop.ledger import Ledger
 from wiw.loop.memory import EpisodeMemories, Query
@@ -165,7 +165,14 @@ class DecisionPass:
         )
         for observer in self._parts.observers:
             decision = observer.annotate(decision)
-        return decision
+        return decision if query.north is None else self._add_pictures(episode, decision, query.north)
+
+    def _add_pictures(self, episode: int, decision: Decision, north: float) -> Decision:
+        """Let the policies draw what they believe. Of pictures of one name that of the reviser is kept."""
+        pictures: dict[str, NDArray[np.uint8]] = {}
+        for policy, situations in zip(self._policies(), (self._proposing, self._revising), strict=False):
+            pictures |= check_pictures(policy, policy.draw(situations[episode], decision, north))
+        return replace(decision, pictures=pictures)
 
     def _choose(
         self, episode: int, plans: Sequence[Proposal], scores: NDArray[np.float64]

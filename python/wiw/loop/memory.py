@@ -25,6 +25,10 @@ class Query:
     observation: Observation | ArmObservation
     goal: Goal
     key: Key
+    north: float | None = None
+    """Azimuth, in the frame of the start, of what is up on maps of the scene. None: no pictures are kept of this
+    decision. No decision depends on it: it is for `Policy.draw` alone.
+    """
 
 
 def read_observation(observation: Any) -> Observation | ArmObservation:

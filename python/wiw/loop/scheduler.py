@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
@@ -43,12 +43,14 @@ class LiveEpisode:
     key: Key
     observation: Any
     begin: float
+    north: float | None = None
+    """See `Query`."""
     decisions: int = 0
     done: bool = field(default=False)
 
     def query(self) -> Query:
         """Return the episode's query to the agent."""
-        return Query(self.observation, self.env.goal, self.key.at(self.decisions))
+        return Query(self.observation, self.env.goal, self.key.at(self.decisions), self.north)
 
     def carry_out(self, decision: Decision) -> DecisionRecord:
         """Execute the decision's first segment and observe."""
@@ -74,8 +76,11 @@ def run_episodes(
     seed: int,
     live: int = 4,
     sink: Sink,
+    pictured: Collection[int] = (),
 ) -> None:
     """Run (index, episode) pairs to their ends, at most `live` at a time.
+
+    Policies draw what they believe in the episodes whose index is in `pictured`.
 
     An exception in an episode is infrastructure: the episode is recorded as an error and the rest go on. One in a batch
     may be due to any of its episodes, so each of them is run again by itself, after the others: what breaks does not
@@ -89,9 +94,9 @@ def run_episodes(
     try:
         while waiting or running or suspects:
             while waiting and envs:
-                running += _start(waiting.popleft(), envs, seed, sink)
+                running += _start(waiting.popleft(), envs, seed, sink, pictured)
             if not running and not waiting and suspects:
-                running += _start(suspects.popleft(), envs, seed, sink)
+                running += _start(suspects.popleft(), envs, seed, sink, pictured)
             for each in running:
                 environments.add(each.key, each.env)
             suspects += _advance(agent, running, sink)
@@ -105,20 +110,23 @@ def run_episodes(
             env.close()
 
 
-def _start(item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink) -> list[LiveEpisode]:
+def _start(
+    item: tuple[int, Episode], envs: list[Any], seed: int, sink: Sink, pictured: Collection[int]
+) -> list[LiveEpisode]:
     """Begin an episode in one of the free environments; return it, unless it could not begin."""
     index, episode = item
     begin = time.perf_counter()
     env = envs.pop()
     try:
         observation = env.begin(episode)
+        north = -float(env.truth().yaw) if index in pictured else None
     except BaseException as error:  # whatever went wrong, the run goes on and the record says so
         if is_stop_request(error):
             raise
         envs.append(env)
         sink.episode(_build_error_result(index, episode, begin, "environment", error))
         return []
-    return [LiveEpisode(index, episode, env, Key(seed, index), observation, begin)]
+    return [LiveEpisode(index, episode, env, Key(seed, index), observation, begin, north)]
 
 
 def _advance(agent: Agent, running: list[LiveEpisode], sink: Sink) -> list[tuple[int, Episode]]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from wiw.errors import ArgumentError
 from wiw.mapping.views import Views, unproject
@@ -24,6 +25,10 @@ DEPTH_STEP = 0.06
 STRIDE_PIXELS = (600, 8000)
 STRIDES = (1, 2, 4)
 """Rows and columns between the pixels that are looked at, in fragments of up to 600, up to 8000, and more pixels."""
+SPARSE = 100
+"""Voxels of a thing below which what is seen of it from above is widened by one, so that gaps of 0.1 m are closed."""
+SCRAP = 0.15
+"""Share of the largest part's voxels below which a part is none."""
 _OFFSET = 1 << 15
 _SHIFT = 16
 
@@ -136,6 +141,40 @@ def unpack_voxels(keys: NDArray[np.int64]) -> NDArray[np.float64]:
     mask = (1 << _SHIFT) - 1
     cells = np.stack([keys >> 2 * _SHIFT, (keys >> _SHIFT) & mask, keys & mask], axis=1)
     return (cells - _OFFSET + 0.5) * VOXEL
+
+
+def split_voxels(keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """Return the parts of a thing that stand apart as seen from above, the largest first.
+
+    What stands apart on the floor, or in its upper third, as the backs of chairs do; the rest joins the nearest part.
+
+    Args:
+        keys: sorted keys of its voxels.
+    """
+    points = unpack_voxels(keys)
+    low, high = points[:, 2].min(), points[:, 2].max()
+    whole, upper = (_find_parts(points[points[:, 2] >= level]) for level in (low, low + (high - low) * 2 / 3))
+    parts = max(whole, upper, key=len)
+    if len(parts) < 2:
+        return [keys]
+    away = np.stack([cKDTree(part).query(points[:, :2])[0] for part in parts])
+    owner = away.argmin(axis=0)
+    found = [keys[owner == number] for number in range(len(parts))]
+    return sorted(found, key=lambda own: (-len(own), int(own[0])))
+
+
+def _find_parts(points: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Return the points [n, 2] of each part that stands apart as seen from above, scraps left out."""
+    cells = np.floor(points[:, :2] / VOXEL).astype(np.intp)
+    cells -= cells.min(axis=0) - 1
+    plan = np.zeros(cells.max(axis=0) + 2, np.uint8)
+    plan[cells[:, 0], cells[:, 1]] = 1
+    if len(points) < SPARSE:
+        plan = cv2.dilate(plan, np.ones((3, 3), np.uint8))
+    _, labels = cv2.connectedComponents(plan, connectivity=8)
+    part = labels[cells[:, 0], cells[:, 1]]
+    counts = np.bincount(part)
+    return [points[part == number, :2] for number in np.flatnonzero(counts >= max(1.0, SCRAP * counts.max()))]
 
 
 def _check_labels(views: Views, labels: Labels, categories: int) -> NDArray[np.uint8]:

@@ -23,6 +23,10 @@ LEAST_SHARE = 0.002
 """Share of a view that a landmark fills at least, in one of them."""
 OPENING_IDS = 1_000_000
 """Landmarks' ids above this are those of openings."""
+BESIDE = 0.8
+"""Metres from the edge of an object within which the agent is beside it: less than `VISITED`, whichever side it is."""
+BEHIND = 0.6
+"""Metres behind an opening to which a way through it leads."""
 _SLACK = 0.15
 
 
@@ -39,6 +43,15 @@ class Landmark:
     """Its pixels, bool [H, W], by number of the view; only views that show it."""
     distance: float
     """Horizontal metres from the agent to its nearest point."""
+    radius: float = 0.25
+    """Metres around `destination` within which a way to it ends."""
+    behind: NDArray[np.float64] | None = None
+    """float64 [2]: a place on the other side of an opening; None for objects."""
+
+    @property
+    def destination(self) -> NDArray[np.float64]:
+        """float64 [2]: where a way to it leads, up to an object or through an opening."""
+        return self.position[:2] if self.behind is None else self.behind
 
     @property
     def view(self) -> int:
@@ -78,7 +91,8 @@ def _find_objects(views: Views, owners: NDArray[np.int32], objects: ObjectMap) -
         thing = objects[number]
         masks = {view: owners[view] == number for view in range(len(VIEW_NAMES)) if counts[view, number]}
         away = float(np.linalg.norm(thing.points[:, :2] - views.odometry[:2], axis=1).min())
-        found.append(Landmark(number, thing.category, thing.center, masks, away))
+        radius = float(thing.extent[:2].min()) / 2 + BESIDE
+        found.append(Landmark(number, thing.category, thing.center, masks, away, radius))
     return found
 
 
@@ -94,8 +108,19 @@ def _find_openings(views: Views, openings: Sequence[Opening]) -> list[Landmark]:
         if masks:
             position = np.array([*opening.position, sum(OPENING_HEIGHT) / 2])
             away = float(np.linalg.norm(opening.position - views.odometry[:2]))
-            found.append(Landmark(OPENING_IDS + opening.id, "opening", position, masks, away))
+            behind = find_place_behind(opening, views.odometry)
+            found.append(Landmark(OPENING_IDS + opening.id, "opening", position, masks, away, behind=behind))
     return found
+
+
+def find_place_behind(opening: Opening, odometry: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the place `BEHIND` metres from the middle of an opening, on the side where the agent is not."""
+    along = opening.edges[1] - opening.edges[0]
+    normal = np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
+    away = opening.position - odometry[:2]
+    if abs(float(normal @ away)) < _SLACK:  # the agent stands in it: the way that it is heading
+        away = np.array([np.cos(odometry[2]), np.sin(odometry[2])])
+    return np.asarray(opening.position + np.copysign(BEHIND, normal @ away) * normal)
 
 
 def draw_opening(views: Views, view: int, opening: Opening) -> NDArray[np.bool_]:

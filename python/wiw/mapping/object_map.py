@@ -17,10 +17,12 @@ from wiw.mapping.views import Views
 
 NEAR = 0.15
 """Metres within which voxels count as overlapping."""
+SMALL = 0.4
+"""Metres of the longest side up to which things must fill the same space to be one: cups stand close together."""
 OVERLAP = 0.2
 """Share of the voxels of a fragment, or of an object, that must overlap for both to be one thing."""
 SAME_SPACE = 0.075
-"""Metres within which voxels of two confusable categories count as overlapping."""
+"""Metres within which voxels of small things, or of two confusable categories, count as overlapping."""
 CONFUSABLE_OVERLAP = 0.5
 """The same, both ways, for two categories that are only confusable: a cup beside a vase remains a cup."""
 SAMPLE = 128
@@ -317,7 +319,8 @@ def measure_overlap(one: MapObject, other: MapObject, mutual: bool = False) -> f
 
     `mutual`: if that is less, so that both must fill the same space.
     """
-    reach = SAME_SPACE if mutual else NEAR
+    small = max(float(thing.extent.max()) for thing in (one, other)) <= SMALL
+    reach = SAME_SPACE if mutual or small else NEAR
     shares = _measure_share(one, other, reach), _measure_share(other, one, reach)
     return min(shares) if mutual else max(shares)
 

@@ -93,7 +93,8 @@ class OccupancyGrid:
         before = int(self.known.sum())
         self._grow(np.asarray(odometry[:2]), float(flat[usable].max(initial=0.0)))
         self._observe_ceiling(height[usable])
-        high = usable & (height > self.ceiling - CEILING_BAND[0]) & (height < self.ceiling - CEILING_BAND[1])
+        upright = np.abs(np.diff(height, axis=0, append=0)) > np.abs(np.diff(flat, axis=0, append=0))
+        high = upright & usable & (height > self.ceiling - CEILING_BAND[0]) & (height < self.ceiling - CEILING_BAND[1])
         for mask, layer in ((solid, self.occupied), (ground, self.free), (high, self.walls)):
             rows, columns = np.nonzero(mask)
             layer[self._place(odometry, flat[rows, columns], azimuth[columns])] = True

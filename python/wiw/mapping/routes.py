@@ -9,6 +9,7 @@ to be free.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -239,6 +240,28 @@ def _simulate(pose: NDArray[np.float64], actions: list[Any], reached: bool) -> R
     poses[1:, 1] = pose[1] + np.cumsum(ahead * np.sin(heading))
     poses[1:, 2] = (heading + np.pi) % (2 * np.pi) - np.pi
     return Route(ids, poses, reached)
+
+
+def find_refused(
+    pose: NDArray[np.float64], actions: Sequence[int] | NDArray[np.int8], end: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Return the pose at which a step forward was first refused on a walk, None if none was.
+
+    Args:
+        pose: x, y, azimuth before the walk.
+        actions: primitives of the walk, the refused ones included.
+        end: x, y, azimuth after the walk.
+    """
+    found = _simulate(pose, list(actions), True)
+    if np.hypot(*(found.poses[-1] - end)[:2]) < STEP / 4:
+        return None
+    ahead = [i for i, action in enumerate(actions) if int(action) == int(FORWARD)]
+    misses = []
+    for first in ahead:  # what refuses a step refuses those after it, until the agent turns
+        last = next((i for i in range(first, len(actions)) if int(actions[i]) != int(FORWARD)), len(actions))
+        carried = [*actions[:first], *actions[last:]]
+        misses.append(float(np.hypot(*(_simulate(pose, carried, True).poses[-1] - end)[:2])))
+    return found.poses[ahead[int(np.argmin(misses))]] if misses else None
 
 
 def _open_cells(grid: OccupancyGrid, pose: NDArray[np.float64], squeeze: bool = False) -> NDArray[np.bool_]:

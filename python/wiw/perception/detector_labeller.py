@@ -50,7 +50,13 @@ class DetectorLabeller(Labeller):
         self.needs = tuple(sorted({*self.detector.needs, *self.segmenter.needs}))
         self.privileged = bool(self.needs)
 
-    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
+    def compute_labels(
+        self,
+        images: NDArray[np.uint8],
+        hfov_deg: float,
+        ids: NDArray[np.uint32] | None,
+        depth: NDArray[np.float32] | None,
+    ) -> SceneLabels:
         """Detect, segment and paint."""
         detections = [
             found.take(np.flatnonzero(found.scores >= self.least_score))

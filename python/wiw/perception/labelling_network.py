@@ -2,7 +2,7 @@
 """The network of the learned labeller: a U-Net that gives each second pixel of a view category and state logits.
 
 Its input is a view in a fixed angular resolution, with the direction of each pixel beside its colours, so that it
-serves any field of view: on a level camera the row says how high things are.
+serves any field of view: on a level camera the row says how high things are. Depth, where it is known, says how large.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ MULTIPLE = 16
 """The input's sides are multiples of this."""
 STRIDE = 2
 """Input pixels per output pixel."""
+CHANNELS = 8
+"""Of the input; see `to_network_input`."""
 
 
 class Network(nn.Module):
@@ -52,7 +54,7 @@ class Network(nn.Module):
 
         self.down = nn.ModuleList(
             [
-                block(5, a, a, stride=2),
+                block(CHANNELS, a, a, stride=2),
                 block(a, b, b, stride=2),
                 block(b, c, c, c, stride=2),
                 block(c, d, d, d, stride=2),
@@ -67,7 +69,7 @@ class Network(nn.Module):
         """Return category logits [B, categories, H/2, W/2] and state logits [B, states, H/2, W/2].
 
         Args:
-            views: float [B, 5, H, W]; see `to_network_input`.
+            views: float [B, CHANNELS, H, W]; see `to_network_input`.
         """
         logits = self.head(self.compute_features(views)[-1])
         return logits[:, : self.categories], logits[:, self.categories :]
@@ -144,17 +146,37 @@ def resize_view(view: NDArray[np.uint8], size: InputSize) -> NDArray[np.uint8]:
     )
 
 
-def to_network_input(views: NDArray[np.uint8], tangents: NDArray[np.float32]) -> Tensor:
-    """Return float [B, 5, H, W], channels last: colours from -1 to 1, and directions.
+def resize_depth(depth: NDArray[np.float32], size: InputSize) -> NDArray[np.float32]:
+    """Pick the depth [H, W] in the middle of each pixel of the network's size; edges are not blurred."""
+    rows, columns = (
+        (np.arange(new) * 2 + 1) * old // (2 * new)
+        for new, old in zip((size.height, size.width), depth.shape, strict=True)
+    )
+    return depth[rows[:, None], columns]
+
+
+def to_network_input(
+    views: NDArray[np.uint8], tangents: NDArray[np.float32], depth: NDArray[np.float32] | None = None
+) -> Tensor:
+    """Return float [B, CHANNELS, H, W], channels last.
+
+    The channels are colours from -1 to 1, directions, and of what is seen the logarithm of its planar depth, its height
+    above the camera in metres, and whether these two are known; they are 0 where not.
 
     Args:
         views: uint8 [B, H, W, 3] in the network's size.
         tangents: float32 [B or 1, H, W, 2]; see `compute_tangents`.
+        depth: float32 [B, H, W]: planar, in metres; 0 where unknown. None means unknown everywhere.
     """
-    made = np.empty((*views.shape[:3], 5), np.float32)
+    made = np.zeros((*views.shape[:3], CHANNELS), np.float32)
     np.multiply(views, 1 / 127.5, out=made[..., :3])
     made[..., :3] -= 1
-    made[..., 3:] = tangents
+    made[..., 3:5] = tangents
+    if depth is not None:
+        known = depth > 0
+        made[..., 5] = np.log(depth, where=known, out=np.zeros_like(depth, np.float32))
+        made[..., 6] = depth * tangents[..., 1]
+        made[..., 7] = known
     return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 

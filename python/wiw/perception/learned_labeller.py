@@ -73,7 +73,13 @@ class LearnedLabeller(Labeller):
             "torch": torch.__version__,
         }
 
-    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
+    def compute_labels(
+        self,
+        images: NDArray[np.uint8],
+        hfov_deg: float,
+        ids: NDArray[np.uint32] | None,
+        depth: NDArray[np.float32] | None,
+    ) -> SceneLabels:
         """Run the network on each view."""
         size = (images.shape[1], images.shape[2])
         labels = SceneLabels(
@@ -86,23 +92,29 @@ class LearnedLabeller(Labeller):
             _map_pixels(pixels, side) for pixels, side in zip(size, (input_size.height, input_size.width), strict=True)
         )
         for view, image in enumerate(images):
-            category, confidence, state = self._label_view(image, input_size, tangents)
+            distances = None if depth is None else depth[view]
+            category, confidence, state = self._label_view(image, distances, input_size, tangents)
             labels.category[view] = category[rows[:, None], columns]
             labels.confidence[view] = confidence[rows[:, None], columns]
             labels.state[view] = state[rows[:, None], columns]
         return labels
 
     def _label_view(
-        self, image: NDArray[np.uint8], input_size: InputSize, tangents: NDArray[np.float32]
+        self,
+        image: NDArray[np.uint8],
+        depth: NDArray[np.float32] | None,
+        input_size: InputSize,
+        tangents: NDArray[np.float32],
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
         """Return category, confidence and state of one view, in the network's size."""
         import torch
 
-        from wiw.perception.labelling_network import resize_view, to_network_input
+        from wiw.perception.labelling_network import resize_depth, resize_view, to_network_input
 
         shown = resize_view(np.ascontiguousarray(image), input_size)
+        distances = None if depth is None else resize_depth(depth, input_size)[None]
         with torch.inference_mode(), single_thread():
-            category_logits, state_logits = self._network(to_network_input(shown[None], tangents[None]))
+            category_logits, state_logits = self._network(to_network_input(shown[None], tangents[None], distances))
             confidence, category = category_logits[0].permute(1, 2, 0).softmax(dim=2).max(dim=2)
             places = category.numpy()
             states = state_logits[0].permute(1, 2, 0).numpy()

@@ -42,7 +42,13 @@ class OracleLabeller(Labeller):
             self._category[instance] = numbers.get(name, 0)
             self._state[instance] = STATES.index(states[instance]) if states[instance] in STATES else 0
 
-    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
+    def compute_labels(
+        self,
+        images: NDArray[np.uint8],
+        hfov_deg: float,
+        ids: NDArray[np.uint32] | None,
+        depth: NDArray[np.float32] | None,
+    ) -> SceneLabels:
         """Look up each pixel's instance."""
         assert ids is not None
         if ids.size and int(ids.max()) >= len(self._category):

@@ -58,26 +58,42 @@ class Labeller(ABC):
     """Whether it knows what no sensor of the agent measures."""
 
     @abstractmethod
-    def compute_labels(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None) -> SceneLabels:
+    def compute_labels(
+        self,
+        images: NDArray[np.uint8],
+        hfov_deg: float,
+        ids: NDArray[np.uint32] | None,
+        depth: NDArray[np.float32] | None,
+    ) -> SceneLabels:
         """Return the labels of at least one view; `ids` is None unless the labeller needs it."""
 
-    def label(self, images: NDArray[np.uint8], hfov_deg: float, ids: NDArray[np.uint32] | None = None) -> SceneLabels:
+    def label(
+        self,
+        images: NDArray[np.uint8],
+        hfov_deg: float,
+        ids: NDArray[np.uint32] | None = None,
+        depth: NDArray[np.float32] | None = None,
+    ) -> SceneLabels:
         """Label each pixel of each view. A view's labels do not depend on the other views.
 
         Args:
             images: uint8 [N, H, W, 3]: perspective views with square pixels, cameras level.
             hfov_deg: their horizontal field of view in degrees, between the outer edges of the outer pixels.
             ids: uint32 [N, H, W]: the simulator's instance ids, for labellers that need them; others never see them.
+            depth: float32 [N, H, W]: planar depth in metres, 0 where it is unknown; None for views without, such as
+                imagined ones. A labeller may do without.
 
         Raises:
             ArgumentError: arrays of other shapes or types, a field of view out of range, or missing ids.
             ContractError: the labeller's result has another shape or type.
         """
         ids = self._check_views(images, hfov_deg, ids)
+        if depth is not None and (depth.dtype != np.float32 or depth.shape != images.shape[:3]):
+            raise ArgumentError(f"label: expected depth float32 {images.shape[:3]}, got {depth.dtype} {depth.shape}")
         if not len(images):
             empty = np.zeros(images.shape[:3], np.uint8)
             return SceneLabels(empty, empty.astype(np.float32), empty.copy())
-        found = self.compute_labels(images, float(hfov_deg), ids)
+        found = self.compute_labels(images, float(hfov_deg), ids, depth)
         self._check_labels(found, images.shape[:3])
         return found
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.errors import ContractError
-from wiw.types import PRIMITIVES, Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import PRIMITIVES, Answer, Decision, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,20 @@ class Policy(ABC):
         Called on the revising policy once per decision, with what is seen and what was imagined. Default: no answer.
         """
         return [None] * len(situations)
+
+    def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
+        """Return pictures of what the policy believes, uint8 [H, W, 3] by name; default: none.
+
+        Called once after each decision of an episode whose record keeps pictures, and in no other. It must not change
+        the memory: a run with pictures decides as one without.
+
+        Args:
+            situation: as at the decision; its memory is up to date.
+            decision: as it was made.
+            north: azimuth, in the frame of the episode's start, of what is up on maps of the scene, so that a map can
+                be drawn as they are. It comes from the environment, so nothing but pictures may depend on it.
+        """
+        return {}
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
         """Return the language model's exchanges of this decision, once; empty without a language model."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Answer, Decision, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 
 
 class PolicyWrapper(Policy):
@@ -78,6 +78,10 @@ class PolicyWrapper(Policy):
     ) -> Sequence[Answer | TextAnswer | None]:
         """See `Policy.answer`."""
         return self.inner.answer(situations, proposals, rollouts)
+
+    def draw(self, situation: Situation, decision: Decision, north: float) -> Mapping[str, NDArray[np.uint8]]:
+        """See `Policy.draw`."""
+        return self.inner.draw(situation, decision, north)
 
     def exchanges(self, key: Key) -> tuple[Exchange, ...]:
         """See `Policy.exchanges`."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from wiw.analysis.blame import read_blame
 from wiw.report import cuts
+from wiw.report.beliefs import list_beliefs, list_expected, read_verdict
 from wiw.report.maps import (
     MapFrame,
     Trail,
@@ -71,7 +72,7 @@ def read_story(
     frame, picture = (None, None) if poses else _map(store, episode, rows, maps, album)
     shots = dict[str, Picture]()
     attempts = tuple(
-        _attempt(store, frame, outcome, decisions[arm], shots, album, f"{index}-{number}")
+        _attempt(store, frame, episode, outcome, decisions[arm], shots, album, f"{index}-{number}")
         for number, (arm, outcome) in enumerate(outcomes.items())
     )
     goal = next((found for arm in outcomes if (found := store.images(arm, index, 0).get("goal"))), None)
@@ -106,6 +107,7 @@ def wording(store: RunStore) -> Wording:
 def _attempt(
     store: RunStore,
     frame: MapFrame | None,
+    episode: Episode,
     outcome: Mapping[str, Any],
     decisions: list[dict[str, Any]],
     shots: dict[str, Picture],
@@ -115,9 +117,10 @@ def _attempt(
     """Return one arm's run of an episode; add the images of a gripper's camera to `shots`."""
     arm, index = outcome["arm"], outcome["episode"]
     stage, steps, end = stage_of(store.info), list[Step](), ""
-    for row, way in zip(decisions, plan_views(decisions, stage), strict=True):
+    beliefs = list_beliefs(decisions, list_expected(episode))
+    for row, way, belief in zip(decisions, plan_views(decisions, stage), beliefs, strict=True):
         number, images = row["decision"], store.images(arm, index, row["decision"])
-        made = step(row, images, way, album, f"{name}-{number}")
+        made = step(row, images, way, album, f"{name}-{number}", belief)
         if made.shot and made.seen:
             shots[made.shot] = made.seen
         if "end" in images:
@@ -134,6 +137,7 @@ def _attempt(
         store.config.get("task", {}).get("categories", ()),
         album.put(f"{name}-film", "webp", film) if film else None,
         end,
+        read_verdict(outcome["details"]),
     )
 
 

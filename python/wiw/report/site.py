@@ -15,6 +15,7 @@ from typing import Any
 
 from wiw._core import core
 from wiw.files import atomic_folder
+from wiw.report.beliefs import read_verdict
 from wiw.report.episodes import outcomes_by_episode, read_story, title, wording
 from wiw.report.plots import arm_colors
 from wiw.report.story import Album, Picture, Story, final_answer, place, where
@@ -27,6 +28,7 @@ class PictureFolder(Album):
     """An album whose pictures are files in a folder, each written once, by a pool of threads."""
 
     panorama_width, frame_height, quality = 1024, 132, 60
+    belief_width, belief_quality, belief_count = 760, 75, None
     front_side, end_side, goal_side, map_side, whole = 480, 160, 480, 1100, True
 
     def __init__(self, folder: Path, pool: Executor) -> None:
@@ -179,6 +181,7 @@ def _common(run: Run) -> dict[str, Any]:
         "words": wording(run.store),
         "choices": task.get("categories", ()),
         "judge": run.store.judge,
+        "judged": "judge" in task,
     }
 
 
@@ -202,7 +205,14 @@ def _cell(arm: str, outcome: Mapping[str, Any] | None, words: Wording, choices: 
         return Cell(arm, "open", "to run", "not run yet")
     if outcome["status"] == "error":
         return Cell(arm, "error", "error", "infrastructure error, excluded from scores")
-    metrics = outcome["metrics"]
+    verdict = read_verdict(outcome["details"])
+    if verdict is not None:
+        state = "success" if outcome["metrics"].get("success") else "failure"
+        return Cell(arm, state, verdict.answer or "no answer", f"{verdict.text}; its answer")
+    return _cell_of_numbers(arm, outcome["metrics"], words, choices)
+
+
+def _cell_of_numbers(arm: str, metrics: Mapping[str, Any], words: Wording, choices: Sequence[str]) -> Cell:
     count = f"{metrics['decisions']:.0f}" if "decisions" in metrics else ""
     if metrics.get("success"):
         return Cell(arm, "success", count, f"{words.won}; number of decisions")

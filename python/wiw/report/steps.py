@@ -10,12 +10,24 @@ from typing import Any
 
 import numpy as np
 
+from wiw.report import cuts
+from wiw.report.beliefs import Belief
 from wiw.report.plans import Poses, Primitives
-from wiw.report.story import Album, Candidate, Step
+from wiw.report.story import Album, Candidate, Picture, Step
 from wiw.runs.rows import select_frames
 
+PREFIX = "believed/"
+"""Of the names of pictures of what the policies believed."""
 
-def step(row: Mapping[str, Any], images: Mapping[str, bytes], way: Primitives | Poses, album: Album, name: str) -> Step:
+
+def step(
+    row: Mapping[str, Any],
+    images: Mapping[str, bytes],
+    way: Primitives | Poses,
+    album: Album,
+    name: str,
+    belief: Belief | None = None,
+) -> Step:
     """Return a decision; `name` makes the names of its pictures unique."""
     seen = images.get(way.view)
     return Step(
@@ -30,9 +42,21 @@ def step(row: Mapping[str, Any], images: Mapping[str, bytes], way: Primitives | 
         _fidelity(row["fidelity"]),
         row["seconds"],
         row["calls"],
-        f"{row['answer']['label']}, {100 * row['answer']['confidence']:.0f} %" if row["answer"] else "",
+        belief.text if belief is not None else "",
         ", ".join(f"{reason} ({count})" for reason, count in Counter(row["refused"]).items()),
         f"shot-{name}" if isinstance(way, Poses) else "",
+        belief=belief,
+        believed=_believed(images, album, name),
+    )
+
+
+def _believed(images: Mapping[str, bytes], album: Album, name: str) -> tuple[tuple[str, Picture], ...]:
+    """Return the pictures of what the policies believed, with their names."""
+    found = {title.removeprefix(PREFIX): image for title, image in images.items() if title.startswith(PREFIX)}
+    size = album.belief_width, album.belief_quality, album.scale
+    return tuple(
+        (title.replace("_", " "), album.draw(f"{name}-believed-{index}", partial(cuts.front, image, *size)))
+        for index, (title, image) in enumerate(list(found.items())[: album.belief_count])
     )
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from wiw.report import cuts
+from wiw.report.beliefs import Belief, Verdict, list_expected
 from wiw.report.maps import MapFrame, Mark, Trail
 from wiw.report.stage import Drawing
 from wiw.types import Episode, Wording
@@ -40,6 +41,10 @@ class Album:
     front_side, end_side = 256, 128
     """Pixels of the front views of a gripper: of real ones, and of imagined ones."""
     goal_side, map_side = 280, 700
+    belief_width, belief_quality = 440, 35
+    """Of pictures of what policies believe, which have lines and letters."""
+    belief_count: int | None = 1
+    """How many of these a decision shows at most; None means all."""
     whole = False
     """Whether imagined futures of a gripper are shown frame by frame, or only their last frames."""
 
@@ -126,6 +131,10 @@ class Step:
     """Why ways of a gripper ended early."""
     shot: str = ""
     """Id of what a gripper's camera saw among the story's shots; empty where plans are not of poses."""
+    belief: Belief | None = None
+    """The same for a timeline."""
+    believed: tuple[tuple[str, Picture], ...] = ()
+    """Pictures of what the policy believed, with their names."""
 
     @property
     def gain(self) -> float:
@@ -148,6 +157,8 @@ class Attempt:
     """Film of the episode; as `Album.put` returns it."""
     end: str = ""
     """Id of what was seen at the end among the story's shots; empty where it was not kept."""
+    verdict: Verdict | None = None
+    """Judgement of the answer in words, where the task asks for one."""
 
     @property
     def success(self) -> bool:
@@ -161,6 +172,8 @@ class Attempt:
             return "infrastructure error, excluded from scores"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
+        if self.verdict is not None:
+            return f"{self.verdict.text}, after {count}"
         if self.success:
             return f"{self.words.won} in {count}"
         due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
@@ -200,6 +213,11 @@ class Story:
     def instruction(self) -> str:
         """Instruction in words, where the task gives one."""
         return str(self.episode.info.get("instruction", ""))
+
+    @property
+    def expected(self) -> tuple[str, ...]:
+        """The answers in words that count as right, where the task is a question."""
+        return list_expected(self.episode) if "question" in self.episode.info else ()
 
     @property
     def way(self) -> str:

@@ -97,7 +97,7 @@ class AgentRecipe(AgentConfig):
         semantics = None if self.model is None else self.semantics  # nobody would look at them
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
-        policy, reviser = (self._make_policy(name, space) for name in (self.policy, self.reviser))
+        policy, reviser = (self._make_policy(name, space, context.task) for name in (self.policy, self.reviser))
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
@@ -203,11 +203,13 @@ class AgentRecipe(AgentConfig):
         kind, scheme, host = self.model.partition("://")
         return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
 
-    def _make_policy(self, policy: Any, space: str) -> Any:
-        """Return a policy with the options of its name; others are made with the agent."""
-        if not isinstance(policy, str) or policy not in self.policy_options:
+    def _make_policy(self, policy: Any, space: str, task: Task) -> Any:
+        """Return a policy with the options of its name, and the task's; others are made with the agent."""
+        sources = (task.policy_options, self.policy_options)
+        if not isinstance(policy, str) or not any(policy in options for options in sources):
             return policy
-        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **self.policy_options[policy]})
+        options = {name: value for own in sources for name, value in own.get(policy, {}).items()}
+        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")

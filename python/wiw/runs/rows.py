@@ -32,7 +32,8 @@ class DecisionRow:
     values: dict[str, Any]
     """The other columns by name."""
     images: dict[str, bytes]
-    """JPEG by name: "panorama" (of a manipulator "front", at last "end"), "goal", "imagined/0" and so on."""
+    """JPEG by name: "panorama" (of a manipulator "front", at last "end"), "goal", "imagined/0" and so on,
+    "believed/map" and whatever else the policies draw."""
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,8 @@ def _images(record: DecisionRecord) -> Iterator[tuple[str, bytes]]:
         yield "end", encode_jpeg(record.end.front)
     if decision.goal is not None and decision.goal.image is not None and record.index == 0:
         yield "goal", encode_jpeg(decision.goal.image)
+    for name, picture in decision.pictures.items():
+        yield f"believed/{name}", encode_jpeg(picture)
     for index, rollout in enumerate(decision.rollouts or ()):
         yield f"imagined/{index}", encode_jpeg(strip(rollout.frames[select_frames(len(rollout.frames))]))
     for index, rollout in enumerate(decision.fidelity.rollouts if decision.fidelity else ()):

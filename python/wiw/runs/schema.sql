@@ -87,7 +87,7 @@ CREATE TABLE image (
     episode INTEGER NOT NULL,
     decision INTEGER NOT NULL,
     name TEXT NOT NULL,             -- panorama | front | end (with the last) | goal (with decision 0) |
-                                    -- imagined/<proposal> | true/<proposal>
+                                    -- imagined/<proposal> | true/<proposal> | believed/<name>
     jpeg BLOB NOT NULL,
     PRIMARY KEY (arm, episode, decision, name)
 );

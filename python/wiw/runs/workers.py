@@ -122,6 +122,7 @@ class Runner:
             seed=self._spec.seed,
             live=self._spec.live,
             sink=sink,
+            pictured=self._spec.pictures,
         )
 
 

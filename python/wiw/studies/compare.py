@@ -12,7 +12,16 @@ from typing import Any
 from wiw.analysis.breakdowns import find_twins
 from wiw.analysis.statistics import adjust_p_values
 from wiw.analysis.statistics import compare as compare_arms
-from wiw.analysis.summary import ArmSummary, Group, Summary, role_of, select_metrics, split_outcomes, summarise
+from wiw.analysis.summary import (
+    ArmSummary,
+    Group,
+    Summary,
+    count_unbalanced,
+    role_of,
+    select_metrics,
+    split_outcomes,
+    summarise,
+)
 from wiw.analysis.utility import Utility
 from wiw.errors import ArgumentError, StoreError
 from wiw.report.tables import SummaryTable
@@ -47,8 +56,8 @@ class Comparison(SummaryTable):
         return (Group(title, f"Gain of {second} over {first}", f"{second} minus {first}", rows),)
 
     def remarks(self) -> tuple[str, ...]:
-        """Return the differences between the agents."""
-        return self.changed
+        """Return what both runs need to be read with, and the differences between the agents."""
+        return (*super().remarks(), *self.changed)
 
 
 def compare(
@@ -117,6 +126,7 @@ def compare(
         both.marks,
         names,
         tuple(line for pair in pairs for line in _describe_changes(first, second, pair)),
+        unbalanced=count_unbalanced(second),
     )
 
 

@@ -3,8 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,15 +15,16 @@ from wiw.datasets.episodes import read_json
 from wiw.datasets.questions import Question, openeqa
 from wiw.datasets.questions.balance import make_episodes
 from wiw.datasets.questions.blind import blind_answer
-from wiw.datasets.questions.generate import EpisodeRules
+from wiw.datasets.questions.generate import EpisodeRules, generate
+from wiw.datasets.questions.mesh_table import NO_ATTRIBUTES, read_attributes
 from wiw.datasets.visibility import COARSE, measure_sizes
-from wiw.datasets.worlds import World
+from wiw.datasets.worlds import World, world
 from wiw.envs.episode_state import EpisodeState
 from wiw.errors import ArgumentError, JudgeError, StoreError, VlmError
 from wiw.judging import Judge, Judgement, make_judge
 from wiw.judging.judge import HIGHEST_MARK
-from wiw.scenes import resolve
-from wiw.tasks.answer_record import CUTS, MARK_METRICS, AnswerRecord, Unanswered, make_reference
+from wiw.scenes import is_generated, resolve
+from wiw.tasks.answer_record import CUTS, MARK_METRICS, AnswerRecord, Unanswered, make_reference, map_mark
 from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
@@ -66,6 +68,8 @@ class AEQA(NavigationTask):
     Args:
         judge: who marks answers, see `wiw.judging.make_judge`: "rules" marks typed questions by rules and all others
             by an approximate score, "rules+llm:URL" asks a language model for those.
+        attributes: JSON file that says more of the instances of a scene from a file, see
+            `wiw.datasets.questions.mesh_table.read_attributes`.
     """
 
     name = "aeqa"
@@ -83,9 +87,17 @@ class AEQA(NavigationTask):
     )
     tables = TableSpec(kinds=("answer_score", "spl"), judged=MARK_METRICS, cuts=CUTS, kind="category")
 
-    def __init__(self, *args: Any, judge: str | Judge = "rules", **options: Any) -> None:
+    def __init__(
+        self, *args: Any, judge: str | Judge = "rules", attributes: str | Path | None = None, **options: Any
+    ) -> None:
         super().__init__(*args, **options)
         self.judge = make_judge(judge)
+        self.attributes = NO_ATTRIBUTES if attributes is None else read_attributes(attributes)
+        if attributes is not None and (self.episode_file or self.is_balanced):
+            raise ArgumentError(
+                "aeqa: attributes=FILE says more of a scene that tells little, such as a house of meshes (scenes=...); "
+                "apartments tell everything, and episodes of a file are asked as they are"
+            )
 
     # -- what it says of itself ----------------------------------------------------------------------------------------
 
@@ -113,11 +125,43 @@ class AEQA(NavigationTask):
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         horizon = self.rules.horizon - 1 + HALF_TURN
-        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": self.rules.execute}
+        execute = min(self.rules.execute, horizon)
+        return {"candidates": self.rules.candidates, "horizon": horizon, "execute": execute}
+
+    @staticmethod
+    def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the same options, with absolute paths and the renderer that "auto" stands for."""
+        made = NavigationTask.make_portable(options)
+        path = made.get("attributes")
+        return made if path is None else {**made, "attributes": str(Path(path).expanduser().absolute())}
+
+    @property
+    def is_balanced(self) -> bool:
+        """Whether generated questions are asked in two scenes at least, so that texts give no answers away."""
+        return is_generated(self.scenes)
+
+    @property
+    def file_header(self) -> dict[str, Any]:
+        """Header of a file of its episodes."""
+        return {**super().file_header, "balanced": self.is_balanced}
 
     def describe(self) -> dict[str, Any]:
         """Return the JSON-able identity: what must be equal for two runs to be comparable."""
-        return {**super().describe(), "judge": self.judge.describe()}
+        more = {"attributes": self.attributes.to_info()} if self.attributes != NO_ATTRIBUTES else {}
+        return {**super().describe(), "judge": self.judge.describe(), "policies": self.policy_options, **more}
+
+    def explain_episodes(self, episodes: Sequence[Episode]) -> list[str]:
+        """Return what unbalanced questions give away."""
+        asked = [read_question(episode) for episode in episodes if episode.info.get("unbalanced")]
+        if not asked:
+            return []
+        references = [make_reference(each) for each in asked]
+        guessed = make_judge("rules").judge(references, [blind_answer(each.text) for each in asked])
+        score = 100 * sum(map_mark(each.mark) for each in guessed) / len(asked)
+        return [
+            "unbalanced: each question is asked in one scene only, so its text may give its answer away; guessing "
+            f"what is most frequent in apartments scores {score:.0f} of 100"
+        ]
 
     # -- episodes ------------------------------------------------------------------------------------------------------
 
@@ -133,8 +177,16 @@ class AEQA(NavigationTask):
         return openeqa.locate_start(place, episode) if episode.info.get("source") == openeqa.SOURCE else episode
 
     def generate_first(self, count: int) -> list[Episode]:
-        """Return questions, each asked in two scenes at least with different answers, from where none is seen."""
+        """Return questions, from where the answer is not in view.
+
+        Of generated apartments each is asked in two at least, with different answers. A scene from a file stands alone:
+        its questions are unbalanced, and their episodes say so (`info["unbalanced"]`).
+        """
         scenes = resolve(self.scenes)
+        if not self.is_balanced:
+            place = world(scenes[0], self.backend)
+            alone = generate(place, count, self.seed, self.generator, attributes=self.attributes)
+            return [_describe(replace(each, info={**each.info, "unbalanced": True})) for each in alone]
         made = make_episodes(scenes, count, self.seed, self.generator, per_scene=self.per_scene, backend=self.backend)
         return [_describe(episode) for episode in made]
 

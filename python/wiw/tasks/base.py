@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from wiw.envs.base import Env
@@ -75,6 +75,11 @@ class Task(ABC):
         return {"candidates": 3, "horizon": 5, "execute": 1}
 
     @property
+    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that named policies are made with on this task, where a run gives no others."""
+        return {}
+
+    @property
     def default_episodes(self) -> int:
         """Default number of episodes of a run."""
         return 20
@@ -88,6 +93,10 @@ class Task(ABC):
     def stage(self) -> dict[str, Any] | None:
         """Where reports draw plans on front views: "camera" and "ground" (see `wiw.report.stage`); None for nowhere."""
         return None
+
+    def explain_episodes(self, episodes: Sequence[Episode]) -> list[str]:
+        """Return sentences that users of some generated episodes must know; default: none."""
+        return []
 
     @property
     def file_header(self) -> dict[str, Any] | None:

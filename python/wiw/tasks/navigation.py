@@ -59,6 +59,7 @@ class NavigationTask(NavigationSpec, Task):
         """Rules that were given as options."""
         owner = presets.find_owner(type(self))
         self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
+        self._policy_options = presets.load_policy_options(owner, preset)
         self._generator_rules = {name: value for name, value in rules.items() if name not in own}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
         self.scenes, self.seed = absolute(scenes), check_seed(seed)
@@ -128,6 +129,11 @@ class NavigationTask(NavigationSpec, Task):
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
+
+    @property
+    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that the preset gives policies."""
+        return self._policy_options
 
     @property
     def file_header(self) -> dict[str, Any]:

@@ -4,6 +4,8 @@
 base: official        # a shipped preset whose rules hold where this file says nothing; `paper` if left out
 about: our long run   # one line for `wiw list`
 decisions: 40
+policies:             # options of policies by name, where the command line gives no others
+  vlm: {history: 0}
 """
 
 from __future__ import annotations
@@ -64,6 +66,25 @@ def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mappi
         ships = f"; give `base: {DEFAULT}`" if list_presets(task) else f", or give {cls.__name__} defaults"
         raise ArgumentError(f"preset '{preset}' of {task} leaves open {', '.join(missing)}{ships}")
     return cls(**values)
+
+
+def load_policy_options(task: str, preset: str | Path) -> dict[str, dict[str, Any]]:
+    """Return the options that a preset gives policies, by name, on top of those of the presets it is based on.
+
+    Raises:
+        ArgumentError: no such preset, or something else than options by name; names the file.
+        FileError: see `load_rules`.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for path in _chain(task, preset):
+        policies = _read(path).get("policies", {})
+        if not isinstance(policies, Mapping) or not all(isinstance(own, Mapping) for own in policies.values()):
+            raise ArgumentError(
+                f"{path}: policies: expected options by policy, `vlm: {{history: 0}}`, got {policies!r}"
+            )
+        for policy, options in policies.items():
+            found[str(policy)] = {**found.get(str(policy), {}), **options}
+    return found
 
 
 def rule_names(cls: type) -> list[str]:
@@ -144,7 +165,7 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if name not in ("base", "about")}
+    return {name: value for name, value in content.items() if name not in ("base", "about", "policies")}
 
 
 def _typed(kind: Any, value: Any, where: str) -> Any:

@@ -27,7 +27,7 @@ from wiw.perception.scene_labels import CATEGORIES
 from wiw.scenes.store import build_digest
 from wiw.training.glimpse_sets import GlimpseSetRules, GlimpseSets, collect_glimpse_sets, merge_glimpse_sets
 from wiw.training.labelled_views import FIELDS as VIEW_FIELDS
-from wiw.training.labelled_views import LabelledViews, ViewRules, merge_views, record_views
+from wiw.training.labelled_views import LabelledViews, ViewRules, change_states, merge_views, record_views
 from wiw.training.walks import WalkRules, Walks, record_walks
 from wiw.training.walks import merge_walks as merged_walks
 
@@ -100,18 +100,23 @@ def gather_walks(specs: str, seed: int, rules: WalkRules, folder: Path, workers:
 
 
 def gather_views(
-    specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar
+    specs: str, seed: int, rules: ViewRules, folder: Path, workers: int, bar: ProgressBar, change: bool = False
 ) -> LabelledViews:
     """Load the labelled views of all scenes of a spec; build those that `folder` lacks in `workers` processes.
+
+    If `change`, each apartment is recorded once more, with other states of doors, lamps and so on.
 
     Raises:
         FileError: the folder cannot be written.
         ArgumentError: nowhere in the scenes can one stand.
     """
     make = partial(_build_views, seed=seed, rules=rules)
-    identity = ("views", 1, list(CATEGORIES), seed, asdict(rules))
+    identity = ("views", 2, list(CATEGORIES), seed, asdict(rules))
     job = Job(f"views of {specs}", VIEW_FIELDS, make, identity)
-    found = gather_arrays(_resolve_scenes(specs), job, folder, workers, bar)
+    sources = _resolve_scenes(specs)
+    if change:
+        sources |= {name: name for name in map(partial(change_states, seed=seed), sources) if name is not None}
+    found = gather_arrays(sources, job, folder, workers, bar)
     return merge_views([LabelledViews(*(arrays[name] for name in VIEW_FIELDS)) for arrays in found])
 
 
@@ -129,7 +134,7 @@ def _build_glimpse_sets(name: str, seed: int, categories: Sequence[str], rules: 
 
 def _build_views(name: str, seed: int, rules: ViewRules) -> Arrays:
     views = record_views(world(name), seed, rules)
-    return {name: getattr(views, name) for name in VIEW_FIELDS}
+    return {field: getattr(views, field) for field in VIEW_FIELDS}
 
 
 def _build_walks(name: str, seed: int, rules: WalkRules) -> Arrays:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of homes, counted in train apartments: kinds of rooms, their contents, materials."""
+"""Statistics of homes, counted in train apartments: kinds of rooms, their contents, materials and sizes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from wiw.datasets.questions.answers import MATERIALS
 from wiw.datasets.questions.facts import STRUCTURE, SceneTable, make_table
@@ -18,15 +20,16 @@ APARTMENTS = 200
 
 
 def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
-    """Return shares of rooms by kind, mean numbers of things by kind and category, and commonest materials."""
+    """Return shares of rooms by kind, mean numbers of things by kind and category, commonest materials, and sides."""
     rooms, contents = Counter[str](), defaultdict[str, Counter[str]](Counter)
-    materials = defaultdict[str, Counter[str]](Counter)
+    materials, sides = defaultdict[str, Counter[str]](Counter), defaultdict[str, list[list[float]]](list)
     for table in tables:
         rooms.update(room.kind for room in table.rooms)
         for thing in table.things:
             material = MATERIALS.get(thing.material, thing.material)
             materials[thing.category][material] += 1
             materials[f"{thing.category}/{thing.color}"][material] += 1
+            sides[thing.category].append(sorted((thing.high - thing.low)[[0, 2]].tolist(), reverse=True))
             if thing.category not in STRUCTURE and (kind := table.kind_of(thing.room)):
                 contents[kind][thing.category] += 1
     total = sum(rooms.values())
@@ -39,11 +42,8 @@ def count_homes(tables: Sequence[SceneTable]) -> dict[str, dict[str, object]]:
         "materials": {
             name: min(c.items(), key=lambda item: (-item[1], item[0]))[0] for name, c in sorted(materials.items())
         },
+        "sides": {name: np.median(found, axis=0).round(3).tolist() for name, found in sorted(sides.items())},
     }
-
-
-def _find_commonest(counts: Counter[str]) -> str:
-    return min(counts, key=lambda name: (-counts[name], name))
 
 
 def write_knowledge(path: str | Path, apartments: int = APARTMENTS) -> None:

@@ -15,10 +15,11 @@ from wiw._core import core
 from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
-from wiw.panorama import PerspectivePlan
+from wiw.panorama import PerspectivePlan, distance_to_planar
 from wiw.perception.colors import COLORS
-from wiw.perception.labelling_network import FOCAL, STRIDE, InputSize, compute_tangents
+from wiw.perception.labelling_network import FOCAL, STRIDE, InputSize, compute_tangents, resize_depth
 from wiw.perception.scene_labels import CATEGORIES, STATES, merge_category
+from wiw.scenes import is_generated, possible_edits
 
 SIZE = (384, 448)
 """(H, W) of the views as they are cut out of panoramas."""
@@ -56,6 +57,8 @@ class LabelledViews:
 
     images: NDArray[np.uint8]
     """uint8 [N, h, w, 3] in the network's size."""
+    depth: NDArray[np.float16]
+    """float16 [N, h, w]: planar, in metres; 0 where nothing is hit."""
     category: NDArray[np.uint8]
     """uint8 [N, h/2, w/2]: index into `CATEGORIES`."""
     state: NDArray[np.uint8]
@@ -87,6 +90,28 @@ def merge_views(parts: Sequence[LabelledViews]) -> LabelledViews:
     return LabelledViews(*(np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS))
 
 
+def change_states(spec: str, seed: int) -> str | None:
+    """Return the spec of an apartment in which about half of what has a state is in another one; None if nothing is.
+
+    A lamp that is always on teaches nothing about those that are off. Other scenes cannot be changed: None.
+    """
+    if not is_generated(spec) or "?" in spec:
+        return None
+    key = core.fold_key([seed, 0x4C24, int(spec.rpartition("/")[2])])
+    possible: dict[str, list[str]] = {}
+    for edit in possible_edits(spec):
+        kind, _, change = edit.partition(":")
+        if kind == "state":
+            possible.setdefault(change.partition("=")[0], []).append(edit)
+    draws = core.uniform(key, 2 * len(possible)).reshape(-1, 2)
+    chosen = [
+        edits[int(which * len(edits))]
+        for (chance, which), (_, edits) in zip(draws, sorted(possible.items()), strict=True)
+        if chance < 0.5
+    ]
+    return f"{spec}?{'&'.join(chosen)}" if chosen else None
+
+
 @dataclass(frozen=True)
 class InstanceTable:
     """Each instance's labels, by id; row 0 is nothing."""
@@ -115,26 +140,38 @@ def read_instances(instances: Sequence[Mapping[str, Any]]) -> InstanceTable:
 
 def record_views(world: World, seed: int, rules: ViewRules = ViewRules()) -> LabelledViews:
     """Record views of a scene from places where an agent can stand; a pure function of (scene, seed, rules)."""
-    key = core.fold_key([seed, 0x4C20])
+    key = core.fold_key([seed, 0x4C20, int("?" in world.scene.name)])
     points = world.ground.put_down(world.navmesh.sample(rules.places, key)).astype(np.float64)
     draws = core.uniform(core.fold_key([key, 1]), len(points) * 2).reshape(-1, 2)
     table = read_instances(world.scene.instances)
     parts = []
     for number, (point, (turn, zoom)) in enumerate(zip(points, draws, strict=True)):
-        shown = world.renderer.panorama(camera_pose(point, 0.0)[None], PANORAMA_SIZE, outputs=("color", "instance"))
+        pose = camera_pose(point, 0.0)[None]
+        shown = world.renderer.panorama(pose, PANORAMA_SIZE, outputs=("color", "depth", "instance"))
         hfov_deg = rules.fields[0] + zoom * (rules.fields[1] - rules.fields[0])
         yaws = [float(360 * (turn + i / rules.views)) for i in range(rules.views)]
         plan = PerspectivePlan(PANORAMA_SIZE, SIZE, hfov_deg)
         images = plan(shown["color"][0], yaws)
-        ids = plan(shown["instance"][0][..., None], yaws, interpolation="nearest")[..., 0]
-        parts.append(_label_views(images, ids, table, hfov_deg, core.fold_key([key, 2, number])))
+        distance, ids = (
+            plan(shown[name][0][..., None], yaws, interpolation="nearest")[..., 0] for name in ("depth", "instance")
+        )
+        depth = distance_to_planar(distance, hfov_deg)
+        parts.append(_label_views(images, depth, ids, table, hfov_deg, core.fold_key([key, 2, number])))
     if not parts:
-        return _label_views(np.zeros((0, *SIZE, 3), np.uint8), np.zeros((0, *SIZE), np.uint32), table, 90.0, 0)
+        nothing = np.zeros((0, *SIZE), np.uint32)
+        return _label_views(
+            np.zeros((0, *SIZE, 3), np.uint8), nothing.astype(np.float32), nothing, table, rules.fields[0], 0
+        )
     return merge_views(parts)
 
 
 def _label_views(
-    images: NDArray[np.uint8], ids: NDArray[np.uint32], table: InstanceTable, hfov_deg: float, key: int
+    images: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    ids: NDArray[np.uint32],
+    table: InstanceTable,
+    hfov_deg: float,
+    key: int,
 ) -> LabelledViews:
     rows = (np.arange(INPUT.height // STRIDE) * 2 + 1) * SIZE[0] * STRIDE // (2 * INPUT.height)
     columns = (np.arange(INPUT.width // STRIDE) * 2 + 1) * SIZE[1] * STRIDE // (2 * INPUT.width)
@@ -142,6 +179,7 @@ def _label_views(
     shrunk = [cv2.resize(image, (INPUT.width, INPUT.height), interpolation=cv2.INTER_AREA) for image in images]
     return LabelledViews(
         np.array(shrunk, np.uint8).reshape(-1, INPUT.height, INPUT.width, 3),
+        np.array([resize_depth(each, INPUT) for each in depth], np.float16).reshape(-1, INPUT.height, INPUT.width),
         table.category[small],
         table.state[small],
         np.full(len(images), hfov_deg, np.float32),

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import cv2
@@ -16,7 +16,15 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
-from wiw.perception.labelling_network import MULTIPLE, STRIDE, Network, fuse, to_network_input
+from wiw.perception.labelling_network import (
+    MULTIPLE,
+    STRIDE,
+    InputSize,
+    Network,
+    fuse,
+    resize_depth,
+    to_network_input,
+)
 from wiw.perception.learned_labeller import LearnedLabeller
 from wiw.perception.scene_labels import CATEGORIES, STATES
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
@@ -48,8 +56,8 @@ class Recipe:
     """
     auxiliary: float = 0.25
     """Weight of the losses of the network's coarser levels, which speed up its training."""
-    degraded: float = 0.4
-    """Share of views that are warped, blurred and noisy, as imagined ones are."""
+    imagined: float = 0.4
+    """Share of views without depth, as imagined ones are; two thirds of them are warped, blurred and noisy too."""
     bfloat16: bool = True
     """Compute products in bfloat16: faster on CPUs with AVX512-BF16, slower on others."""
     seed: int = 0
@@ -175,34 +183,41 @@ class Batch:
 def sample_batch(
     views: LabelledViews, recipe: Recipe, weights: NDArray[np.float64], rng: np.random.Generator, coarse: bool = False
 ) -> Batch:
-    """Sample views, half of them mirrored, with other brightness and tint, a share of them degraded.
+    """Sample views, half of them mirrored, with other brightness and tint, a share of them like imagined ones.
 
     If `coarse`, twice as many views as usual, at about half their size.
     """
     count = 2 * recipe.batch if coarse else recipe.batch
     rows = rng.choice(len(views), count, p=weights)
     images, category, state = views.images[rows], views.category[rows], views.state[rows]
-    for i in np.flatnonzero(rng.random(count) < recipe.degraded):
-        images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
-        category[i], state[i] = labels[..., 0], labels[..., 1]
+    depth = views.depth[rows].astype(np.float32)
+    for i in np.flatnonzero(rng.random(count) < recipe.imagined):
+        depth[i] = 0
+        if rng.random() < 2 / 3:
+            images[i], labels = degrade_view(images[i], np.stack([category[i], state[i]], axis=-1), rng)
+            category[i], state[i] = labels[..., 0], labels[..., 1]
     mirrored = rng.random(count) < 0.5
-    for array in (images, category, state):
+    for array in (images, depth, category, state):
         array[mirrored] = array[mirrored, :, ::-1]
     light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
     tangents = compute_view_tangents(views.hfov_deg[rows], (images.shape[1], images.shape[2]))
     if coarse:
-        images, category, state, tangents = _halve(images, category, state, tangents)
+        images, depth, category, state, tangents = _halve(images, depth, category, state, tangents)
     return Batch(
-        to_network_input(images, tangents),
+        to_network_input(images, tangents, depth),
         torch.from_numpy(category.astype(np.int64)),
         torch.from_numpy(state.astype(np.int64)),
     )
 
 
 def _halve(
-    images: NDArray[np.uint8], category: NDArray[np.uint8], state: NDArray[np.uint8], tangents: NDArray[np.float32]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
+    images: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    category: NDArray[np.uint8],
+    state: NDArray[np.uint8],
+    tangents: NDArray[np.float32],
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
     """Shrink views and labels to about half their size, a size that the network takes."""
     height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in images.shape[1:3])
     rows, columns = (
@@ -214,7 +229,8 @@ def _halve(
         for array in (images, tangents)
     ]
     places = (slice(None), rows[:, None], columns)
-    return resized[0], category[places], state[places], resized[1]
+    smaller = np.stack([resize_depth(each, InputSize(height, width, 0.0)) for each in depth])
+    return resized[0], smaller, category[places], state[places], resized[1]
 
 
 def degrade_view(
@@ -261,10 +277,10 @@ def find_possible_states(views: LabelledViews) -> dict[str, list[str]]:
 
 
 def evaluate(network: Network, states: dict[str, list[str]], views: LabelledViews, seed: int) -> dict[str, Any]:
-    """Measure the labeller on held-out views, as they are and degraded.
+    """Measure the labeller on held-out views, as they are, without depth, and without depth and degraded.
 
     Returns:
-        {"views": N, "plain": measures, "degraded": measures}; see `_measure`.
+        {"views": N, "plain": measures, "no_depth": measures, "degraded": measures}; see `_measure`.
     """
     labeller = LearnedLabeller.of(network, {"categories": list(CATEGORIES), "states": states})
     rng = np.random.default_rng(core.fold_key([seed, 0x4C23]))
@@ -272,23 +288,25 @@ def evaluate(network: Network, states: dict[str, list[str]], views: LabelledView
         degrade_view(image, np.stack([category, state], axis=-1), rng)
         for image, category, state in zip(views.images, views.category, views.state, strict=True)
     ]
-    labels = np.array([each for _, each in degraded])
+    labels, nothing = np.array([each for _, each in degraded]), np.zeros_like(views.depth)
     return {
         "views": len(views),
-        "plain": _measure(labeller, views.images, views.category, views.state, views.hfov_deg),
+        "plain": _measure(labeller, views),
+        "no_depth": _measure(labeller, replace(views, depth=nothing)),
         "degraded": _measure(
-            labeller, np.array([image for image, _ in degraded]), labels[..., 0], labels[..., 1], views.hfov_deg
+            labeller,
+            replace(
+                views,
+                images=np.array([image for image, _ in degraded]),
+                depth=nothing,
+                category=labels[..., 0],
+                state=labels[..., 1],
+            ),
         ),
     }
 
 
-def _measure(
-    labeller: LearnedLabeller,
-    images: NDArray[np.uint8],
-    category: NDArray[np.uint8],
-    state: NDArray[np.uint8],
-    hfov_deg: NDArray[np.float32],
-) -> dict[str, Any]:
+def _measure(labeller: LearnedLabeller, views: LabelledViews) -> dict[str, Any]:
     """Return pixel accuracy, IoU by category and its mean, and the accuracy of states by category and its mean.
 
     A state counts as right where most pixels that the labeller gives an object's category have its state; objects
@@ -297,8 +315,10 @@ def _measure(
     """
     confusion = np.zeros((len(CATEGORIES), len(CATEGORIES)), np.int64)
     right: dict[str, dict[str, list[bool]]] = {}
-    for image, truth, states, angle in zip(images, category, state, hfov_deg, strict=True):
-        found = labeller.label(image[None], float(angle))
+    for image, depth, truth, states, angle in zip(
+        views.images, views.depth, views.category, views.state, views.hfov_deg, strict=True
+    ):
+        found = labeller.label(image[None], float(angle), depth=depth[None].astype(np.float32))
         predicted, predicted_state = (array[0, ::STRIDE, ::STRIDE] for array in (found.category, found.state))
         pairs = truth.astype(np.int64) * len(CATEGORIES) + predicted
         confusion += np.bincount(pairs.ravel(), minlength=confusion.size).reshape(confusion.shape)

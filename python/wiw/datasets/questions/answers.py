@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-from wiw.datasets.questions.facts import FRONTED, HUNG, STRUCTURE, Room, SceneTable, Thing
+from wiw.datasets.questions.facts import BROADER, FRONTED, HUNG, STRUCTURE, UNCLEAR, Room, SceneTable, Thing
 from wiw.datasets.questions.grammar import ACTIVITIES, CAPACITIES, HABITS, TEMPLATES, USES
 
 Slots = Mapping[str, str]
@@ -51,7 +51,7 @@ LOOKED_FOR = (
     "washing machine",
 )
 """Categories whose existence is asked for."""
-PLURAL = frozenset({"books", "candles"})
+PLURAL = frozenset({"books", "candles", "kitchen utensils"})
 """Categories whose names are plurals: nothing is asked about what "the books" are like."""
 PATTERNED = frozenset({"books", "mirror", "picture", "window"})
 """Categories that have no one colour or material to see."""
@@ -127,9 +127,18 @@ def resemblance(guess: str, fact: Fact, answer_type: str) -> float:
 
 def find_answer(table: SceneTable, template: str, slots: Slots) -> Fact | None:
     """Return what is true of a question in a scene, or None where it has no answer, or more than one."""
-    if "room" in slots and table.find_room(slots["room"]) is None:
+    if "room" in slots and (table.find_room(slots["room"]) is None or _may_be_elsewhere(table, slots)):
         return None
-    return _ANSWERS[template](table, slots)
+    fact = _ANSWERS[template](table, slots)
+    return None if fact is None or any(sight.room == UNCLEAR for sight in fact.sights) else fact
+
+
+def _may_be_elsewhere(table: SceneTable, slots: Slots) -> bool:
+    """Return whether something that a question speaks of may be in its room or not: nobody could say."""
+    words = {*slots.values(), *USES.get(slots.get("use", ""), ())}
+    return any(
+        thing.room == UNCLEAR and {thing.category, BROADER.get(thing.category)} & words for thing in table.things
+    )
 
 
 def propose(table: SceneTable) -> Iterator[tuple[str, dict[str, str]]]:

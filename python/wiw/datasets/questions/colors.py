@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,10 +64,13 @@ _TO_OKLAB = np.array(
 )
 
 
-def name_rendered_color(world: World, instance: int, viewpoints: list[Viewpoint], share: float) -> str:
+def name_rendered_color(
+    world: World, instance: int, viewpoints: list[Viewpoint], share: float, exposures: Sequence[float] = (1.0,)
+) -> str:
     """Return the name of an instance's colour as rendered from some viewpoints; empty where it has no clear one.
 
-    It is clear where at least `share` of its pixels are of that name, from each viewpoint, and so is their mean.
+    It is clear where at least `share` of its pixels are of that name, from each viewpoint, and so is their mean, and
+    would be if it were brighter by the factors in `exposures`.
     """
     poses = np.stack([camera_pose(np.array(at[:3]), at[3]) for at in viewpoints])
     views = world.renderer.perspective(poses, _SIZE, HFOV, outputs=("color", "instance"))
@@ -77,7 +82,8 @@ def name_rendered_color(world: World, instance: int, viewpoints: list[Viewpoint]
         names, counts = np.unique(name_colors(pixels), return_counts=True)
         mean = ((pixels / 255.0) ** _GAMMA).mean(axis=0) ** (1 / _GAMMA)
         name = str(names[counts.argmax()])
-        if counts.max() < share * len(pixels) or name_colors((255 * mean).astype(np.uint8)[None])[0] != name:
+        means = np.clip(255 * np.outer(exposures, mean), 0, 255).astype(np.uint8)
+        if counts.max() < share * len(pixels) or (name_colors(means) != name).any():
             return ""
         found.add(name)
     return found.pop() if len(found) == 1 else ""

@@ -48,6 +48,10 @@ PASSAGES = {"hall": "hallway", "corridor": "hallway"}
 """Rooms that nobody would tell apart by name."""
 
 
+UNCLEAR = "?"
+"""Room of a thing of which nobody could say which room it is in."""
+
+
 @dataclass(frozen=True, eq=False)
 class Room:
     """A room with its inner bounds."""
@@ -76,7 +80,7 @@ class Thing:
     material: str
     state: str
     room: str
-    """Name of its room; empty outside of any."""
+    """Name of its room; empty outside of any, `UNCLEAR` between several."""
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     front: NDArray[np.float64]
@@ -100,6 +104,10 @@ class SceneTable:
     name: str
     things: tuple[Thing, ...]
     rooms: tuple[Room, ...]
+    small: frozenset[str] = SMALL
+    """Categories that stand on furniture here."""
+    hung: frozenset[str] = HUNG
+    """Categories that hang on walls here."""
 
     @property
     def room_kinds(self) -> dict[str, list[Room]]:
@@ -141,20 +149,20 @@ class SceneTable:
         return [
             thing
             for thing in self.things
-            if thing.category not in STRUCTURE | SMALL | HUNG | FLAT
+            if thing.category not in STRUCTURE | self.small | self.hung | FLAT
             and thing.low[1] < 0.35
             and (room is None or thing.room == room)
         ]
 
     def find_support(self, thing: Thing) -> Thing | None:
         """Return what a small thing stands on or in."""
-        if thing.category not in SMALL:
+        if thing.category not in self.small:
             return None
         under = [
             other
             for other in self.things
             if other.id != thing.id
-            and other.category not in STRUCTURE | FLAT | SMALL
+            and other.category not in STRUCTURE | FLAT | self.small
             and other.room == thing.room
             and _is_over(thing, other)
             and other.low[1] - 0.03 <= thing.low[1] <= other.high[1] + 0.05
@@ -166,7 +174,7 @@ class SceneTable:
         return [
             thing
             for thing in self.things
-            if thing.category in SMALL and thing.room == anchor.room and self.find_support(thing) is anchor
+            if thing.category in self.small and thing.room == anchor.room and self.find_support(thing) is anchor
         ]
 
     def things_above(self, anchor: Thing) -> list[Thing]:
@@ -174,7 +182,7 @@ class SceneTable:
         return [
             thing
             for thing in self.things
-            if thing.category in HUNG
+            if thing.category in self.hung
             and thing.room == anchor.room
             and thing.low[1] >= anchor.high[1] - 0.25
             and thing.centre[1] > anchor.centre[1]

@@ -22,6 +22,7 @@ from wiw.datasets.questions.answers import Fact, find_answer, propose
 from wiw.datasets.questions.colors import name_rendered_color
 from wiw.datasets.questions.facts import SceneTable, make_table
 from wiw.datasets.questions.grammar import TEMPLATES, phrase
+from wiw.datasets.questions.mesh_table import NO_ATTRIBUTES, Attributes, observe_table
 from wiw.datasets.questions.question import CATEGORIES, Question, Viewpoint
 from wiw.datasets.questions.survey import Survey, choose_places, place_key, survey
 from wiw.datasets.worlds import World, world
@@ -195,22 +196,31 @@ class Surroundings:
 
 
 def look_around(
-    place: World, seed: int, rules: EpisodeRules, points: NDArray[np.float64] | None = None
+    place: World,
+    seed: int,
+    rules: EpisodeRules,
+    points: NDArray[np.float64] | None = None,
+    attributes: Attributes = NO_ATTRIBUTES,
 ) -> Surroundings:
     """Survey a scene, from places of its own or those of another one like it.
 
+    The rooms of a scene that does not tell them are found by what is in them (`mesh_table`); `attributes` says more.
+
     Raises:
-        ArgumentError: the scene does not tell its rooms.
+        ArgumentError: no rooms are found; attributes of instances that are not there.
     """
     table = make_table(place.scene, place.name)
-    if not table.rooms:
-        raise ArgumentError(
-            f"{place.name}: expected a scene that tells its rooms and what is in them, such as apartments:val/3; "
-            "questions for other scenes come from a file (episode_file=...)"
-        )
     if points is None:
         points = choose_places(place, rules.places, place_key(seed, place.name))
-    return Surroundings(place, table, survey(place, points), rules, seed)
+    views = survey(place, points)
+    if not table.rooms:
+        table = observe_table(place, views, attributes, rules.clear)
+    if not table.rooms:
+        raise ArgumentError(
+            f"{place.name}: expected a scene that tells its rooms, such as apartments:val/3, or whose instances have "
+            "names that give rooms away, such as bed and stove; other questions come from a file (episode_file=...)"
+        )
+    return Surroundings(place, table, views, rules, seed)
 
 
 def find_questions(surroundings: Surroundings) -> list[Answerable]:
@@ -224,9 +234,11 @@ def find_questions(surroundings: Surroundings) -> list[Answerable]:
 
 
 @lru_cache(maxsize=16)
-def questions_of(scene: str, seed: int, rules: EpisodeRules, backend: Backend) -> tuple[Answerable, ...]:
+def questions_of(
+    scene: str, seed: int, rules: EpisodeRules, backend: Backend, attributes: Attributes = NO_ATTRIBUTES
+) -> tuple[Answerable, ...]:
     """Return the valid questions of a single scene's spec, from memory where possible."""
-    return tuple(find_questions(look_around(world(scene, backend), seed, rules)))
+    return tuple(find_questions(look_around(world(scene, backend), seed, rules, attributes=attributes)))
 
 
 def generate(
@@ -237,6 +249,7 @@ def generate(
     *,
     first: int = 0,
     before: Iterable[str] = (),
+    attributes: Attributes = NO_ATTRIBUTES,
 ) -> list[Episode]:
     """Return episodes `first` to `first + count - 1` of one scene alone, none with a text of `before`.
 
@@ -244,35 +257,48 @@ def generate(
     which pairs scenes.
 
     Raises:
-        ArgumentError: the scene does not tell its rooms, or has too few valid questions.
+        ArgumentError: the scene has no rooms, or too few valid questions.
     """
-    pool = list(questions_of(world.name, seed, rules, world.backend))
+    pool = list(questions_of(world.name, seed, rules, world.backend, attributes))
     draws = core.uniform(core.fold_key([place_key(seed, world.name), first]), len(pool))
     pool = [pool[i] for i in np.argsort(draws, kind="stable")]
     made: list[Answerable] = []
     tally: Counter[str] = Counter()
     texts = set(before)
     while len(made) < count:
-        free = [each for each in pool if each.text not in texts and _within_limits(each, made, count, rules)]
+        free = [each for each in pool if each.text not in texts and _within_limits(each, made, rules)]
         if not free:
             raise ArgumentError(
                 f"{world.name}: only {len(made)} of {count} questions satisfy {rules}; ask for fewer in a scene"
             )
         chosen = min(
-            free, key=lambda each: (tally[each.category], tally[each.template], CATEGORIES.index(each.category))
+            free,
+            key=lambda each: (
+                tally[each.category],
+                tally[each.template],
+                tally[_name_fact(each)],
+                CATEGORIES.index(each.category),
+            ),
         )
         made.append(chosen)
         texts.add(chosen.text)
-        tally.update([chosen.category, chosen.template])
+        tally.update([chosen.category, chosen.template, _name_fact(chosen)])
     return [each.to_episode(first + i) for i, each in enumerate(made)]
 
 
-def _within_limits(question: Answerable, made: list[Answerable], count: int, rules: EpisodeRules) -> bool:
+def _name_fact(question: Answerable) -> str:
+    """Return what a question asks about, whether or not its text names the room as well."""
+    return f"{question.template} {sorted(question.fact.target)}"
+
+
+def _within_limits(question: Answerable, made: list[Answerable], rules: EpisodeRules) -> bool:
     """Return whether one more question keeps yes-no questions few, and as often answered by yes as by no."""
     if question.answer_type != "yes_no":
         return True
     answers = [each.fact.answer for each in made if each.answer_type == "yes_no"]
-    return len(answers) + 1 <= rules.yes_no * count and answers.count(question.fact.answer) * 2 <= len(answers)
+    return len(answers) + 1 <= rules.yes_no * (len(made) + 1) and answers.count(question.fact.answer) * 2 <= len(
+        answers
+    )
 
 
 def _shortest_routes(

@@ -7,8 +7,9 @@ asks ("A-EQA High-Level Planner Additional Prompt").
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -18,18 +19,22 @@ from numpy.typing import NDArray
 from wiw.action import TURN_LEFT
 from wiw.datasets.questions import ParsedQuestion, parse
 from wiw.errors import ArgumentError
+from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
+from wiw.mapping.routes import STEP, find_refused
 from wiw.mapping.views import HFOV_DEG, VIEW_YAWS_DEG, Views, cut_views, unproject
 from wiw.panorama import to_perspective
 from wiw.perception.colors import name_color
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
-from wiw.policies.explorer.destinations import Destination, choose_destinations, plan_route
+from wiw.policies.explorer.confidence import estimate_confidence
+from wiw.policies.explorer.destinations import Destination, Rate, choose_destinations, plan_route
+from wiw.policies.explorer.drawing import draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
-from wiw.types import Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Decision, Goal, Key, Proposal, Rollout, TextAnswer
 
 VIEW_SIZE = (192, 224)
 """(H, W) of the views that are labelled."""
@@ -38,8 +43,28 @@ SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
 """Most primitives of a plan that only takes a second look."""
+PATIENCE = 6
+"""Decisions after which a place that could not be reached is given up; six lead up to 18 m."""
+LAST_ACTIONS = 18
+"""Primitives left from which on an answer is final: those of one more decision, and of the look that confirms it."""
 CLEAR_SHARE = 0.01
 """Share of a view that a wanted thing must fill in an imagined view to count in full."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A real look around."""
+
+    panorama: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    """Distances along the ray in metres."""
+    odometry: NDArray[np.float64]
+    ids: NDArray[np.uint32] | None = None
+    """The simulator's instance of each pixel, for explorers that are given the truth."""
+
+    def with_ids(self, ids: NDArray[np.uint32]) -> Look:
+        """Return the same look with instance ids."""
+        return replace(self, ids=ids)
 
 
 @dataclass
@@ -53,6 +78,30 @@ class Memory:
     surfaces: list[Surface] = field(default_factory=list)
     belief: Belief = field(default_factory=lambda: Belief("", 0.0))
     home: Any = None
+    azimuth: float | None = None
+    """Of the walls in the frame of the start; the map's x axis points along it."""
+    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    """x, y, azimuth in the map at the last decision."""
+    executed: int = 0
+    """Primitives until then."""
+    destinations: list[Destination] = field(default_factory=list)
+    """Places worth going to from there, the most worth first."""
+
+    tries: Counter[tuple[int, int]] = field(default_factory=Counter)
+    """Decisions in which a place, in half metres, was the most worth going to."""
+
+    def choose_destinations(self, rate: Rate) -> None:
+        """Choose where to go from here; places that were the best for long, and never reached, are given up."""
+        found = choose_destinations(self.grid, self.pose, self.belief.things, rate)
+        cells = [(round(2 * place.position[0]), round(2 * place.position[1])) for place in found]
+        self.destinations = [place for place, cell in zip(found, cells, strict=True) if self.tries[cell] < PATIENCE]
+        self.tries.update(next(([cell] for cell in cells if self.tries[cell] < PATIENCE), []))
+
+    def align(self, look: Look) -> NDArray[np.float64]:
+        """Return x, y, azimuth of a look in the map."""
+        if self.azimuth is None:
+            self.azimuth = find_wall_azimuth(look.depth, look.odometry)
+        return turn_odometry(look.odometry, self.azimuth)
 
     @cached_property
     def wanted(self) -> tuple[str, ...]:
@@ -66,6 +115,8 @@ class Explorer(Policy):
     Args:
         perception: who labels views: "learned", or a `wiw.perception.scene_labels.Labeller`.
         sure: confidence from which on an answer is final.
+        calibrated: whether confidence is the probability of being right (`wiw.policies.explorer.confidence`), or the
+            support by the map that this is estimated from.
         imagination: weight of what imagined views show, in the units of a destination's worth (square metres).
         path: worth of a metre that need not be walked, in square metres of new floor.
         affinity: worth of a room that is likely to have what is asked about.
@@ -88,6 +139,7 @@ class Explorer(Policy):
         path: float = 0.6,
         affinity: float = 4.0,
         budget: int = 250,
+        calibrated: bool = True,
     ) -> None:
         self.labeller: Labeller = LABELLERS.make(perception)
         if "ids" in self.labeller.needs:
@@ -96,6 +148,7 @@ class Explorer(Policy):
                 "policy explorer-oracle is an explorer with true perception"
             )
         self.sure, self.imagination, self.path, self.affinity, self.budget = sure, imagination, path, affinity, budget
+        self.calibrated = bool(calibrated)
         self.knowledge = load_knowledge()
 
     @classmethod
@@ -121,34 +174,84 @@ class Explorer(Policy):
             "path": self.path,
             "affinity": self.affinity,
             "budget": self.budget,
+            "calibrated": self.calibrated,
         }
 
     def begin(self, goal: Goal, key: Key) -> Memory:
         """Return an empty map."""
-        return Memory(parse(goal.text or ""), ObjectMap(self.labeller.categories, STATES))
+        return Memory(parse(goal.text or ""), ObjectMap(self.map_categories, STATES))
+
+    @property
+    def map_categories(self) -> tuple[str, ...]:
+        """Names of what the map can hold, index 0 is ""."""
+        return self.labeller.categories
 
     # -- real views ----------------------------------------------------------------------------------------------------
 
     def observe(self, situations: Sequence[Situation]) -> None:
-        """Add the real views to the maps, labelled in one batch, and ask them the questions."""
-        cut = [
-            cut_views(own.panorama, own.depth, own.odometry, VIEW_SIZE) for own in (s.observation for s in situations)
-        ]
-        labels = self.label_real(situations, cut)
-        for i, (situation, views) in enumerate(zip(situations, cut, strict=True)):
-            self._add_views(situation, views, _take(labels, 4 * i, 4))
+        """Add the real views to the maps, and ask them the questions."""
+        for situation in situations:
+            memory = situation.memory
+            for look in self.look_around(situation):
+                pose = memory.align(look)
+                views, labels = self.perceive(situation, look, pose)
+                memory.grid.add(look.depth, pose)
+                memory.objects.add(views, labels, self.name_color)
+                memory.surfaces += self._look_at_surfaces(views, labels)
+            self._mark_refused(situation)
+            memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
+            memory.belief = self._answer_from_map(memory, situation.goal.text or "")
+            memory.choose_destinations(partial(self._rate, memory))
 
-    def label_real(self, situations: Sequence[Situation], cut: Sequence[Views]) -> SceneLabels:
-        """Return the labels of the real views of all episodes, four of each."""
-        return self.labeller.label(np.concatenate([views.images for views in cut]), HFOV_DEG)
+    def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
+        """Return looks at floors and walls: patches that are all of one surface, with their colour."""
+        looks, categories = [], self.map_categories
+        half = SURFACE_STRIDE // 2
+        for name in SURFACES:
+            if name not in categories:
+                continue
+            mask = (labels.category == categories.index(name)) & (views.depth > 0)
+            height, width = views.size
+            for view in range(len(mask)):
+                for row in range(half, height - half, SURFACE_STRIDE):
+                    for column in range(half, width - half, SURFACE_STRIDE):
+                        patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
+                        if mask[patch].all():
+                            color, confidence = self.name_color(views.images[patch].reshape(-1, 3))
+                            point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
+                            looks.append(Surface(name, point[:2], color, confidence))
+        return looks
 
-    def _add_views(self, situation: Situation, views: Views, labels: SceneLabels) -> None:
-        memory, observation = situation.memory, situation.observation
-        memory.grid.add(observation.depth, observation.odometry)
-        memory.objects.add(views, labels, name_color)
-        memory.surfaces += _look_at_surfaces(views, labels, self.labeller.categories)
-        memory.home = believe_home(memory.objects, memory.grid, memory.surfaces, self.knowledge)
-        memory.belief = answer(memory.question, situation.goal.text or "", memory.home, memory.grid)
+    def _mark_refused(self, situation: Situation) -> None:
+        """Mark what stood in the way since the last decision, and note where the agent stands now."""
+        memory = situation.memory
+        pose = turn_odometry(situation.observation.odometry, memory.azimuth)
+        if memory.executed < len(situation.executed):
+            blocked = find_refused(memory.pose, situation.executed[memory.executed :], pose)
+            if blocked is not None:
+                memory.grid.mark_blocked(blocked, STEP)
+        memory.pose, memory.executed = pose, len(situation.executed)
+
+    def look_around(self, situation: Situation) -> Iterator[Look]:
+        """Yield what is to be added to the map: the present observation."""
+        observation = situation.observation
+        yield Look(observation.panorama, observation.depth, observation.odometry)
+
+    def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
+        """Return the four real views of a look around from a pose in the map, and their labels."""
+        views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
+        return views, self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
+
+    def _answer_from_map(self, memory: Memory, text: str) -> Belief:
+        """Return the answer that the map gives to a text, and how sure it is."""
+        found = answer(memory.question, text, memory.home, memory.grid)
+        if memory.question is None or not self.calibrated:
+            return found
+        return replace(found, confidence=estimate_confidence(memory.question.answer_type, found.confidence))
+
+    def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+        """Return the colour word of pixels uint8 [n, 3] of one thing in such views, and its probability."""
+        return name_color(pixels)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 
@@ -157,14 +260,11 @@ class Explorer(Policy):
         return [self._plan(situation, candidates, horizon) for situation in situations]
 
     def _plan(self, situation: Situation, candidates: int, horizon: int) -> list[Proposal]:
-        memory, pose = situation.memory, situation.observation.odometry
-        final = self._is_final(situation)
-        rate = partial(self._rate, memory)
-        most = 1 if final else 2 * candidates
-        found = choose_destinations(memory.grid, pose, memory.belief.places, rate, most)
+        memory = situation.memory
+        final = self.is_final(situation)
         plans: dict[bytes, Proposal] = {}
-        for place in found:
-            actions = plan_route(memory.grid, pose, place, LOOK_ACTIONS if final else horizon)
+        for place in memory.destinations[: 1 if final else 2 * candidates]:
+            actions = plan_route(memory.grid, memory.pose, place, LOOK_ACTIONS if final else horizon)
             if len(actions):
                 plans.setdefault(actions.tobytes(), Proposal(actions, prior=place.worth, note=place.note))
             if len(plans) == candidates:
@@ -233,16 +333,19 @@ class Explorer(Policy):
     ) -> list[TextAnswer]:
         """Answer from the map of real views."""
         return [
-            TextAnswer(
-                own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self._is_final(situation)
-            )
+            TextAnswer(own.belief.text, own.belief.confidence, final=bool(own.belief.text) and self.is_final(situation))
             for situation, own in ((situation, situation.memory) for situation in situations)
         ]
 
-    def _is_final(self, situation: Situation) -> bool:
-        """Return whether the present belief is given as the answer: it is sure enough, or time is nearly up."""
+    def draw(self, situation: Situation, decision: Decision, north: float) -> dict[str, NDArray[np.uint8]]:
+        """Return the map of real views, and the present view with what it is believed to show."""
+        return draw_beliefs(situation.memory, situation, decision, north)
+
+    def is_final(self, situation: Situation) -> bool:
+        """Return whether the present belief is the answer: it is sure enough, nothing is left to see, or no time."""
+        memory = situation.memory
         left = self.budget - len(situation.executed)
-        return bool(situation.memory.belief.confidence >= self.sure or left <= 2 * LOOK_ACTIONS)
+        return bool(memory.belief.confidence >= self.sure or not memory.destinations or left <= LAST_ACTIONS)
 
 
 def _take(labels: SceneLabels, first: int, count: int) -> SceneLabels:
@@ -257,23 +360,3 @@ def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
     if rollout.view == "panorama":
         return np.stack([to_perspective(end, HFOV_DEG, VIEW_SIZE, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
     return end[None] if end.ndim == 3 else end, 90.0
-
-
-def _look_at_surfaces(views: Views, labels: SceneLabels, categories: Sequence[str]) -> list[Surface]:
-    """Return looks at floors and walls: patches that are all of one surface, with their colour."""
-    looks = []
-    half = SURFACE_STRIDE // 2
-    for name in SURFACES:
-        if name not in categories:
-            continue
-        mask = (labels.category == categories.index(name)) & (views.depth > 0)
-        height, width = views.size
-        for view in range(len(mask)):
-            for row in range(half, height - half, SURFACE_STRIDE):
-                for column in range(half, width - half, SURFACE_STRIDE):
-                    patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
-                    if mask[patch].all():
-                        color, confidence = name_color(views.images[patch].reshape(-1, 3))
-                        point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
-                        looks.append(Surface(name, point[:2], color, confidence))
-    return looks

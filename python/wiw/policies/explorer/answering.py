@@ -10,14 +10,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wiw.datasets.questions.answers import Fact, find_answer
+from wiw.datasets.questions.answers import Fact
 from wiw.datasets.questions.blind import blind_answer
 from wiw.datasets.questions.grammar import ACTIVITIES, HABITS, USES, ParsedQuestion
 from wiw.mapping.object_map import MapObject
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.policies.explorer.home import Home
+from wiw.policies.explorer.presuming import find_likeliest
 
 CLEAR_SIZE = 0.01
 """Share of a view from which on a thing is seen as well as needed."""
@@ -34,8 +34,8 @@ class Belief:
     text: str
     confidence: float
     """From 0 to 1; 0 where nothing observed supports the answer."""
-    places: tuple[NDArray[np.float64], ...] = ()
-    """float64 [3] each: where what the answer rests on is, best looked at next to be surer."""
+    things: tuple[MapObject, ...] = ()
+    """What the answer rests on, best looked at next to be surer."""
 
 
 def list_wanted(question: ParsedQuestion | None) -> tuple[str, ...]:
@@ -55,31 +55,31 @@ def list_wanted(question: ParsedQuestion | None) -> tuple[str, ...]:
 
 def answer(question: ParsedQuestion | None, text: str, home: Home, grid: OccupancyGrid) -> Belief:
     """Return what the map says in answer to a question, or the most frequent answer to such a text."""
-    fact = None if question is None else find_answer(home.table, question.template, question.slots)
+    fact = None if question is None else find_likeliest(home, question)
     if question is None or fact is None:
         return Belief(blind_answer(text), 0.0, _locate(home, list_wanted(question)))
     things = [home.objects[number] for number in fact.target if number in home.objects]
     confidence = _measure_confidence(question, fact, things, home, grid)
-    return Belief(fact.answer, confidence, tuple(thing.center for thing in things))
+    return Belief(fact.answer, confidence, tuple(things))
 
 
-def _locate(home: Home, categories: Sequence[str]) -> tuple[NDArray[np.float64], ...]:
-    """Return where things of some categories may be."""
-    return tuple(thing.center for thing in home.objects.values() if thing.category in categories)
+def _locate(home: Home, categories: Sequence[str]) -> tuple[MapObject, ...]:
+    """Return the things of some categories."""
+    return tuple(thing for thing in home.objects.values() if thing.category in categories)
 
 
 def _measure_confidence(
     question: ParsedQuestion, fact: Fact, things: Sequence[MapObject], home: Home, grid: OccupancyGrid
 ) -> float:
     """Return how sure an answer is: by how well its things were seen, and how much of the place is known."""
-    sure = min((_measure_clarity(thing) for thing in things), default=0.6)
+    sure = min((measure_clarity(thing) for thing in things), default=0.6)
     if question.answer_type == "state":
         sure *= min((thing.state_share for thing in things), default=0.0)
     if question.answer_type == "color" and things:
         sure *= min(thing.color_share for thing in things)
     named = question.slots.get("room")
     if named is not None:
-        sure *= max((home.room_shares[room.name] for room in home.table.rooms if room.kind == named), default=0.0)
+        sure *= max((kinds.get(named, 0.0) for kinds in home.room_kinds.values()), default=0.0)
     if question.template in WHOLE_HOME:
         sure *= _measure_completeness(grid)
     elif question.template in WHOLE_ROOM and named is not None:
@@ -87,7 +87,7 @@ def _measure_confidence(
     return float(np.clip(sure, 0.0, 1.0))
 
 
-def _measure_clarity(thing: MapObject) -> float:
+def measure_clarity(thing: MapObject) -> float:
     """Return how well a thing was seen, 0 to 1."""
     near = min(1.0, (thing.size / CLEAR_SIZE) ** 0.5)
     again = 1.0 if thing.decisions > 1 else 0.9

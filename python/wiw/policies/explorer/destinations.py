@@ -9,13 +9,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.mapping.object_map import MapObject
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.mapping.routes import measure_distances, route
+from wiw.policies.explorer.answering import measure_clarity
 
 NEAR = 1.2
 """Metres from which a thing is looked at."""
+LOOKED_AT = 1.6
+"""Metres from which a thing has been looked at as nearly as it will be."""
 INTEREST = 6.0
 """Worth of a nearer look at what the question is about, in square metres of new floor."""
+LEAST_GAIN = 0.4
+"""Square metres of new floor from which on a frontier is worth going to."""
 MOST_FRONTIERS = 12
 """Frontiers that are rated, the longest."""
 GAIN_REACH = 4.0
@@ -43,31 +49,37 @@ Rate = Callable[[Destination, float], float]
 def choose_destinations(
     grid: OccupancyGrid,
     pose: NDArray[np.float64],
-    things: Sequence[NDArray[np.float64]],
+    things: Sequence[MapObject],
     rate: Rate,
-    most: int,
 ) -> list[Destination]:
-    """Return at most `most` places, the most worth first.
+    """Return the places that can be reached and promise something, the most worth first.
 
     Args:
         grid: what is known of the floor.
         pose: x, y, azimuth of the agent.
-        things: float64 [3] each: what the question is about, as far as it is in the map.
+        things: what the question is about, as far as it is in the map.
         rate: returns the worth of a place, with the metres to it.
-        most: places at most.
     """
     distances = measure_distances(grid, pose)
-    found = [Destination(thing[:2], 0.0, INTEREST, NEAR, "a nearer look") for thing in things]
-    found += [
-        Destination(frontier.position, grid.measure_gain(frontier.position, reach=GAIN_REACH), note="unknown floor")
-        for frontier in grid.frontiers[:MOST_FRONTIERS]
-    ]
+    found = [look for thing in things if (look := _look_nearer(grid, thing)) is not None]
+    for frontier in grid.frontiers[:MOST_FRONTIERS]:
+        gain = grid.measure_gain(frontier.position, reach=GAIN_REACH)
+        if gain >= LEAST_GAIN:
+            found.append(Destination(frontier.position, gain, note="unknown floor"))
     rated = []
     for place in found:
         metres = _measure_way(grid, distances, place)
         if np.isfinite(metres):
             rated.append(replace(place, worth=rate(place, metres)))
-    return sorted(rated, key=lambda place: (-place.worth, *place.position.tolist()))[:most]
+    return sorted(rated, key=lambda place: (-place.worth, *place.position.tolist()))
+
+
+def _look_nearer(grid: OccupancyGrid, thing: MapObject) -> Destination | None:
+    """Return the place of a thing that has not been looked at from near; None for one that has."""
+    place = thing.center[:2]
+    if min((float(np.hypot(*(visit - place))) for visit in grid.visits), default=np.inf) <= LOOKED_AT:
+        return None
+    return Destination(place, 0.0, INTEREST * (1 - measure_clarity(thing)), NEAR, "a nearer look")
 
 
 def plan_route(grid: OccupancyGrid, pose: NDArray[np.float64], place: Destination, longest: int) -> NDArray[np.int8]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets.questions.facts import FRONTED, Room, SceneTable, Thing
+from wiw.mapping.fragments import split_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 
@@ -26,6 +27,14 @@ LEAST_SIZE = 0.0004
 """Share of a view that a thing must once have filled to be believed in."""
 LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
+
+
+WORKTOPS = frozenset({"kitchen counter", "kitchen cabinet"})
+"""Categories that stand against walls and have no left and right."""
+WALL_REACH = 0.7
+"""Metres behind what was seen of furniture in which its wall is looked for."""
+TOO_LONG = 1.3
+"""Times the usual length of its category, from which on a thing of the map may be several."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,8 @@ class Knowledge:
     """By kind of room, then by category: how many a room has on average."""
     materials: Mapping[str, str]
     """By category, the most common material."""
+    sides: Mapping[str, Sequence[float]]
+    """By category, the medians of the longer and of the shorter horizontal side in metres."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -87,18 +98,24 @@ class Home:
     """By id of the table's things; floors and walls have none."""
     room_names: Mapping[int, str]
     """By number of the grid's rooms."""
-    room_shares: Mapping[str, float]
-    """Probability of the kind that each room is taken for, by the room's name."""
+    room_kinds: Mapping[str, Mapping[str, float]]
+    """Probability of each kind, by the room's name."""
+
+    def weigh(self, thing: Thing) -> float:
+        """Return the evidence for a thing of the table: how large it was seen, and how surely as what it is."""
+        seen = self.objects.get(thing.id)
+        return seen.size * seen.category_share * seen.confidence if seen is not None else np.inf
 
 
 def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Surface], knowledge: Knowledge) -> Home:
     """Return the home that a map of it shows."""
-    seen = [thing for thing in objects.objects if thing.size >= LEAST_SIZE and thing.category_share >= LEAST_SHARE]
+    known = [thing for thing in objects.objects if thing.size >= LEAST_SIZE and thing.category_share >= LEAST_SHARE]
+    seen = _take_apart(known, knowledge)
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
-    rooms, names, shares = _name_rooms(seen, places, grid, knowledge)
+    rooms, names, kinds = _name_rooms(seen, places, grid, knowledge)
     things = [_make_thing(thing, names.get(places[thing.id], ""), grid, knowledge) for thing in seen]
     things += _make_surfaces(surfaces, grid, names, knowledge, first=max(places, default=0) + 1)
-    return Home(SceneTable("", tuple(things), tuple(rooms)), {thing.id: thing for thing in seen}, names, shares)
+    return Home(SceneTable("", tuple(things), tuple(rooms)), {thing.id: thing for thing in seen}, names, kinds)
 
 
 def to_table_frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -106,10 +123,28 @@ def to_table_frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.stack([-points[..., 1], points[..., 2], -points[..., 0]], axis=-1))
 
 
+def _take_apart(things: Sequence[MapObject], knowledge: Knowledge) -> list[MapObject]:
+    """Return the things, those that are too long for one and do not hang together as several, with new ids.
+
+    Chairs around a table are one fragment in a view across it, and one thing of the map from then on.
+    """
+    found, unused = list[MapObject](), max((thing.id for thing in things), default=0) + 1
+    for thing in things:
+        length = float(np.ptp(thing.points[:, :2], axis=0).max())
+        parts = [thing.voxels]
+        if length > TOO_LONG * knowledge.sides.get(thing.category, (np.inf,))[0]:
+            parts = split_voxels(thing.voxels)
+        found.append(replace(thing, voxels=parts[0]))
+        for part in parts[1:]:
+            found.append(replace(thing, id=unused, voxels=part))
+            unused += 1
+    return found
+
+
 def _name_rooms(
     seen: Sequence[MapObject], places: Mapping[int, int], grid: OccupancyGrid, knowledge: Knowledge
-) -> tuple[list[Room], dict[int, str], dict[str, float]]:
-    rooms, names, shares = [], dict[int, str](), dict[str, float]()
+) -> tuple[list[Room], dict[int, str], dict[str, dict[str, float]]]:
+    rooms, names, kinds = [], dict[int, str](), dict[str, dict[str, float]]()
     for number in range(1, int(grid.rooms.max(initial=0)) + 1):
         counts: dict[str, int] = {}
         for thing in seen:
@@ -118,15 +153,19 @@ def _name_rooms(
         probabilities = knowledge.judge_room(counts)
         kind = knowledge.kinds[int(probabilities.argmax())]
         name = f"{kind} {number}"
-        names[number], shares[name] = name, float(probabilities.max())
+        names[number], kinds[name] = name, dict(zip(knowledge.kinds, probabilities.tolist(), strict=True))
         cells = grid.to_points(np.argwhere(grid.rooms == number))
         corners = to_table_frame(np.concatenate([cells, np.zeros((len(cells), 1))], axis=1))
         rooms.append(Room(name, kind, corners.min(axis=0), corners.max(axis=0)))
-    return rooms, names, shares
+    return rooms, names, kinds
 
 
 def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Knowledge) -> Thing:
     corners = to_table_frame(thing.bounds)
+    low, high, front = corners.min(axis=0), corners.max(axis=0), np.array([0.0, 0.0, 1.0])
+    if thing.category in FRONTED | WORKTOPS:
+        front = _find_front(thing, grid)
+        low, high = _complete_bounds(low, high, front, knowledge.sides.get(thing.category, (0.0, 0.0))[1])
     return Thing(
         id=thing.id,
         name=f"{thing.category} {thing.id}",
@@ -135,25 +174,40 @@ def _make_thing(thing: MapObject, room: str, grid: OccupancyGrid, knowledge: Kno
         material=knowledge.materials.get(thing.category, ""),
         state=thing.state,
         room=room,
-        low=corners.min(axis=0),
-        high=corners.max(axis=0),
-        front=_find_front(thing, grid) if thing.category in FRONTED else np.array([0.0, 0.0, 1.0]),
+        low=low,
+        high=high,
+        front=front,
     )
 
 
+def _complete_bounds(
+    low: NDArray[np.float64], high: NDArray[np.float64], front: NDArray[np.float64], depth: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return bounds at least `depth` metres deep: of a worktop at eye level little but the front is in sight."""
+    axis = int(np.abs(front).argmax())
+    missing = np.zeros(3)
+    missing[axis] = max(0.0, depth - float(high[axis] - low[axis]))
+    return (low - missing, high) if front[axis] > 0 else (low, high + missing)
+
+
 def _find_front(thing: MapObject, grid: OccupancyGrid) -> NDArray[np.float64]:
-    """Return the horizontal axis on which the floor beside a thing is most free: furniture stands against walls."""
-    low, high = thing.bounds[:, :2]
-    middle, half = (low + high) / 2, (high - low) / 2
-    best, most = np.array([1.0, 0.0]), -1.0
+    """Return the horizontal axis, in the table's frame, that a thing faces along: floor ahead, a wall behind, wide."""
+    best, most = np.array([1.0, 0.0]), -np.inf
     for axis in np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]):
         across = np.array([-axis[1], axis[0]])
-        ahead = np.abs(axis) @ half + np.array([0.15, 0.3, 0.45, 0.6])
-        beside = np.linspace(-0.8, 0.8, 5) * (np.abs(across) @ half)
-        points = middle + ahead[:, None, None] * axis + beside[None, :, None] * across
-        free = float(grid.lookup(grid.free, points.reshape(-1, 2)).mean())
-        if free > most:
-            best, most = axis, free
+        along, beside = np.sort(thing.points[:, :2] @ axis), np.sort(thing.points[:, :2] @ across)
+        last = len(along) - 1
+        width = np.linspace(beside[int(0.1 * last)], beside[int(0.9 * last)], 5)
+
+        def look(layer: NDArray[np.bool_], places: NDArray[np.float64]) -> NDArray[np.bool_]:
+            points = places[:, None, None] * axis + width[None, :, None] * across  # noqa: B023 - used at once
+            return grid.lookup(layer, points.reshape(-1, 2)).reshape(len(places), -1)
+
+        free = look(grid.free, along[int(0.98 * last)] + np.array([0.15, 0.3, 0.45, 0.6])).mean()
+        wall = look(grid.walls, along[int(0.02 * last)] - np.arange(0.0, WALL_REACH, 0.05)).any(axis=0).mean()
+        score = free + wall + 0.25 * (np.ptp(along) <= np.ptp(beside))
+        if score > most:
+            best, most = axis, score
     return to_table_frame(np.array([best[0], best[1], 0.0]))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,7 +21,7 @@ from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import plans, presets, prompt_images
 from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout
+from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.cache import open_reply_cache
 from wiw.vlm.messages import Part
@@ -155,7 +156,8 @@ class VLM(Policy):
             ArgumentError: a task without prompts.
         """
         if goal.task not in self.tasks:
-            raise ArgumentError(f"policy vlm: expected a task among {', '.join(self.tasks)}, got '{goal.task}'")
+            hint = f"; make it with task='{goal.task}'" if goal.question else ""
+            raise ArgumentError(f"policy vlm: expected a task among {', '.join(self.tasks)}, got '{goal.task}'{hint}")
         return Memory()
 
     def observe(self, situations: Sequence[Situation]) -> None:
@@ -168,10 +170,10 @@ class VLM(Policy):
     def propose(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
         """Return the model's plans; only one where none will be imagined, and then for recognition one primitive."""
         wanted = [self._build_requests(situation, candidates, horizon) for situation in situations]
-        replies = iter(self.client.ask([request for _, requests in wanted for request in requests]))
+        replies = self._ask_each([requests for _, requests in wanted])
         return [
-            self._build_proposals(situation, purpose, [next(replies) for _ in requests], horizon)
-            for situation, (purpose, requests) in zip(situations, wanted, strict=True)
+            self._build_proposals(situation, purpose, own, horizon)
+            for situation, (purpose, _), own in zip(situations, wanted, replies, strict=True)
         ]
 
     def extend(self, situations: Sequence[Situation], candidates: int, horizon: int) -> list[list[Proposal]]:
@@ -189,7 +191,7 @@ class VLM(Policy):
             *self._build_plan_prompt(situation, horizon), self._render_prompt(situation, "output", horizon, shared)
         )
         options: dict[str, Any] = {
-            "schema": self._get_plan_schema(horizon, shared),
+            "schema": self._get_plan_schema(situation, horizon, shared),
             "temperature": self.temperature,
             "max_tokens": MAX_PLAN_TOKENS * shared,
             "tries": self.tries,
@@ -204,7 +206,7 @@ class VLM(Policy):
         parts: list[Part] = [words, "Front view:", front, "Panorama:", panorama]
         return parts if situation.goal.image is None else [*parts, "Goal image:", situation.goal.image]
 
-    def _get_plan_schema(self, longest: int, count: int = 1) -> type[BaseModel]:
+    def _get_plan_schema(self, situation: Situation, longest: int, count: int = 1) -> type[BaseModel]:
         return plans.plan_schema(longest, count)
 
     def _parse_plans(self, value: Any) -> list[Proposal]:
@@ -249,12 +251,10 @@ class VLM(Policy):
         the share of each that agrees from its beginning with the plan written by the model ("write").
         """
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        requests = [self._build_scoring_request(*row) for row in rows]
-        asked = [request for request in requests if request is not None]
-        replies = iter(self.client.ask(asked))
+        replies = self._ask_each([self._build_scoring_requests(*row) for row in rows])
         return [
-            np.ones(1) if request is None else self._read_scores(situation, proposed, next(replies))
-            for (situation, proposed, _), request in zip(rows, requests, strict=True)
+            self._read_scores(situation, proposed, *own) if own else np.ones(1)
+            for (situation, proposed, _), own in zip(rows, replies, strict=True)
         ]
 
     def revise(
@@ -272,16 +272,17 @@ class VLM(Policy):
                 return plan.actions, index
         return actions, None
 
-    def _build_scoring_request(
+    def _build_scoring_requests(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
-    ) -> Request | None:
+    ) -> list[Request]:
+        """Return the question that ranks the plans; none where there is nothing to choose."""
         if situation.goal.choices:
             tracks = self._track_target(situation, proposals, rollouts)
             strips = [prompt_images.render_plan_strip(*row) for row in zip(proposals, rollouts, tracks, strict=True)]
-            return self._build_move_request(situation, _caption_strips(proposals, strips))
+            return [self._build_move_request(situation, _caption_strips(proposals, strips))]
         if self._selects(proposals) and len(proposals) == 1:
-            return None
-        return self._build_revision_request(situation, proposals, rollouts)
+            return []
+        return [self._build_revision_request(situation, proposals, rollouts)]
 
     def _selects(self, proposals: Sequence[Proposal]) -> bool:
         """Return whether the model selects one of the proposals, rather than writing a plan."""
@@ -309,26 +310,27 @@ class VLM(Policy):
         return Request((user(*parts),), schema=plans.plan_schema(horizon), seed=seed, tries=self.tries)
 
     def _read_scores(self, situation: Situation, proposals: Sequence[Proposal], reply: Reply) -> NDArray[np.float64]:
-        fallback = -np.arange(len(proposals), dtype=np.float64)
         memory: Memory = situation.memory
         if situation.goal.choices:
             found = self._read_move_probabilities(situation, reply, "the first plan was taken")
             if found is None:
-                memory.decision = None
-                return fallback
+                return self._rate_plans(situation, proposals, reply, None)
             memory.decision = situation.key, np.array([MOVES[int(found.argmax())]], np.int8)
             return np.array(
                 [found[MOVES.index(plan.actions[0])] if plan.actions[0] in MOVES else 0.0 for plan in proposals]
             )
         self._record_exchange(situation.key, "revise", reply, "the first plan was taken")
-        memory.decision = None
-        if reply.problem is not None:
-            return fallback
-        if reply.probabilities is not None:
-            return reply.probabilities
-        (written,) = self._parse_plans(reply.value)
-        memory.decision = situation.key, written.actions
-        return np.array([_measure_agreement(plan.actions, written.actions) for plan in proposals])
+        written = None if reply.value is None else self._parse_plans(reply.value)[0].actions
+        return self._rate_plans(situation, proposals, reply, written)
+
+    def _rate_plans(
+        self, situation: Situation, proposals: Sequence[Proposal], reply: Reply, written: NDArray[Any] | None
+    ) -> NDArray[np.float64]:
+        """Return the plans' scores by the reply to a revision, and remember the plan that it has written."""
+        situation.memory.decision = None if written is None else (situation.key, written)
+        if written is not None:
+            return np.array([_measure_agreement(plan.actions, written) for plan in proposals])
+        return -np.arange(len(proposals), dtype=np.float64) if reply.probabilities is None else reply.probabilities
 
     def _build_move_request(self, situation: Situation, imagined: Sequence[Part]) -> Request:
         """Ask for the next primitive."""
@@ -350,22 +352,19 @@ class VLM(Policy):
         situations: Sequence[Situation],
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
-    ) -> list[Answer | None]:
+    ) -> Sequence[Answer | TextAnswer | None]:
         """Return the category, by views centred on the boxed target: the real one, and those imagined for each plan."""
         rows = list(zip(situations, proposals, rollouts, strict=True))
-        requests = [self._build_answer_request(*row) if row[0].goal.choices else None for row in rows]
-        replies = iter(self.client.ask([request for request in requests if request is not None]))
+        replies = self._ask_each([self._build_answer_requests(*row) if row[0].goal.choices else [] for row in rows])
         return [
-            self._build_answer(situation, None if request is None else next(replies))
-            if situation.goal.choices
-            else None
-            for situation, request in zip(situations, requests, strict=True)
+            self._build_answer(situation, *own) if situation.goal.choices else None
+            for situation, own in zip(situations, replies, strict=True)
         ]
 
-    def _build_answer_request(
+    def _build_answer_requests(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout] | None
-    ) -> Request | None:
-        """Ask for the category; None where the target is in no view."""
+    ) -> list[Request]:
+        """Ask for the category; nothing where the target is in no view."""
         real = prompt_images.render_target(situation.observation)
         strips: list[prompt_images.Image] = []
         if rollouts is not None:
@@ -376,17 +375,16 @@ class VLM(Policy):
             ]
             strips = [strip for strip in found if strip is not None]
         if real is None and not strips:
-            return None
+            return []
         parts: list[Part] = [self._render_prompt(situation, "answerer", 1)]
         parts += [] if real is None else [real]
         if strips:
             parts += [self._render_prompt(situation, "answerer_imagined", 1), *strips]
         choices = situation.goal.choices
-        return Request(
-            (user(*parts),), choices=choices, seed=derive_seed(situation.key, _ANSWER_SEED), tries=self.tries
-        )
+        seed = derive_seed(situation.key, _ANSWER_SEED)
+        return [Request((user(*parts),), choices=choices, seed=seed, tries=self.tries)]
 
-    def _build_answer(self, situation: Situation, reply: Reply | None) -> Answer:
+    def _build_answer(self, situation: Situation, reply: Reply | None = None) -> Answer:
         memory, choices = situation.memory, situation.goal.choices
         instead = "no choice was preferred" if memory.belief is None else "the last answer was kept"
         if reply is None:
@@ -411,6 +409,11 @@ class VLM(Policy):
         return memory.tracks[1]
 
     # ------------------------------------------------------------------------------------------------------------------
+
+    def _ask_each(self, requests: Sequence[Sequence[Request]]) -> list[list[Reply]]:
+        """Ask the questions of all episodes at once; return the replies of each."""
+        replies = iter(self.client.ask([request for own in requests for request in own]))
+        return [list(islice(replies, len(own))) for own in requests]
 
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
         return self.prompts.render(

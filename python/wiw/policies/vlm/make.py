@@ -8,22 +8,27 @@ from typing import Any
 
 from wiw.policies.vlm import VLM
 from wiw.policies.vlm.arm import ArmVLM
+from wiw.policies.vlm.questions import QuestionVLM
 from wiw.types import GRIPPER_POSES, PRIMITIVES
 
 
-def make_vlm(space: str = PRIMITIVES, **options: Any) -> VLM:
+def make_vlm(space: str = PRIMITIVES, task: str = "", **options: Any) -> VLM:
     """Ask a vision-language model for plans, scores and answers (any OpenAI-compatible server, or a local model).
 
-    `VLM` documents the options.
+    `VLM` documents the options, and `QuestionVLM` those of task "aeqa".
     """
-    return (ArmVLM if space == GRIPPER_POSES else VLM)(**options)
+    kind = ArmVLM if space == GRIPPER_POSES else QuestionVLM if task in QuestionVLM.tasks else VLM
+    return kind(**options)
 
 
 def _signature() -> inspect.Signature:
-    """The options of `VLM`, so that `--policy-option` and errors name them."""
-    own = inspect.signature(make_vlm, eval_str=True).parameters["space"].replace(kind=inspect.Parameter.KEYWORD_ONLY)
+    """The options of all classes, so that `--policy-option` and errors name them."""
     *options, rest = inspect.signature(VLM).parameters.values()
-    return inspect.Signature([*options, own, rest])
+    own = inspect.signature(make_vlm, eval_str=True).parameters
+    asking = inspect.signature(QuestionVLM).parameters.values()
+    more = [each for each in asking if each.kind is inspect.Parameter.KEYWORD_ONLY]
+    named = [own[name].replace(kind=inspect.Parameter.KEYWORD_ONLY) for name in ("space", "task")]
+    return inspect.Signature([*options, *more, *named, rest])
 
 
 make_vlm.__signature__ = _signature()  # type: ignore[attr-defined]

@@ -59,7 +59,7 @@ class ArmVLM(VLM):
             prompt_images.render_observation(situation.observation),
         ]
 
-    def _get_plan_schema(self, longest: int, count: int = 1) -> type[BaseModel]:
+    def _get_plan_schema(self, situation: Situation, longest: int, count: int = 1) -> type[BaseModel]:
         return plans.plan_schema(longest, count)
 
     def _parse_plans(self, value: Any) -> list[Proposal]:
@@ -91,7 +91,9 @@ class ArmVLM(VLM):
             choices = tuple(f"plan {number}" for number in range(1, len(proposals) + 1))
             return Request((user(*parts),), choices=choices, **options)
         parts.append(self._render_prompt(situation, "output", horizon))
-        return Request((user(*parts),), schema=self._get_plan_schema(horizon), max_tokens=MAX_PLAN_TOKENS, **options)
+        return Request(
+            (user(*parts),), schema=self._get_plan_schema(situation, horizon), max_tokens=MAX_PLAN_TOKENS, **options
+        )
 
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
         observation = situation.observation

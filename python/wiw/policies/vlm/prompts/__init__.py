@@ -5,7 +5,9 @@ them.
 Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
 and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,
 `rotation_bins` and `rotation_degrees` (as `wiw.action.PoseGrid`), `table_height` (Z of its top), `colours` (names),
-`instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far).
+`instruction`, `objects` (index to [X, Y, Z]), `gripper` (its pose) and `executed` (actions so far). Question answering:
+`obs_key`, `question`, `detected_objs` (view to number to name), `history` (plans so far, in words), `actions`,
+`action_times` (how often one may be repeated) and `high_level_plan` (what the low-level planner is to carry out).
 
 The shipped templates are filled here, a user's in a process with limits on time, memory and length
 (`wiw.vlm.template_filler`).
@@ -44,6 +46,23 @@ ARM_SLOTS: dict[str, Any] = {
     "executed": [[50, 50, 40, 0, 60, 60, 1]],
 }
 """Every slot of manipulation, likewise."""
+QUESTION_SLOTS: dict[str, Any] = {
+    "obs_key": "front view",
+    "question": "What color is the sofa?",
+    "detected_objs": {"front": {1: "sofa"}, "left": {}},
+    "history": ["after 0 actions: Go through the opening."],
+    "look_ahead_action_num": 4,
+    "plan_num": 1,
+    "actions": {"forward": "go straight for 0.20 m"},
+    "action_times": 4,
+    "high_level_plan": {"action_plan": "Go to the sofa.", "chosen_view": "front", "chosen_landmark": 1},
+}
+"""Every slot of question answering, likewise."""
+
+
+def get_slots(task: str) -> dict[str, Any]:
+    """Return every slot of a task's templates, with values to test them with."""
+    return {"manipulation": ARM_SLOTS, "aeqa": QUESTION_SLOTS}.get(task, SLOTS)
 
 
 def list_tasks() -> list[str]:
@@ -104,8 +123,7 @@ class Prompts:
                 raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
         own = {name: (path, _read_source(path)) for name, path in found.items()}
         for path, source in own.values():  # tried on, so that what is wrong is known before the first question
-            slots = ARM_SLOTS if path.parent.name == "manipulation" else SLOTS
-            self._filling.fill(path, source, slots, check=True)
+            self._filling.fill(path, source, get_slots(path.parent.name), check=True)
         return own
 
 

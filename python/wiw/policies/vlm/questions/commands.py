@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two languages of question answering: commands of the high-level planner, walks of the low-level planner.
+
+A command names a landmark or a view and says in words what to do there; it may come with an answer. A walk is a few
+primitives, each several times.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.mapping.landmarks import Landmark
+from wiw.mapping.marks import MarkedViews
+from wiw.mapping.views import VIEW_NAMES
+from wiw.policies.vlm import shorten
+from wiw.policies.vlm.plans import PRIMITIVES
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+WALK_ACTIONS, WALK_TIMES = 4, 4
+"""Most different actions of a walk, and most times that each is repeated, as in the published code."""
+STOP = "stop"
+WALK_NAMES = (*PRIMITIVES, STOP)
+LONGEST_ANSWER = 300
+"""Characters of an answer."""
+_NOTHING = ("", "none", "null", "n/a")
+"""Words that models write for null."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """What the high-level planner wants done."""
+
+    plan: str
+    """In its words."""
+    view: int
+    """Number of the view to go on in."""
+    mark: int | None = None
+    """Number of the landmark in the pictures; None where the words alone say what to do."""
+    landmark: Landmark | None = None
+    answer: str = ""
+    """Answer to the question; empty where it cannot be answered yet."""
+
+    def to_prompt(self) -> dict[str, Any]:
+        """Return the command as models write it, for the prompts that come after it."""
+        return {"action_plan": self.plan, "chosen_view": VIEW_NAMES[self.view], "chosen_landmark": self.mark}
+
+
+@lru_cache(maxsize=256)
+def command_schema(marks: tuple[int, ...], count: int = 1, answers: bool = True) -> type[BaseModel]:
+    """Return the schema of a command, in the paper's fields; {plans: [...]} of up to `count` of them where count > 1.
+
+    Args:
+        marks: numbers of the landmarks that may be chosen.
+        count: how many commands are asked for.
+        answers: whether a command comes with an answer; not where imagined views are shown.
+    """
+    from pydantic import ConfigDict, Field, create_model, field_validator
+
+    strict: Any = ConfigDict(extra="forbid")
+    landmark: Any = Literal[marks] | None if marks else None
+    fields: dict[str, Any] = {
+        "reason": (str, ...),
+        "action_plan": (str, Field(min_length=1)),
+        "chosen_view": (Literal[VIEW_NAMES], ...),
+        "chosen_landmark": (landmark, ...),
+    }
+    if answers:
+        fields["answer"] = (str | None, Field(max_length=LONGEST_ANSWER))
+    loose = {
+        "read_landmark": field_validator("chosen_landmark", mode="before")(_read_number),
+        "read_answer": field_validator("answer", mode="before", check_fields=False)(_read_null),
+    }
+    command = create_model("Command", __config__=strict, __validators__=loose, **fields)
+    if count == 1:
+        return command
+    plans: Any = (list[command], Field(min_length=1, max_length=count))  # type: ignore[valid-type]
+    return create_model("Commands", __config__=strict, plans=plans)
+
+
+@lru_cache(maxsize=1)
+def answer_schema() -> type[BaseModel]:
+    """Return the schema {reason, answer}."""
+    from pydantic import ConfigDict, Field, create_model, field_validator
+
+    loose = {"read_answer": field_validator("answer", mode="before")(_read_null)}
+    answer: Any = (str | None, Field(max_length=LONGEST_ANSWER))
+    strict: Any = ConfigDict(extra="forbid")
+    return create_model("Answer", __config__=strict, __validators__=loose, reason=(str, ...), answer=answer)
+
+
+@lru_cache(maxsize=1)
+def walk_schema() -> type[BaseModel]:
+    """Return the schema {reason, actions: [{action, times}]} of a walk."""
+    from pydantic import ConfigDict, Field, create_model
+
+    strict: Any = ConfigDict(extra="forbid")
+    times: Any = (int, Field(ge=1, le=WALK_TIMES))
+    names: Any = (Literal[WALK_NAMES], ...)
+    step = create_model("Step", __config__=strict, action=names, times=times)
+    actions: Any = (list[step], Field(min_length=1, max_length=WALK_ACTIONS))  # type: ignore[valid-type]
+    return create_model("Walk", __config__=strict, reason=(str, ...), actions=actions)
+
+
+def parse_commands(value: Any, marked: MarkedViews) -> list[Command]:
+    """Return the commands of a validated answer.
+
+    A landmark has one number in all views, so that it counts where another view was named beside it.
+    """
+    return [_parse_command(each, marked) for each in getattr(value, "plans", None) or [value]]
+
+
+def parse_walk(value: Any) -> NDArray[np.int8]:
+    """Return the primitives of a validated walk, up to where it stops."""
+    actions: list[int] = []
+    for step in value.actions:
+        if step.action == STOP:
+            break
+        actions += [PRIMITIVES[step.action]] * step.times
+    return np.array(actions, np.int8)
+
+
+def parse_answer(value: Any) -> str:
+    """Return the answer of a validated reply; empty where there is none."""
+    return shorten(getattr(value, "answer", None) or "")
+
+
+def list_marks(marked: MarkedViews) -> tuple[int, ...]:
+    """Return the numbers that stand in the pictures."""
+    return tuple(sorted({number for names in marked.names.values() for number in names}))
+
+
+def name_marks(marked: MarkedViews) -> dict[str, dict[int, str]]:
+    """Return what the numbers mean, by the name of the view and the number."""
+    return {VIEW_NAMES[view]: dict(names) for view, names in sorted(marked.names.items())}
+
+
+def _parse_command(value: Any, marked: MarkedViews) -> Command:
+    mark, view = value.chosen_landmark, VIEW_NAMES.index(value.chosen_view)
+    landmark = None if mark is None else marked.landmarks[mark]
+    if landmark is not None and view not in landmark.masks:
+        view = landmark.view
+    return Command(shorten(value.action_plan), view, mark, landmark, parse_answer(value))
+
+
+def _read_null(value: Any) -> Any:
+    """Read words for nothing, such as "None", as null."""
+    nothing = isinstance(value, str) and value.strip().casefold().rstrip(".") in _NOTHING
+    return None if nothing else value
+
+
+def _read_number(value: Any) -> Any:
+    """Read a number in quotes as a number, and words for nothing as null."""
+    return int(value) if isinstance(value, str) and value.strip().isdecimal() else _read_null(value)
