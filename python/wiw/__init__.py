@@ -36,6 +36,7 @@ __all__ = [
     "envs",
     "errors",
     "evaluate",
+    "judge",
     "load_run",
     "make",
     "make_vec",
@@ -70,6 +71,7 @@ _HOME = {
     "collect": "wiw.training.collect",
     "compare": "wiw.studies.compare",
     "evaluate": "wiw.studies.evaluate",
+    "judge": "wiw.studies.judge",
     "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
     "make_vec": "wiw.registry",
@@ -133,6 +135,7 @@ if TYPE_CHECKING:
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare
     from wiw.studies.evaluate import evaluate
+    from wiw.studies.judge import judge
     from wiw.studies.model_check import check_model
     from wiw.studies.run_log import load_run
     from wiw.studies.scale import scale

@@ -194,6 +194,20 @@ class Wording:
 
 
 @dataclass(frozen=True)
+class TableSpec:
+    """What the tables and plots of a task's runs show beside the metrics of each arm."""
+
+    kinds: tuple[str, ...] = ("success",)
+    """Metrics that are shown for each kind of episode, where there are several."""
+    judged: tuple[str, ...] = ()
+    """Metrics that depend on a judge's marks."""
+    cuts: tuple[int, ...] = ()
+    """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on."""
+    kind: str = "kind of task"
+    """What a kind is called."""
+
+
+@dataclass(frozen=True)
 class Proposal:
     """One candidate plan: primitive ids int8 [K] or gripper poses float64 [K, 7], 1 <= K <= horizon."""
 

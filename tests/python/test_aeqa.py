@@ -267,9 +267,26 @@ def test_an_answer_that_cannot_be_judged_is_an_error_and_no_failure(episode):
     task = make_task(episode, judge=Broken())
     sink = run(task, Talker(final("novel")), [episode])
     assert [(each.status, each.kind) for each in sink.results] == [("error", "judge/huge")]
+    (error,) = sink.results
+    assert error.details["answer"] == "novel" and error.details["judgement"] is None
+    assert error.details["measured"]["primitives"] == 15 and error.details["measured"]["decisions"] == 2
+    assert [answer.text for answer in sink.answers] == ["novel"] * 2, "the decision that ended the episode is kept"
     sink = run(task, Talker(final("anything")), [episode])
     assert [(each.status, each.metrics["answer_score"]) for each in sink.results] == [("done", 0.5)]
     assert sink.results[0].details["judgement"]["judge"] == "broken"
+
+
+def test_an_episode_that_could_not_be_judged_is_judged_later(episode, tmp_path):
+    task, out = make_task(episode, judge=Broken()), tmp_path / "run"
+    log = wiw.evaluate(task, wiw.Agent(Talker(final("novel"))), 1, out=out, progress=False)
+    assert log.numbers().arms[0].errors == 1
+    found = wiw.judge(out, progress=False)
+    assert found.complete and found.log.numbers().arms[0].done == 1
+    (row,) = found.log.episodes
+    again = make_task(episode)
+    (expected,) = run(again, Talker(final("novel")), [episode]).results
+    assert row["metrics"] == expected.metrics, "the same numbers as if that judge had been the task's"
+    assert row["details"] == expected.details
 
 
 # -- the store ---------------------------------------------------------------------------------------------------------

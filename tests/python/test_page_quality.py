@@ -6,11 +6,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import pytest
+from aeqa_runs import Ended, color_question, free_question, make_episodes, write_run
 from browser import COMMAND, WHY, Browser
 from fakes import LineAgent, LineTask
 
 from wiw.report.site import write_view
 from wiw.studies.evaluate import run_arms
+from wiw.studies.run_log import load_run
 
 pytestmark = pytest.mark.skipif(COMMAND is None, reason=WHY)
 
@@ -81,7 +83,24 @@ def addresses(tmp_path_factory):
     )
     site = write_view(log, log.path / "view")
     episode = site.index.parent / "episodes" / "0000.html"
-    return {"report": log.report().as_uri(), "list": site.index.as_uri(), "episode": episode.as_uri()}
+    answers = load_run(write_questions(tmp_path_factory.mktemp("answers") / "run")).report()
+    return {
+        "report": log.report().as_uri(),
+        "list": site.index.as_uri(),
+        "episode": episode.as_uri(),
+        "answers": answers.as_uri(),
+    }
+
+
+def write_questions(folder):
+    """A run of questions with everything that its report can show: categories, twins, approximate marks, five arms."""
+    named = [("attribute recognition", "blue"), ("object state recognition", "red"), ("object localization", "white")]
+    questions = [color_question(color, category) for category, color in named * 3]
+    questions += [color_question("blue", twin="q10"), color_question("red", twin="q9"), free_question("it is night")]
+    scenes = [f"apartments:val/{index}" for index in range(10)] + ["apartments:val/9?remove:tv_1", "apartments:val/7"]
+    ends = [Ended("blue", 20 + 20 * index, 3.0 + index) for index in range(len(questions))]
+    arms = ("none", "copy", "warp", "placebo-shuffled:a_model_with_a_long_name", "oracle")
+    return write_run(folder, make_episodes(questions, scenes), dict.fromkeys(arms, ends))
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +110,7 @@ def browser(tmp_path_factory):
     page.close()
 
 
-PAGES = pytest.mark.parametrize("page", ["report", "list", "episode"])
+PAGES = pytest.mark.parametrize("page", ["report", "list", "episode", "answers"])
 
 
 @PAGES
@@ -125,9 +144,18 @@ def test_headings_are_in_order_and_no_header_is_empty(addresses, browser, page):
     assert browser.ask("[...document.images].every((image) => image.hasAttribute('alt'))")
 
 
+def test_tables_of_answers_fit_a_desktop(addresses, browser):
+    browser.resize(1280, 900)
+    browser.open(addresses["answers"])
+    assert browser.ask("document.querySelectorAll('.scroll').length") > 8
+    scrolled = "[...document.querySelectorAll('#results .scroll')].filter((e) => e.scrollWidth > e.clientWidth)"
+    assert browser.ask(f"{scrolled}.map((e) => e.textContent.trim().slice(0, 60))") == []
+
+
+@pytest.mark.parametrize("page", ["report", "answers"])
 @pytest.mark.parametrize("width", [390, 1280])
-def test_texts_of_plots_do_not_collide(addresses, browser, width):
+def test_texts_of_plots_do_not_collide(addresses, browser, width, page):
     browser.resize(width, 900)
-    browser.open(addresses["report"])
+    browser.open(addresses[page])
     assert browser.ask("document.querySelectorAll('.plots svg text').length") > 20
     assert browser.ask(COLLIDING) == []

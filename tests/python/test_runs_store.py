@@ -11,6 +11,7 @@ from fakes import LineTask
 
 import wiw
 from wiw.errors import ArgumentError, StoreError
+from wiw.runs.judges import JudgedRow, JudgeRecord
 from wiw.runs.rows import OutcomeRow, decision_row, decode_jpeg, encode_jpeg, strip, to_json
 from wiw.runs.store import SCHEMA_VERSION, RunStore
 from wiw.studies.run_log import load_run
@@ -18,7 +19,7 @@ from wiw.types import Decision, DecisionRecord, EpisodeResult, Goal, Observation
 
 ARMS = [{"name": "none", "agent": {"policy": "line"}}, {"name": "warp", "agent": {"policy": "line", "model": "warp"}}]
 CONFIG = {"task": {"task": "line"}, "seed": 0, "episodes": 3, "arms": ARMS}
-INFO = {"pictures": [0]}
+INFO = {"pictures": [0], "task": None, "agents": {}, "live": 1, "workers": 1, "limits": {}}
 
 
 def record(episode, index, rollouts=True):
@@ -125,8 +126,35 @@ def test_a_store_of_an_older_schema_is_read_as_it_lies(old_run):
     assert log.numbers()["none"].errors == 1 and log.numbers()["none"].done == 1 and len(log.decisions) == 5
     assert log.store.pending("none") == [] and log.store.pending("none", retry_errors=True) == [1]
     assert "no such scene" in log.report().read_text()
+    assert log.store.judges == [] and log.store.judged_outcomes("any") == {}
     log.close()
     assert version_and_statuses(old_run) == (7, ["done", "failed"])
+
+
+def test_a_store_of_an_older_schema_is_updated_when_marks_are_added(old_run):
+    with RunStore.annotate(old_run) as store:
+        store.add_judge(JudgeRecord({"judge": "strict"}))
+        store.write_judged(JudgedRow(store.judges[0].digest, "none", 0, {"success": 0.0}, {}))
+    with RunStore.read(old_run) as store:
+        store.use_judge("strict")
+        assert [row["metrics"].get("success") for row in store.outcomes()] == [0.0, None]
+        assert store.recorded_outcomes()[0]["metrics"]["success"] == 1.0
+    assert version_and_statuses(old_run) == (SCHEMA_VERSION, ["done", "error"])
+
+
+def test_marks_are_written_once_and_errors_replaced(run):
+    run.write(OutcomeRow("warp", EpisodeResult(0, "0000", "line/0", "done", {"success": 1.0})))
+    judge = JudgeRecord({"judge": "strict"})
+    run.add_judge(judge)
+    for row in (
+        JudgedRow(judge.digest, "warp", 0, {}, {}, "no mark", "judge/empty"),
+        JudgedRow(judge.digest, "warp", 0, {"success": 0.0}, {}),
+        JudgedRow(judge.digest, "warp", 0, {"success": 1.0}, {}),
+        JudgedRow(judge.digest, "warp", 0, {}, {}, "no mark", "judge/empty"),
+    ):
+        run.write_judged(row)
+    (found,) = run.judged_outcomes(judge.digest).values()
+    assert found["status"] == "done" and found["metrics"] == {"success": 0.0} and not found["error"]
 
 
 def test_a_store_of_an_older_schema_is_updated_when_it_is_resumed(old_run):

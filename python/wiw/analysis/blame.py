@@ -197,9 +197,12 @@ def _verdict_cells(line: ArmBlame) -> list[str]:
 
 
 def read_blame(run: RunStore) -> Blame | None:
-    """Return the verdicts on a run's failures so far; None where none was rerun."""
+    """Return the verdicts on a run's failures so far; None where none was rerun.
+
+    None too where another judge's marks are read than the run's own, by which reruns are failures.
+    """
     folder = run.path.parent / FOLDER
-    if not RunStore.exists(folder):
+    if not RunStore.exists(folder) or (run.judge is not None and not run.judge.own):
         return None
     with RunStore.read(folder) as store:
         if store.config["attributes"] != run.created:  # of an older run in the same folder

@@ -101,7 +101,7 @@ def adjust_p_values(differences: Sequence[Difference]) -> tuple[Difference, ...]
 def compare(
     arm: str, base: str, outcomes: Mapping[str, Mapping[int, Mapping[str, Any]]], metric: Metric, seed: int = 0
 ) -> Difference | None:
-    """Return the paired difference of two arms, or None without common episodes.
+    """Return the paired difference of two arms, or None without common episodes that have the metric.
 
     Args:
         arm: name of the arm under test.
@@ -110,7 +110,11 @@ def compare(
         metric: which metric.
         seed: of the bootstrap.
     """
-    both = sorted(set(outcomes[arm]) & set(outcomes[base]))
+    both = [
+        index
+        for index in sorted(set(outcomes[arm]) & set(outcomes[base]))
+        if all(metric.name in outcomes[name][index]["metrics"] for name in (arm, base))
+    ]
     if not both:
         return None
     ours, theirs = ([outcomes[name][i]["metrics"][metric.name] for i in both] for name in (arm, base))

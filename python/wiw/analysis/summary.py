@@ -11,12 +11,24 @@ from dataclasses import dataclass, field, replace
 from functools import cache, reduce
 from typing import Any
 
+from wiw.analysis.breakdowns import (
+    Breakdown,
+    compare_anytime_curves,
+    find_twins,
+    read_anytime_curve,
+    score_twins,
+    split_by_kind,
+)
+from wiw.analysis.marks import BLIND, Marks, answer_blind, read_marks
 from wiw.analysis.statistics import Difference, Estimate, adjust_p_values, compare, estimate_mean
 from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
-from wiw.metrics.metric import SUCCESS, Metric
+from wiw.metrics.metric import ANSWER_SCORE, Metric
 from wiw.registry import METRICS
+from wiw.runs.judges import JudgeRecord
 from wiw.runs.run import Records, Run
+from wiw.scenes import strip_edits
+from wiw.types import TableSpec
 
 ROLES = {
     "none": "policy without a world model",
@@ -34,6 +46,7 @@ GAINS = {
     "copy": "Gain over the floor, which predicts that nothing changes",
 }
 """What a difference from these arms measures."""
+BLIND_ROLE = "floor, best guess from the question's text alone"
 WORLD_MODEL, ANOTHER_POLICY = "world model", "another policy without a world model"
 
 MAX_ERROR_SHARE = 0.01
@@ -90,10 +103,25 @@ class Summary:
     """Whether all arms are scored on the same episodes, so that their lines can be compared as they stand."""
     utilities: tuple[Utility, ...] = ()
     """Where each arm stands between "copy" and "oracle", if the run has both."""
-    kinds: Mapping[str, Mapping[str, Estimate]] = field(default_factory=dict)
-    """Success rates by kind of episode, then by arm, where a task has several kinds."""
+    breakdowns: tuple[Breakdown, ...] = ()
+    """Further tables: by kind of episode, the anytime curve, twins, where the task has these."""
+    baselines: tuple[ArmSummary, ...] = ()
+    """Lines beside the arms that no agent was run for: answers from the question's text alone."""
+    marks: Marks | None = None
+    """Whose marks scores rest on, where answers are judged."""
+
     unbalanced: int = field(default=0, kw_only=True)
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
+
+    @property
+    def lines(self) -> tuple[ArmSummary, ...]:
+        """All lines of the table: arms, then baselines."""
+        return (*self.arms, *self.baselines)
+
+    @property
+    def kinds(self) -> dict[str, dict[str, Estimate]]:
+        """Estimates of the first metric that is shown by kind of episode: by kind, then by arm."""
+        return next((each.rows for each in self.breakdowns if each.name == "kinds"), {})
 
     def groups(self) -> tuple[Group, ...]:
         """Return the differences as tables, one per base."""
@@ -159,6 +187,11 @@ def summarise(
     episodes: int,
     seed: int = 0,
     policies: Collection[str] = (),
+    *,
+    tables: TableSpec = TableSpec(),  # noqa: B008 - frozen
+    twins: Sequence[tuple[int, int]] = (),
+    judge: JudgeRecord | None = None,
+    pairs: Sequence[tuple[str, str]] | None = None,
 ) -> Summary:
     """Return the numbers of a run.
 
@@ -168,6 +201,10 @@ def summarise(
         episodes: how many the run has.
         seed: of the bootstrap.
         policies: arms that have no world model and differ from "none" by their policy.
+        tables: what the task has tables show.
+        twins: pairs of episodes that are twins.
+        judge: whose marks the outcomes have, where answers are judged.
+        pairs: arms whose anytime curves are compared, each with its base; None for each arm with "none" and "copy".
     """
     done, errors = split_outcomes(arms, outcomes)
     lines = tuple(_line(arm, role_of(arm, policies), done[arm], errors[arm], episodes, seed) for arm in arms)
@@ -178,14 +215,31 @@ def summarise(
         for difference in _differences_from(base, arms, done, seed)
     )
     same = len({frozenset(ended) for ended in done.values()}) == 1
-    return Summary(lines, differences, same, _utilities(lines, done), _kinds(done, seed))
+    blind = answer_blind(done, tables.cuts) if BLIND not in done else {}
+    baselines = (_line(BLIND, BLIND_ROLE, blind, 0, len(blind), seed),) if blind else ()
+    marks = read_marks(judge, outcomes, arms, tables)
+    beside = {**done, BLIND: blind} if blind else done
+    if pairs is None:
+        pairs = [(arm, base) for base in ("none", FLOOR) if base in arms for arm in arms if arm not in (base, "none")]
+    breakdowns = _break_down(beside, pairs, tables, twins, marks, seed)
+    return Summary(lines, differences, same, _utilities(lines, done), breakdowns, baselines, marks)
 
 
 def summarise_run(run: Run) -> Summary:
     """Return means, intervals and paired differences of a run."""
     config = run.store.config
     policies = [arm["name"] for arm in config["arms"] if arm["agent"].get("model") is None]
-    found = summarise(run.arms, run.store.outcomes(), len(run.store.episodes()), config["seed"], policies)
+    episodes = run.store.episodes()
+    found = summarise(
+        run.arms,
+        run.store.outcomes(),
+        len(episodes),
+        config["seed"],
+        policies,
+        tables=run.tables,
+        twins=find_twins(episodes),
+        judge=run.store.judge,
+    )
     return replace(found, unbalanced=count_unbalanced(run))
 
 
@@ -202,13 +256,18 @@ def arm_table(run: Run) -> Records:
     summary = summarise_run(run)
     utilities = {found.arm: found for found in summary.utilities}
     lines = []
-    for arm in summary.arms:
+    for arm in summary.lines:
         line: dict[str, Any] = {"arm": arm.name, "role": arm.role}
         line |= {"n": arm.done, "asked": arm.total, "errors": arm.errors}
         for metric, estimate in arm.estimates.items():
             line |= {metric: estimate.value, f"{metric}_low": estimate.low, f"{metric}_high": estimate.high}
         if found := utilities.get(arm.name):
             line |= {"utility": found.value, "utility_low": found.low, "utility_high": found.high}
+        if summary.marks is not None:
+            line |= {
+                "judge": summary.marks.judge.full_label,
+                "approximate_marks": summary.marks.approximate.get(arm.name, 0),
+            }
         lines.append(line)
     return Records(lines)
 
@@ -216,14 +275,18 @@ def arm_table(run: Run) -> Records:
 def split_outcomes(
     arms: Sequence[str], outcomes: Sequence[Mapping[str, Any]]
 ) -> tuple[dict[str, dict[int, Mapping[str, Any]]], dict[str, int]]:
-    """Return by arm the scored episodes, by index and with all metrics, and the number of errors."""
+    """Return by arm the scored episodes, by index and with all metrics, and the number of errors.
+
+    An edited copy of an apartment counts as the same scene: intervals are over apartments.
+    """
     known = load_metrics()
     done: dict[str, dict[int, Mapping[str, Any]]] = {arm: {} for arm in arms}
     errors = dict.fromkeys(arms, 0)
     for outcome in outcomes:
         if outcome["status"] == "done":
             metrics = reduce(lambda values, metric: metric.add_to(values), known, outcome["metrics"])
-            done[outcome["arm"]][outcome["episode"]] = {**outcome, "metrics": metrics}
+            scene = strip_edits(outcome["scene"])
+            done[outcome["arm"]][outcome["episode"]] = {**outcome, "scene": scene, "metrics": metrics}
         else:
             errors[outcome["arm"]] += 1
     return done, errors
@@ -253,15 +316,26 @@ def _utilities(lines: Sequence[ArmSummary], done: Mapping[str, Mapping[int, Mapp
     return tuple(one for one in found if one is not None)
 
 
-def _kinds(done: Mapping[str, Mapping[int, Mapping[str, Any]]], seed: int) -> dict[str, dict[str, Estimate]]:
-    found: dict[str, dict[str, Estimate]] = {}
-    for arm, ended in done.items():
-        judged = [o for o in ended.values() if "task" in o and "success" in o["metrics"]]
-        for kind in dict.fromkeys(o["task"] for o in judged):
-            own = [o for o in judged if o["task"] == kind]
-            values, scenes = [o["metrics"]["success"] for o in own], [o["scene"] for o in own]
-            found.setdefault(kind, {})[arm] = estimate_mean(values, scenes, SUCCESS, seed=seed)
-    return found
+def _break_down(
+    done: Mapping[str, Mapping[int, Mapping[str, Any]]],
+    pairs: Sequence[tuple[str, str]],
+    tables: TableSpec,
+    twins: Sequence[tuple[int, int]],
+    marks: Marks | None,
+    seed: int,
+) -> tuple[Breakdown, ...]:
+    known = {metric.name: _label(metric, marks) for metric in load_metrics()}
+    score = _label(ANSWER_SCORE, marks)
+    return (
+        *split_by_kind(done, [known[name] for name in tables.kinds if name in known], tables.kind, seed),
+        *read_anytime_curve(done, tables.cuts, score, seed),
+        *compare_anytime_curves(done, pairs, tables.cuts, score, seed),
+        *score_twins(done, twins, seed),
+    )
+
+
+def _label(metric: Metric, marks: Marks | None) -> Metric:
+    return metric if marks is None else marks.label(metric)
 
 
 def is_under_test(arm: str, role: str) -> bool:
@@ -287,21 +361,23 @@ def _load_metrics_on(path: tuple[str, ...]) -> tuple[Metric, ...]:
 
 
 def select_metrics(done: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> list[Metric]:
-    """Return the metrics that every scored episode has a value for."""
+    """Return the metrics that every scored episode has a value for, or some where a metric is partial."""
     ended = [outcome["metrics"] for arm in done.values() for outcome in arm.values()]
-    return [metric for metric in load_metrics() if ended and all(metric.name in metrics for metrics in ended)]
+    return [
+        metric
+        for metric in load_metrics()
+        if ended and (any if metric.partial else all)(metric.name in metrics for metrics in ended)
+    ]
 
 
 def _line(
     arm: str, role: str, done: Mapping[int, Mapping[str, Any]], errors: int, episodes: int, seed: int
 ) -> ArmSummary:
-    scenes = [outcome["scene"] for outcome in done.values()]
-    estimates = {
-        metric.name: estimate_mean(
-            [outcome["metrics"][metric.name] for outcome in done.values()], scenes, metric, seed=seed
-        )
-        for metric in select_metrics({arm: done})
-    }
+    estimates = {}
+    for metric in select_metrics({arm: done}):
+        own = [outcome for outcome in done.values() if metric.name in outcome["metrics"]]
+        values, scenes = [outcome["metrics"][metric.name] for outcome in own], [outcome["scene"] for outcome in own]
+        estimates[metric.name] = estimate_mean(values, scenes, metric, seed=seed)
     return ArmSummary(arm, role, len(done), errors, episodes - len(done) - errors, estimates)
 
 
@@ -312,10 +388,12 @@ def notes(summary: Summary) -> list[str]:
     if summary.invalid:
         found.insert(
             0,
-            f"INVALID RUN, do not report: {' '.join(summary.invalid)} Fix the cause, then `wiw resume --retry-errors`.",
+            f"INVALID RUN, do not report: {' '.join(summary.invalid)} Fix the cause, then {_name_remedy(summary)}.",
         )
     found += [_describe_missing(line) for line in summary.arms if line.done < line.total]
     found += [*_explain_intervals(summary), *_explain_differences(summary), *_explain_utility(summary)]
+    found += summary.marks.describe() if summary.marks is not None else []
+    found += _explain_partial(summary)
     found += [_explain_paper_name(metric) for metric in list_columns(summary) if metric.paper_name]
     found += summary.remarks()
     widest = max(
@@ -329,6 +407,13 @@ def notes(summary: Summary) -> list[str]:
             f"{widest.high - widest.low:.0f} points wide."
         )
     return found
+
+
+def _name_remedy(summary: Summary) -> str:
+    """Return the command that mends errors: judging again where marks are all that is missing."""
+    errors = sum(line.errors for line in summary.arms)
+    only_marks = summary.marks is not None and summary.marks.missing == errors
+    return "`wiw judge` with the same judge" if only_marks else "`wiw resume --retry-errors`"
 
 
 def _describe_missing(line: ArmSummary) -> str:
@@ -371,6 +456,17 @@ def _explain_utility(summary: Summary) -> list[str]:
     return found
 
 
+def _explain_partial(summary: Summary) -> list[str]:
+    """Return for which share of the scored episodes metrics are known that not all have."""
+    found = []
+    for metric in list_columns(summary):
+        counts = [(line.estimates[metric.name].n, line.done) for line in summary.arms if metric.name in line.estimates]
+        if any(known < done for known, done in counts):
+            known, done = min(counts)
+            found.append(f"{metric.label}: over the episodes for which it is known, {known} of {done} at least.")
+    return found
+
+
 def _explain_paper_name(metric: Metric) -> str:
     return f"{metric.label}: {metric.paper_name} in the paper."
 
@@ -396,7 +492,7 @@ def show_p(p_value: float | None) -> str:
 def list_columns(summary: Summary) -> list[Metric]:
     """Return the metrics that the summary has numbers for."""
     present = {metric for line in summary.arms for metric in line.estimates}
-    return [metric for metric in load_metrics() if metric.name in present]
+    return [_label(metric, summary.marks) for metric in load_metrics() if metric.name in present]
 
 
 def column_title(metric: Metric) -> str:

@@ -18,6 +18,7 @@ from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
+from wiw.cli.judge import judge
 from wiw.cli.names import list_names
 from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
@@ -50,8 +51,8 @@ on a task, for one world model or several on the same episodes, and measures how
 
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
-Exit codes: 0 done, 1 the run is invalid (verify: something differs), 2 error, 130 stopped by Ctrl-C, 75 stopped by
-SIGTERM, within 5 seconds. A stopped run keeps everything recorded; `wiw resume` continues it."""
+Exit codes: 0 done, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped by
+Ctrl-C, 75 stopped by SIGTERM, within 5 seconds. A stopped run keeps everything recorded; `wiw resume` continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
@@ -59,6 +60,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
     (blame, "blame", "Find the stage of the loop that causes a run's failures."),
+    (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "Compute how many episodes a run needs to show a difference."),
     (scale, "scale", "Success against the number of imagined futures."),

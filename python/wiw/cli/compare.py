@@ -8,16 +8,19 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import JudgeName
+
 Run = Positional[Annotated[Path, arg(metavar="RUN")]]
 Arm = Annotated[str | None, arg(metavar="NAME")]
 
 
-def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -> int:
+def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None, judge: JudgeName = None) -> int:
     """Compare two runs on the same episodes, the second minus the first.
 
       $ wiw compare runs/old runs/new                          # every arm that both have
       $ wiw compare runs/old /elsewhere/new --arm warp         # one
       $ wiw compare runs/a runs/b --arm warp --other mine      # mine of the second run minus warp of the first
+      $ wiw compare runs/a runs/b --judge rules+llm            # by the marks that `wiw judge` added to both
 
     Episodes are compared in pairs, so the runs must have the same task, seed, scenes and episodes; otherwise the
     message names the first field that differs. Other differences, such as the policy's weights or the version of wiw,
@@ -28,9 +31,11 @@ def compare(first: Run, second: Run, /, *, arm: Arm = None, other: Arm = None) -
         second: Folder of the run that is compared with it.
         arm: Arm of both runs, or of the first; all common arms if not given.
         other: Arm of the second run, if it has another name there.
+        judge: Judge whose marks are compared, by name or digest; each run's own if not given. Unlike judges are
+            refused.
     """
     from wiw.report.tables import print_summary
     from wiw.studies.compare import compare as compare_runs
 
-    print_summary(compare_runs(first, second, arm, other))
+    print_summary(compare_runs(first, second, arm, other, judge=judge))
     return 0

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import JudgeName
+
 Folder = Annotated[Path | None, arg(metavar="DIR")]
 
 
@@ -18,22 +20,25 @@ def export(
     csv: Folder = None,
     parquet: Folder = None,
     rerun: Annotated[Path | None, arg(metavar="FILE.rrd")] = None,
+    judge: JudgeName = None,
 ) -> int:
     """Write a run as plain tables for other programs, or as a recording for the Rerun viewer.
 
     $ wiw export runs/first --csv tables
     $ wiw export runs/first --parquet tables --rerun first.rrd
 
-    Tables: arms, episodes, outcomes, decisions and candidates. A stopped export leaves no half file.
+    Tables: arms, episodes, outcomes, decisions and candidates; where a task has them, kinds, anytime,
+    anytime_differences, twins, and judgements (of all judges). A stopped export leaves no half file.
 
     Args:
         run: The run's folder.
         csv: New folder for CSV files.
         parquet: New folder for Parquet files; needs pyarrow.
         rerun: Recording for `rerun FILE.rrd`, with the pictures that the run kept; needs rerun-sdk.
+        judge: Judge whose marks are exported, by name or digest (see `wiw judge`); the run's own if not given.
     """
     from wiw.studies.run_log import load_run
 
-    for path in load_run(run).export(csv, parquet, rerun):
+    for path in load_run(run, judge).export(csv, parquet, rerun):
         print(path)
     return 0

@@ -13,6 +13,8 @@ from wiw.runs.part_options import parse_options
 
 Options = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="KEY=VALUE")]
 """A flag that may be given several times."""
+JudgeName = Annotated[str | None, arg(metavar="NAME|DIGEST")]
+"""A judge that has marked a run's answers."""
 
 
 def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import JudgeName
+
 
 def report(
     run: Positional[Annotated[Path, arg(metavar="RUN")]],
@@ -16,11 +18,13 @@ def report(
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     episodes: Annotated[int | None, arg(metavar="N")] = None,
     max_mb: Annotated[float | None, arg(metavar="N")] = None,
+    judge: JudgeName = None,
 ) -> int:
     """Print the tables of a run and write its HTML report: one self-contained file.
 
     $ wiw report runs/first
     $ wiw report runs/first --out first.html --max-mb 1
+    $ wiw report runs/first --judge rules+llm
 
     Also works during the run.
 
@@ -30,11 +34,12 @@ def report(
         episodes: How many to show with pictures, the most telling first; all that kept them (see `wiw run
             --keep-images`) if not given.
         max_mb: Most megabytes of the file: pictures are made smaller, then episodes left out, until it fits.
+        judge: Judge whose marks are shown, by name or digest (see `wiw judge`); the run's own if not given.
     """
     from wiw.report.tables import print_costs, print_fidelity
     from wiw.studies.run_log import load_run
 
-    log = load_run(run)
+    log = load_run(run, judge)
     log.summary()
     print_costs(log)
     print_fidelity(log)

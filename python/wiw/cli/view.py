@@ -8,12 +8,15 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import JudgeName
+
 
 def view(
     run: Positional[Annotated[Path, arg(metavar="RUN")]],
     /,
     *,
     out: Annotated[Path | None, arg(metavar="DIR")] = None,
+    judge: JudgeName = None,
 ) -> int:
     """Write HTML pages to browse a run: all episodes with filters, and a timeline of each episode's decisions.
 
@@ -27,11 +30,12 @@ def view(
     Args:
         run: The run's folder.
         out: Folder to write, new or with an older view; `view` in the run's folder if not given.
+        judge: Judge whose marks are shown, by name or digest (see `wiw judge`); the run's own if not given.
     """
     from wiw.report.site import write_view
     from wiw.studies.run_log import load_run
 
-    log = load_run(run)
+    log = load_run(run, judge)
     site = write_view(log, out or log.path / "view")
     megabytes = site.size / 1e6
     print(f"{site.episodes} episodes, {site.pictures} pictures of {megabytes:.1f} MB\nview    {site.index}")

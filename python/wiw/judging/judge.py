@@ -63,6 +63,9 @@ class Judgement:
     """The language model's raw reply."""
     unanswered: bool = False
     """Whether there was no answer; the mark is the lowest then."""
+    seed: int | None = None
+    """Of the language model's sampling; None without one."""
+    temperature: float | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.mark, bool) or not isinstance(self.mark, int) or not 1 <= self.mark <= HIGHEST_MARK:
@@ -83,6 +86,11 @@ class Judge(ABC):
 
     name: str
     """Name in judgements and tables."""
+
+    @property
+    def concurrency(self) -> int:
+        """How many answers are best judged at a time, each in a thread of its own."""
+        return 1
 
     def judge(self, references: Sequence[Reference], answers: Sequence[str]) -> list[Judgement]:
         """Return one judgement per answer, in order.
@@ -142,6 +150,11 @@ class TieredJudge(Judge):
             raise ArgumentError("judge: expected at least one judge, got none")
         self.tiers = tuple(tiers)
         self.name = "+".join(tier.name for tier in self.tiers)
+
+    @property
+    def concurrency(self) -> int:
+        """That of the judge that takes most at a time."""
+        return max(tier.concurrency for tier in self.tiers)
 
     def can_judge(self, reference: Reference) -> bool:
         """Return whether one of the judges can."""

@@ -85,6 +85,11 @@ class LanguageModelJudge(Judge):
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _schema=make_schema())
 
+    @property
+    def concurrency(self) -> int:
+        """How many requests its client sends at a time."""
+        return self.client.concurrency
+
     def describe(self) -> dict[str, Any]:
         """Return the model, the digest of the prompt and the sampling.
 
@@ -126,7 +131,15 @@ class LanguageModelJudge(Judge):
             mark = read_mark(reply)
         except JudgeError as error:
             return JudgeError(f"question '{reference.question}': {self.client.model}: {error}", error.kind)
-        return Judgement(mark, self.name, model=self.client.model, prompt_digest=self.prompt.digest, reply=reply.text)
+        return Judgement(
+            mark,
+            self.name,
+            model=self.client.model,
+            prompt_digest=self.prompt.digest,
+            reply=reply.text,
+            seed=self.seed,
+            temperature=self.temperature,
+        )
 
 
 @cache

@@ -175,7 +175,12 @@ def _kind(error: BaseException) -> str:
 
 
 def _build_result(live: LiveEpisode) -> EpisodeResult:
-    metrics = {**live.env.result(), "decisions": float(live.decisions)}
+    """Return the end of an episode; where its judge gave no mark, an error with the details, to be judged again."""
+    try:
+        metrics = {**live.env.result(), "decisions": float(live.decisions)}
+    except (JudgeError, VlmError) as error:
+        found = _build_error_result(live.index, live.episode, live.begin, f"judge/{error.kind}", error)
+        return replace(found, details=dict(live.env.details()))
     details, seconds = dict(live.env.details()), time.perf_counter() - live.begin
     episode = live.episode
     return EpisodeResult(live.index, episode.episode_id, episode.scene, "done", metrics, seconds, details=details)

@@ -36,6 +36,8 @@ class Metric:
     """Smallest possible value; intervals of the mean end there."""
     paper_name: str = ""
     """Name of the metric in the World-in-World paper, if it differs from the label."""
+    partial: bool = False
+    """Whether some episodes have no value; the mean is over those that have one. Others need one of every episode."""
 
     @property
     def scale(self) -> float:
@@ -75,7 +77,12 @@ ANSWER_SCORE = Metric(
 )
 ANSWERED = Metric("answered", "Answered", "rate", True, about="Percent of questions that were answered in time.")
 GROUNDED = Metric(
-    "grounded", "Grounded", "rate", True, about="Percent of episodes in which what is asked about was in sight."
+    "grounded",
+    "Grounded",
+    "rate",
+    True,
+    about="Percent of episodes in which what is asked about was in sight.",
+    partial=True,
 )
 PATH_LENGTH = Metric(
     "path_length",

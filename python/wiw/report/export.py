@@ -7,11 +7,11 @@ Everything is written beside its place and renamed once it is whole, so that a k
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from wiw.analysis.summary import arm_table
+from wiw.analysis.summary import arm_table, summarise_run
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file, atomic_folder
 from wiw.runs.rows import to_json
@@ -48,9 +48,15 @@ def export(run: Run, csv: Path | None = None, parquet: Path | None = None, rerun
 def tables(run: Run) -> dict[str, Table]:
     """Return the run as tables of plain values, by name: arms, episodes, outcomes, decisions, candidates.
 
-    Ended episodes only; a metric is a column of outcomes, seconds and counts are columns of decisions.
+    Ended episodes only; a metric is a column of outcomes, seconds and counts are columns of decisions. Where the task
+    has them: kinds, anytime, anytime_differences, twins, and judgements, by all judges.
     """
     decisions = run.store.decisions()
+    further: dict[str, Table] = {}
+    for breakdown in summarise_run(run).breakdowns:
+        further.setdefault(breakdown.name, []).extend(breakdown.list_cells())
+    if judgements := list_judgements(run):
+        further["judgements"] = judgements
     return {
         "arms": [dict(line) for line in arm_table(run)],
         "episodes": _episodes(run),
@@ -60,7 +66,33 @@ def tables(run: Run) -> dict[str, Table]:
         ],
         "decisions": [_decision(row) for row in decisions],
         "candidates": [candidate for row in decisions for candidate in _candidates(row)],
+        **further,
     }
+
+
+def list_judgements(run: Run) -> Table:
+    """Return every judgement of the run by every judge, a dict each; none where its task has no answers in words."""
+    recorded = {(row["arm"], row["episode"]): row for row in run.store.recorded_outcomes()}
+    found: Table = []
+    for judge in run.store.judges:
+        judged = run.store.judged_outcomes(judge.digest)
+        for (arm, episode), row in ({**recorded, **judged} if judge.own else judged).items():
+            key = {"judge": judge.digest, "judge_name": judge.label, "own": judge.own, "arm": arm, "episode": episode}
+            found += [{**key, **each, "kind": row["kind"], "error": row["error"]} for each in _judged(row["details"])]
+    return found
+
+
+def _judged(details: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Yield the answers of an outcome, the agent's and the one from the text alone, with their judgements."""
+    blind = details.get("blind") or {}
+    pairs = (
+        ("agent", details.get("answer"), details.get("judgement")),
+        ("blind", *map(blind.get, ("answer", "judgement"))),
+    )
+    for answered_by, answer, judgement in pairs:
+        if answer:
+            marked = dict(judgement or {})
+            yield {"answered_by": answered_by, "answer": answer, "marked_by": marked.pop("judge", ""), **marked}
 
 
 def export_csv(run: Run, folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from wiw.analysis.blame import RERUNS, VERDICTS, Blame, read_blame
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
+from wiw.analysis.marks import BLIND
 from wiw.analysis.statistics import Difference
 from wiw.analysis.summary import Summary, list_columns, notes, summarise_run
 from wiw.errors import ArgumentError
@@ -102,6 +103,7 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
             whole=Album.whole,
             remark=remark,
             sentence=sentence(summary, wording(run.store)),
+            terms=explain_metrics(summary, wording(run.store)),
             plots=_plots(run, summary, truths, blamed),
             stories=shown,
             maps=maps,
@@ -141,6 +143,30 @@ def sentence(summary: Summary, words: Wording | None = None) -> str:
     return " ".join(parts)
 
 
+def explain_metrics(summary: Summary, words: Wording) -> list[tuple[str, str]]:
+    """Return what each column of the table of arms means in this task, and who gave the marks where there are any."""
+    own = {
+        "success": f"Success rate: percent of episodes that {words.succeeded}.",
+        "spl": "Success weighted by path length: a success counts as shortest path over path taken.",
+        "actions": f"Mean number of executed {words.steps}.",
+        "refused": "Mean number of gripper motions that ended early: out of reach, or blocked.",
+    }
+    if summary.marks is not None:
+        own["spl"] = (
+            "Score weighted by path length: it counts as shortest walk to where the answer can be seen, over metres "
+            "walked."
+        )
+    found = []
+    for metric in list_columns(summary):
+        name = f"{metric.label} ({metric.paper_name} in the paper)" if metric.paper_name else metric.label
+        found.append((name, own.get(metric.name, metric.about)))
+    if summary.marks is not None:
+        found.append(("Judge", f"{summary.marks.judge.full_label}: gave each answer a mark, 1 (wrong) to 5 (right)."))
+    if summary.baselines:
+        found.append((BLIND, "The most frequent answer of train scenes to such a question, without looking."))
+    return found
+
+
 def _describe_gain(difference: Difference | None) -> str:
     if difference is None:
         return "."
@@ -175,7 +201,7 @@ def _common(summary: Summary) -> dict[str, Any]:
         "groups": summary.groups(),
         "utilities": {found.arm: found for found in summary.utilities},
         "utility_ends": _utility_ends(summary),
-        "colors": plots.arm_colors([line.name for line in summary.arms]),
+        "colors": plots.arm_colors([line.name for line in summary.lines]),
         "reach": _reach(summary.differences),
     }
 
@@ -206,14 +232,10 @@ def _plots(
     if not any(rows and "success" in rows[0]["metrics"] for rows in done.values()):
         return []
     words = wording(run.store)
+    found = _plot_anytime_curves(summary)
     budget = int(max(row["metrics"].get("decisions", 0) for rows in done.values() for row in rows))
-    found = [
-        (
-            "Success by arm",
-            "Bars are 95 % intervals; dashed lines mark floor (copy) and ceiling (oracle).",
-            plots.success_by_arm(summary),
-        ),
-    ]
+    about = "Bars are 95 % intervals; dashed lines mark floor (copy) and ceiling (oracle)."
+    found.append(("Success by arm", about, plots.success_by_arm(summary)))
     ways = {arm: [row for row in rows if row["geodesic"] is not None] for arm, rows in done.items()}
     if any(ways.values()):
         about = "Do longer paths need the world model more?"
@@ -229,4 +251,19 @@ def _plots(
     if blamed is not None and any(line.episodes for line in blamed.arms):
         about = "Failures by the stage whose ground truth turns them into successes."
         found.append(("Stage to blame", about, plots.blame_by_arm(blamed)))
+    return found
+
+
+def _plot_anytime_curves(summary: Summary) -> list[tuple[str, str, Markup]]:
+    """Return title, explanation and drawing of the anytime curve and of each paired difference, where there are any."""
+    found = []
+    for curve in summary.breakdowns:
+        if curve.name == "anytime":
+            about = "Score if every episode had been cut there; bands are 95 % intervals."
+            if BLIND in curve.estimates:
+                about += " Dashed: the best guess from the question's text, which counts where nothing is answered."
+            found.append(("Score by budget", about, plots.anytime_curve(curve)))
+        elif curve.name == "anytime_differences":
+            about = "Paired by episode, if every episode had been cut there; bands are 95 % intervals."
+            found.append((f"Gain over {curve.base} by budget", about, plots.anytime_differences(curve)))
     return found

@@ -18,8 +18,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from wiw.analysis.blame import Blame
+from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
+from wiw.analysis.marks import BLIND
 from wiw.analysis.summary import Summary
 from wiw.types import Wording
 
@@ -28,7 +30,7 @@ LONGEST_LINE = 16
 INK = "#010203"
 """Stands for the page's text colour."""
 PALETTE = ("#4c78a8", "#8e6bbf", "#d1495b", "#17899b", "#b5651d", "#5a7d2a")
-ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b"}
+ROLE_COLORS = {"none": "#8b9099", "copy": "#c98a2b", "oracle": "#2e9e6b", BLIND: "#a39a86"}
 BLAME_COLORS = {
     "imagination": "#4c78a8",
     "scoring": "#d1495b",
@@ -203,6 +205,51 @@ def decisions_to_success(outcomes: Outcomes, budget: int, words: Wording) -> Mar
     axes.set_ylabel(f"{words.succeeded}, %")
     _legend(axes)
     return _svg(figure, "decisions-to-success")
+
+
+def anytime_curve(found: Breakdown) -> Markup:
+    """Plot the score if episodes are cut after a number of primitives, with bands; blind answers as a dashed line."""
+    figure, axes = _figure()
+    colors, cuts = arm_colors(list(found.estimates)), [int(key) for key in found.keys]
+    blind = found.estimates.get(BLIND)
+    _draw_bands(axes, found, colors)
+    if blind is not None:
+        level = blind[str(cuts[0])].value
+        axes.plot([0, cuts[-1]], [level, level], color=colors[BLIND], lw=1.4, ls=(0, (4, 3)), label=BLIND)
+        for arm, estimates in found.estimates.items():
+            first = estimates[str(cuts[0])]
+            if arm != BLIND and first.n == blind[str(cuts[0])].n:  # nothing is answered before anything is done
+                axes.plot([0, cuts[0]], [level, first.value], color=colors[arm], lw=1.2, alpha=0.6)
+    axes.set_ylim(-3, 103)
+    axes.set_ylabel(f"{found.metric.label.lower()}, %")
+    _legend(axes)
+    return _svg(figure, "anytime-curve")
+
+
+def anytime_differences(found: Breakdown) -> Markup:
+    """Plot the gain in score over a base if episodes are cut after a number of primitives, with bands."""
+    figure, axes = _figure()
+    _draw_bands(axes, found, arm_colors([found.base, *found.estimates]))
+    axes.axhline(0, color=INK, lw=1, alpha=0.5)
+    axes.set_ylabel(f"{found.metric.label.lower()}, points")
+    _legend(axes)
+    return _svg(figure, f"anytime-differences-{found.base}")
+
+
+def _draw_bands(axes: Axes, found: Breakdown, colors: Mapping[str, str]) -> None:
+    """Draw each arm's estimates over primitives as a line with a band."""
+    cuts = [int(key) for key in found.keys]
+    for arm, estimates in found.estimates.items():
+        if arm == BLIND:
+            continue
+        points = [(int(key), one) for key, one in estimates.items()]
+        x, values = [cut for cut, _ in points], [one.value for _, one in points]
+        bands = [one.low for _, one in points], [one.high for _, one in points]
+        axes.fill_between(x, *bands, color=colors[arm], alpha=0.14, lw=0)
+        axes.plot(x, values, "-o", color=colors[arm], lw=2, ms=5, label=arm)
+    axes.set_xlim(0, cuts[-1] * 1.03)
+    axes.set_xticks([0, *cuts])
+    axes.set_xlabel("primitives")
 
 
 def _readable_on(color: str) -> str:

@@ -180,6 +180,7 @@ def _common(run: Run) -> dict[str, Any]:
         "whole": PictureFolder.whole,
         "words": wording(run.store),
         "choices": task.get("categories", ()),
+        "judge": run.store.judge,
         "judged": "judge" in task,
     }
 

@@ -15,6 +15,7 @@ from rich.console import Group as Lines
 from rich.table import Table
 from rich.text import Text
 
+from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import choose_columns, fidelity
 from wiw.analysis.statistics import Estimate
@@ -29,7 +30,6 @@ from wiw.analysis.summary import (
     show_p,
     show_utility,
 )
-from wiw.metrics.metric import SUCCESS
 from wiw.report.page import summary_html
 from wiw.runs.run import Run
 
@@ -153,8 +153,8 @@ def summary_tables(summary: Summary, width: int) -> Any:
     parts: list[Any] = [*_arm_tables(summary, width)]
     if summary.utilities:
         parts.append(_utilities(summary))
-    if len(summary.kinds) > 1:
-        parts += _kind_tables(summary, "\n" if len(summary.arms) > NARROW else " ", width)
+    for breakdown in summary.breakdowns:
+        parts += _breakdown_tables(breakdown, "\n" if len(breakdown.columns) > NARROW else " ", width)
     for group in summary.groups():
         parts += _difference_tables(summary, group, gap, width)
     styled = [Text(note, style="bold red" if note.startswith("INVALID") else "dim") for note in notes(summary)]
@@ -175,13 +175,15 @@ def _table(title: str) -> Table:
 
 def _arm_tables(summary: Summary, width: int) -> list[Table]:
     which = "on the same episodes" if summary.same_episodes else "each on the episodes scored in it"
-    counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in summary.arms)]
+    if summary.marks is not None:
+        which += f", marks by {summary.marks.judge.label}"
+    lines = summary.lines
+    counts = [count for count in COUNTS if count[0] == "n" or any(getattr(line, count[1]) for line in lines)]
     columns = [
-        Column(column_title(metric), [_cell(line, metric.name) for line in summary.arms])
-        for metric in list_columns(summary)
+        Column(column_title(metric), [_cell(line, metric.name) for line in lines]) for metric in list_columns(summary)
     ]
-    columns += [Column(name, [str(getattr(line, key)) for line in summary.arms], style) for name, key, style in counts]
-    return stack_tables(f"Arms, {which}", [line.name for line in summary.arms], columns, width)
+    columns += [Column(name, [str(getattr(line, key)) for line in lines], style) for name, key, style in counts]
+    return stack_tables(f"Arms, {which}", [line.name for line in lines], columns, width)
 
 
 def _cell(line: ArmSummary, metric: str) -> str:
@@ -202,23 +204,27 @@ def _utilities(summary: Summary) -> Table:
     return table
 
 
-def _kind_tables(summary: Summary, gap: str, width: int) -> list[Table]:
-    """Return success rates by kind of task; `gap` stands between an estimate and its interval."""
+def _breakdown_tables(breakdown: Breakdown, gap: str, width: int) -> list[Table]:
+    """Return a table by kind, budget or outcome; `gap` stands between an estimate and its interval."""
+    rows = breakdown.rows
+    show = _format_difference if breakdown.base else _format_mean
     columns = [
-        Column(
-            line.name,
-            [show_estimate(found[line.name]).replace(" ", gap, 1) if line.name in found else "–" for found in rows],
-        )
-        for rows in [list(summary.kinds.values())]
-        for line in summary.arms
+        Column(title, [show(row[title], gap) if title in row else Text("–") for row in rows.values()])
+        for title in breakdown.columns
     ]
-    columns.append(Column("n", [str(max(one.n for one in found.values())) for found in summary.kinds.values()]))
-    return stack_tables(f"{column_title(SUCCESS)} by kind of task", list(summary.kinds), columns, width, "task")
+    count = "n" if breakdown.unit == "episodes" else breakdown.unit
+    columns.append(Column(count, [str(max(one.n for one in row.values())) for row in rows.values()]))
+    return stack_tables(breakdown.title, list(rows), columns, width, breakdown.corner)
+
+
+def _format_mean(estimate: Estimate, gap: str) -> Text:
+    return Text(show_estimate(estimate).replace(" ", gap, 1))
 
 
 def _difference_tables(summary: Summary, group: Group, gap: str, width: int) -> list[Table]:
     """Return one group's paired differences; `gap` stands between an estimate and its interval."""
-    metrics, rows = list_columns(summary), list(group.rows.values())
+    rows = list(group.rows.values())
+    metrics = [metric for metric in list_columns(summary) if all(metric.name in row for row in rows)]
     columns = [
         Column(column_title(metric), [_format_difference(row[metric.name].estimate, gap) for row in rows])
         for metric in metrics

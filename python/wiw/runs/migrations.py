@@ -29,6 +29,25 @@ _OUTCOME_TABLE = """CREATE TABLE outcome_10 (
 ) WITHOUT ROWID"""
 
 
+_TABLES_OF_11 = {
+    "judge": """(
+    digest TEXT PRIMARY KEY,
+    description TEXT NOT NULL,
+    created TEXT NOT NULL
+) WITHOUT ROWID""",
+    "judged": """(
+    judge TEXT NOT NULL REFERENCES judge (digest),
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL REFERENCES episode (episode),
+    status TEXT NOT NULL CHECK (status IN ('done', 'error')),
+    metrics TEXT NOT NULL,
+    error TEXT NOT NULL,
+    kind TEXT NOT NULL,
+    details TEXT NOT NULL,
+    PRIMARY KEY (judge, arm, episode)
+) WITHOUT ROWID""",
+}
+"""Marks that judges gave later; version 10 had none."""
 _PARTS_RENAMED_IN_9 = {"revision": "reviser", "swaps": "ground_truth"}
 """Parts of an agent's recipe, which is written as JSON, that version 8 called otherwise."""
 _WRAPPED_STAGES = {"scoring": "revision", "proposals": "policy"}
@@ -47,6 +66,8 @@ def migrate(connection: sqlite3.Connection, version: int) -> None:
             connection.execute(statement)
     if version < 9:
         _rename_agent_parts(connection)
+    for name, columns in _TABLES_OF_11.items():
+        connection.execute(f"CREATE TABLE {name} {columns}")
 
 
 def show_as_current(connection: sqlite3.Connection, version: int) -> None:
@@ -56,6 +77,8 @@ def show_as_current(connection: sqlite3.Connection, version: int) -> None:
     if version < 9:  # so does a temporary table
         connection.execute("CREATE TEMP TABLE run AS SELECT * FROM main.run")
         _rename_agent_parts(connection)
+    for name, columns in _TABLES_OF_11.items():
+        connection.execute(f"CREATE TEMP TABLE {name} {columns}")
 
 
 def _rename_agent_parts(connection: sqlite3.Connection) -> None:

@@ -32,6 +32,11 @@ class ArmProgress:
         self.successes += metrics.get("success", 0.0)
 
     @property
+    def begun(self) -> bool:
+        """Whether a decision has been taken since this process began."""
+        return self.decisions > 0
+
+    @property
     def share(self) -> float:
         """0 to 1; decisions of running episodes count in part, so that the bar moves from the start."""
         running = self.decisions / max(1, self.decisions_each)
@@ -46,11 +51,60 @@ class ArmProgress:
         return f"{self.ended}/{self.total} episodes{rate}{f', {count}' if self.errors else ''}"
 
 
+@dataclass
+class AnswerProgress:
+    """Progress of judging answers."""
+
+    total: int
+    ended: int = 0
+    errors: int = 0
+
+    @property
+    def share(self) -> float:
+        """0 to 1."""
+        return self.ended / max(1, self.total)
+
+    @property
+    def begun(self) -> bool:
+        """Always: judging begins with the first answer."""
+        return True
+
+    @property
+    def text(self) -> str:
+        """E.g. "7/20 answers, 1 error"."""
+        count = "1 error" if self.errors == 1 else f"{self.errors} errors"
+        return f"{self.ended}/{self.total} answers{f', {count}' if self.errors else ''}"
+
+
+class Progress(Protocol):
+    """What a board shows of a piece of work."""
+
+    @property
+    def total(self) -> int:
+        """Parts of the work."""
+
+    @property
+    def ended(self) -> int:
+        """Parts that are done."""
+
+    @property
+    def begun(self) -> bool:
+        """Whether anything has been done since this process began."""
+
+    @property
+    def share(self) -> float:
+        """0 to 1."""
+
+    @property
+    def text(self) -> str:
+        """The state in words."""
+
+
 class Board(Protocol):
     """Displays progress."""
 
-    def show(self, arm: str, progress: ArmProgress) -> None:
-        """Show an arm's new state."""
+    def show(self, arm: str, progress: Progress) -> None:
+        """Show the new state of an arm, or of another piece of work."""
 
     def close(self) -> None:
         """Finish: the run has ended or was stopped."""
@@ -87,7 +141,7 @@ class Tracker:
 class SilentBoard:
     """Displays nothing."""
 
-    def show(self, arm: str, progress: ArmProgress) -> None:
+    def show(self, arm: str, progress: Progress) -> None:
         """Do nothing."""
 
     def close(self) -> None:
@@ -117,7 +171,7 @@ class TerminalBoard:
         self._begun: dict[str, tuple[float, int]] = {}
         self._bars.start()
 
-    def show(self, arm: str, progress: ArmProgress) -> None:
+    def show(self, arm: str, progress: Progress) -> None:
         """Move the arm's bar."""
         if not self._console.is_terminal:
             self._line(arm, progress)
@@ -128,17 +182,17 @@ class TerminalBoard:
             self._bars.start_task(self._tasks[arm])
         self._bars.update(self._tasks[arm], completed=progress.share, text=progress.text)
 
-    def _line(self, arm: str, progress: ArmProgress) -> None:
+    def _line(self, arm: str, progress: Progress) -> None:
         quarter = 4 * progress.ended // max(1, progress.total)
         if arm not in self._quarters:
             self._quarters[arm] = quarter
-        if arm not in self._begun and progress.decisions:
+        if arm not in self._begun and progress.begun:
             self._begun[arm] = time.monotonic(), progress.ended
         if quarter > self._quarters[arm]:
             self._quarters[arm] = quarter
             self._console.print(f"{arm}: {progress.text}{self._describe_time_left(arm, progress)}", highlight=False)
 
-    def _describe_time_left(self, arm: str, progress: ArmProgress) -> str:
+    def _describe_time_left(self, arm: str, progress: Progress) -> str:
         """Return e.g. ", about 0:12:30 left" for the arm; empty at its end."""
         begin, before = self._begun.get(arm, (0.0, progress.ended))
         left = progress.total - progress.ended
@@ -159,11 +213,11 @@ class NotebookBoard:
         from IPython.display import HTML, display
 
         self._html = HTML
-        self._arms: dict[str, ArmProgress] = {}
+        self._arms: dict[str, Progress] = {}
         self._shown = 0.0
         self._handle = display(HTML(""), display_id=True)
 
-    def show(self, arm: str, progress: ArmProgress) -> None:
+    def show(self, arm: str, progress: Progress) -> None:
         """Redraw, at most five times a second."""
         self._arms[arm] = progress
         if time.monotonic() - self._shown > 0.2:

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from wiw.errors import ArgumentError
+from wiw.registry import TASKS, task_class
 from wiw.runs.store import RunStore
+from wiw.types import TableSpec
 
 
 class Records(list[dict[str, Any]]):
@@ -56,6 +58,15 @@ class Run:
     def decisions(self) -> Records:
         """Decisions of all ended episodes: proposals, scores, choice, what was executed, truth before and after."""
         return Records(self.store.decisions())
+
+    @property
+    def tables(self) -> TableSpec:
+        """What its task has tables and plots show; runs from before that was recorded have what the task says now."""
+        kept, task = self.store.info.get("tables"), self.store.config["task"].get("task")
+        if kept is not None:
+            values: dict[str, Any] = {str(name): tuple(v) if isinstance(v, list) else v for name, v in kept.items()}
+            return TableSpec(**values)
+        return TableSpec() if task not in TASKS.names() else task_class(task).tables
 
     @property
     def complete(self) -> bool:

@@ -1,4 +1,4 @@
--- A run: one experiment, one or more arms on the same episodes. Version 10 (PRAGMA user_version).
+-- A run: one experiment, one or more arms on the same episodes. Version 11 (PRAGMA user_version).
 CREATE TABLE run (
     id INTEGER PRIMARY KEY CHECK (id = 1),
     created TEXT NOT NULL,          -- ISO 8601, UTC
@@ -27,6 +27,24 @@ CREATE TABLE outcome (              -- how an episode ended in an arm; absent wh
     kind TEXT NOT NULL,             -- environment | agent | worker | world_model/<kind> | vlm/<kind> | judge/<kind>; else empty
     details TEXT NOT NULL,          -- JSON: what the task says of it besides numbers, such as the answer and its judgement
     PRIMARY KEY (arm, episode)
+) WITHOUT ROWID;
+
+CREATE TABLE judge (                -- judges that have marked the run's answers since (`wiw judge`)
+    digest TEXT PRIMARY KEY,        -- of the description
+    description TEXT NOT NULL,      -- JSON: all that its marks depend on: versions, model, prompt digest, seed, temperature
+    created TEXT NOT NULL           -- ISO 8601, UTC
+) WITHOUT ROWID;
+
+CREATE TABLE judged (               -- outcomes as a judge of table `judge` marks them; the run's own judge is in `outcome`
+    judge TEXT NOT NULL REFERENCES judge (digest),
+    arm TEXT NOT NULL,
+    episode INTEGER NOT NULL REFERENCES episode (episode),
+    status TEXT NOT NULL CHECK (status IN ('done', 'error')),
+    metrics TEXT NOT NULL,          -- as in table outcome
+    error TEXT NOT NULL,
+    kind TEXT NOT NULL,             -- judge/<kind>; empty where nothing broke
+    details TEXT NOT NULL,
+    PRIMARY KEY (judge, arm, episode)
 ) WITHOUT ROWID;
 
 CREATE TABLE decision (

@@ -49,6 +49,7 @@ COLUMNS: Mapping[str, Any] = {
     "config": CONFIG,
     "info": INFO,
     "episode.info": {},
+    "description": {"judge": TEXT},
     "metrics": NUMBERS,
     "details": {},
     "world_to_pixel": [[NUMBER]],

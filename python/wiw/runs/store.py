@@ -21,12 +21,13 @@ from typing import Any
 import wiw
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.faults import explain_faults, find_remedy
+from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.shapes import check_decision, check_types, parse_column
 from wiw.types import Episode
 
-SCHEMA_VERSION = 10
+SCHEMA_VERSION = 11
 DECISION_JSON = (
     "actions",
     "executed",
@@ -64,6 +65,7 @@ class RunStore:
         self.path = path
         self._connection = connection
         self._lock = lock
+        self._judge: str | None = None
 
     @classmethod
     def create(
@@ -164,6 +166,16 @@ class RunStore:
         return cls._open(store_path(run), None)
 
     @classmethod
+    def annotate(cls, run: str | Path) -> RunStore:
+        """Open an existing store to add marks of ended episodes; partial episodes stay.
+
+        Raises:
+            StoreError: missing, damaged, of another schema, or in use.
+        """
+        path = store_path(run)
+        return cls._open(path, _lock(path) if path.exists() else None)
+
+    @classmethod
     def _open(cls, path: Path, lock: Any) -> RunStore:
         if not path.is_file():
             raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
@@ -235,8 +247,51 @@ class RunStore:
         infos = [parse_column("episode.info", row["info"], self._place("episode", row)) for row in rows]
         return [_episode(row, info) for row, info in zip(rows, infos, strict=True)]
 
+    @property
+    def judges(self) -> list[JudgeRecord]:
+        """All judges of the run's answers, its own first; none where its task has no answers in words."""
+        own = self.config["task"].get("judge")
+        found = [JudgeRecord(own, own=True)] if isinstance(own, dict) else []
+        for row in self._rows("SELECT digest, description FROM judge ORDER BY created, digest"):
+            description = parse_column("description", row["description"], f"{self.path}: judge {row['digest']}")
+            found.append(JudgeRecord(description))
+        return list({judge.digest: judge for judge in reversed(found)}.values())[::-1]  # its own counts as that
+
+    @property
+    def judge(self) -> JudgeRecord | None:
+        """The judge whose marks outcomes have: the run's own unless `use_judge` has chosen another."""
+        return find_judge(self.judges, self._judge, str(self.path.parent))
+
+    def use_judge(self, name: str | None) -> None:
+        """Choose the judge whose marks `outcomes` have, by name or digest; None for the run's own.
+
+        Raises:
+            ArgumentError: no judge or several of that name.
+        """
+        found = find_judge(self.judges, name, str(self.path.parent))
+        self._judge = None if found is None else found.digest
+
     def outcomes(self) -> list[dict[str, Any]]:
-        """Return the ended episodes of all arms, with their kind ("task") where a task has several."""
+        """Return the ended episodes of all arms, with their kind ("task") where a task has several.
+
+        What depends on marks is by the judge that `use_judge` has chosen.
+        """
+        judge, found = self.judge, self.recorded_outcomes()
+        return found if judge is None else apply_judge(found, self.judged_outcomes(judge.digest), judge)
+
+    def judged_outcomes(self, digest: str) -> dict[tuple[str, int], dict[str, Any]]:
+        """Return what depends on the marks of a judge, by arm and episode."""
+        rows = self._rows("SELECT * FROM judged WHERE judge = ? ORDER BY arm, episode", (digest,))
+        return {
+            (row["arm"], row["episode"]): {
+                **{name: row[name] for name in ("status", "error", "kind")},
+                **{name: parse_column(name, row[name], self._place("judged", row)) for name in OUTCOME_JSON},
+            }
+            for row in self._convert_types("judged", rows)
+        }
+
+    def recorded_outcomes(self) -> list[dict[str, Any]]:
+        """Return the ended episodes as the run recorded them, with the marks of its own judge."""
         rows = self._rows(
             "SELECT o.*, e.episode_id, e.scene, e.geodesic, json_extract(e.info, '$.task') AS task "
             "FROM outcome o JOIN episode e USING (episode) "
@@ -308,14 +363,21 @@ class RunStore:
         return None
 
     def pending(self, arm: str, retry_errors: bool = False) -> list[int]:
-        """Return indices of the episodes still to be run in an arm."""
-        status = "AND status = 'done'" if retry_errors else ""
-        rows = self._rows(
-            f"SELECT episode FROM episode WHERE episode NOT IN "
-            f"(SELECT episode FROM outcome WHERE arm = ? {status}) ORDER BY episode",
-            (arm,),
-        )
-        return [row["episode"] for row in rows]
+        """Return indices of the episodes still to be run in an arm.
+
+        With `retry_errors` also those that ended with an error, unless the run's own judge has marked them since.
+        """
+        done = "AND status = 'done'" if retry_errors else ""
+        ended = {row["episode"] for row in self._rows(f"SELECT episode FROM outcome WHERE arm = ? {done}", (arm,))}
+        if retry_errors and (own := next((judge for judge in self.judges if judge.own), None)):
+            ended |= {
+                row["episode"]
+                for row in self._rows(
+                    "SELECT episode FROM judged WHERE arm = ? AND judge = ? AND status = 'done'", (arm, own.digest)
+                )
+            }
+        rows = self._rows("SELECT episode FROM episode ORDER BY episode")
+        return [row["episode"] for row in rows if row["episode"] not in ended]
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
@@ -352,6 +414,27 @@ class RunStore:
                         "UPDATE episode SET geodesic = ? WHERE episode = ? AND geodesic IS NULL",
                         (shortest, result.episode),
                     )
+
+    def add_judge(self, judge: JudgeRecord) -> None:
+        """Store a judge's description, so that its marks can be written."""
+        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        with self._writing() as connection:
+            connection.execute(
+                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", (judge.digest, to_json(dict(judge.description)), now)
+            )
+
+    def write_judged(self, row: JudgedRow) -> None:
+        """Write what a judge's marks make of an outcome; marks that are there already stay, an error is replaced."""
+        values = {name: getattr(row, name) for name in ("judge", "arm", "episode", "status", "error", "kind")}
+        values |= {name: to_json(dict(getattr(row, name))) for name in OUTCOME_JSON}
+        names = ", ".join(values)
+        changes = ", ".join(f"{name} = excluded.{name}" for name in ("status", "error", "kind", *OUTCOME_JSON))
+        with self._writing() as connection:
+            connection.execute(
+                f"INSERT INTO judged ({names}) VALUES ({', '.join('?' for _ in values)}) "
+                f"ON CONFLICT (judge, arm, episode) DO UPDATE SET {changes} WHERE judged.status = 'error'",
+                tuple(values.values()),
+            )
 
     def write_agent(self, row: AgentRow) -> None:
         """Store the description of an arm's agent as `info["built"][arm]`.
@@ -395,7 +478,8 @@ class RunStore:
         with self._writing() as connection:
             for episode in episodes:
                 _forget(connection, "d.arm = ? AND d.episode = ?", (arm, episode))
-                connection.execute("DELETE FROM outcome WHERE arm = ? AND episode = ?", (arm, episode))
+                for table in ("outcome", "judged"):
+                    connection.execute(f"DELETE FROM {table} WHERE arm = ? AND episode = ?", (arm, episode))
 
     def keep_pictures(self, episodes: Sequence[int]) -> None:
         """Drop the pictures of all other episodes; `info["pictures"]` has these, the one to show first in front."""

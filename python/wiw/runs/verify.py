@@ -88,7 +88,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
     if episodes < 1:
         raise ArgumentError(f"verify: expected episodes of at least 1, got {episodes}")
     with RunStore.read(run) as store:
-        ended = {(row["arm"], row["episode"]): row for row in store.outcomes() if row["status"] == "done"}
+        ended = {(row["arm"], row["episode"]): row for row in store.recorded_outcomes() if row["status"] == "done"}
         if not ended:
             raise StoreError(f"{store.path} has no ended episode that could be run again; see `wiw resume`")
         known = sorted({index for _, index in ended})

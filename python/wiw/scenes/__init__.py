@@ -33,6 +33,7 @@ __all__ = [
     "open_scene",
     "possible_edits",
     "resolve",
+    "strip_edits",
 ]
 
 COLORS = (
@@ -160,6 +161,11 @@ _FORMS = (
 def is_generated(spec: str) -> bool:
     """Return whether a scene spec names generated apartments rather than a file."""
     return spec.startswith("apartments:")
+
+
+def strip_edits(spec: str) -> str:
+    """Return the apartment that an edited one is a copy of: "apartments:val/7" for "apartments:val/7?remove:tv_1"."""
+    return spec.partition("?")[0] if is_generated(spec) else spec
 
 
 def absolute(spec: str | PathLike[str]) -> str:

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from wiw.analysis.breakdowns import find_twins
 from wiw.analysis.statistics import adjust_p_values
 from wiw.analysis.statistics import compare as compare_arms
 from wiw.analysis.summary import (
@@ -60,7 +61,12 @@ class Comparison(SummaryTable):
 
 
 def compare(
-    a: str | Path | RunLog, b: str | Path | RunLog, arm: str | None = None, other: str | None = None
+    a: str | Path | RunLog,
+    b: str | Path | RunLog,
+    arm: str | None = None,
+    other: str | None = None,
+    *,
+    judge: str | None = None,
 ) -> Comparison:
     """Compare two runs on the same episodes: run b minus run a, for each arm that both have.
 
@@ -73,12 +79,15 @@ def compare(
         b: likewise.
         arm: of run a (and of run b, unless `other` names another); None: all that both have, or the only one of each.
         other: arm of run b to compare with `arm`.
+        judge: name or digest of the judge whose marks are compared (see `wiw.judge`); None for each run's own, or the
+            one that a run given as an object was opened with.
 
     Raises:
-        ArgumentError: an arm that is not there, or no arm in common.
-        StoreError: a run cannot be read, or the two differ in task, seed or episodes: the first field that differs.
+        ArgumentError: an arm that is not there, no arm in common, or a judge that has not marked a run.
+        StoreError: a run cannot be read, or the two differ in task, seed, episodes or judge: the first field that
+            differs.
     """
-    first, second = (run if isinstance(run, RunLog) else load_run(run) for run in (a, b))
+    first, second = (_open(run, judge) for run in (a, b))
     require_comparable(first, second)
     pairs = _pairs(first, second, arm, other)
     names = _names(first, second)
@@ -91,7 +100,17 @@ def compare(
     ]
     labelled = [tuple(labels[arm] for arm, (_, labels) in zip(pair, sides, strict=True)) for pair in pairs]
     seed = int(first.store.config["seed"])
-    both = summarise([label for pair in labelled for label in pair], outcomes, len(first.store.episodes()), seed)
+    episodes = first.store.episodes()
+    both = summarise(
+        [label for pair in labelled for label in pair],
+        outcomes,
+        len(episodes),
+        seed,
+        tables=first.tables,
+        twins=find_twins(episodes),
+        judge=first.store.judge,
+        pairs=[(theirs, ours) for ours, theirs in labelled],
+    )
     done, _ = split_outcomes([line.name for line in both.arms], outcomes)
     found = [
         compare_arms(theirs, ours, done, metric, seed) for ours, theirs in labelled for metric in select_metrics(done)
@@ -102,11 +121,20 @@ def compare(
         adjust_p_values([one for one in found if one is not None]),
         both.same_episodes,
         tuple(one for log, labels in sides for one in _utilities(log, labels)),
-        both.kinds,
+        both.breakdowns,
+        both.baselines,
+        both.marks,
         names,
         tuple(line for pair in pairs for line in _describe_changes(first, second, pair)),
         unbalanced=count_unbalanced(second),
     )
+
+
+def _open(run: str | Path | RunLog, judge: str | None) -> RunLog:
+    """Return a run with the marks of a judge."""
+    if isinstance(run, RunLog):
+        return run if judge is None else load_run(run.path, judge)
+    return load_run(run, judge)
 
 
 def _lines(log: RunLog, both: Summary, labels: Mapping[str, str]) -> list[ArmSummary]:
@@ -130,8 +158,9 @@ def require_comparable(a: RunLog, b: RunLog) -> None:
     ours, theirs = a.store.config, b.store.config
     for name in dict.fromkeys([*ours["task"], *theirs["task"]]):
         values = [_value(config["task"].get(name)) for config in (ours, theirs)]
-        if values[0] != values[1]:
+        if values[0] != values[1] and name != "judge":
             _refuse(a, b, f"task.{name}", values, "run one of them again with the other's task, scenes and preset")
+    _require_same_judge(a, b)
     if ours["seed"] != theirs["seed"]:
         _refuse(a, b, "seed", [ours["seed"], theirs["seed"]], f"run one of them again with --seed {ours['seed']}")
     episodes = a.store.episodes(), b.store.episodes()
@@ -140,6 +169,19 @@ def require_comparable(a: RunLog, b: RunLog) -> None:
         _refuse(a, b, "episodes", counts, f"run the shorter one again with --episodes {max(counts)}")
     for index, pair in enumerate(zip(*episodes, strict=True)):
         _require_same_episode(a, b, index, pair)
+
+
+def _require_same_judge(a: RunLog, b: RunLog) -> None:
+    """Check that the marks of both runs are by one judge, with one model, prompt and sampling."""
+    judges = [log.store.judge for log in (a, b)]
+    digests = [None if judge is None else judge.digest for judge in judges]
+    if digests[0] != digests[1]:
+        known = [{judge.digest: judge for judge in log.store.judges} for log in (a, b)]
+        common = [judge.full_label for digest, judge in known[0].items() if digest in known[1]]
+        judged = f"both have marks by {common[0]}: name that with judge= or --judge" if common else ""
+        remedy = judged or "judge both with the same judge (`wiw judge`), then name it with judge= or --judge"
+        labels = ["no judge" if judge is None else judge.full_label for judge in judges]
+        _refuse(a, b, "judge", labels, f"marks of unlike judges are not comparable; {remedy}")
 
 
 def _require_same_episode(a: RunLog, b: RunLog, index: int, pair: tuple[Episode, Episode]) -> None:
@@ -164,7 +206,7 @@ def _value(value: Any) -> Any:
 def _refuse(a: RunLog, b: RunLog, field: str, values: Sequence[Any], advice: str) -> None:
     raise StoreError(
         f"cannot compare {a.path} and {b.path}: {field} is {to_json(values[0])} in the first and {to_json(values[1])} "
-        f"in the second; only runs of the same task, seed and episodes can be paired: {advice}"
+        f"in the second; only runs of the same task, seed, episodes and judge can be paired: {advice}"
     )
 
 

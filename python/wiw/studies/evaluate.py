@@ -158,6 +158,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "scenes": used,
             "stage": built.stage,
             "wording": asdict(built.wording),
+            "tables": asdict(built.tables),
             "live": settings.live,
             "workers": settings.workers,
             "limits": settings.to_json(),

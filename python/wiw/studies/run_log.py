@@ -9,6 +9,7 @@ from wiw.analysis.blame import read_blame
 from wiw.analysis.costs import costs
 from wiw.analysis.fidelity import fidelity
 from wiw.analysis.summary import arm_table, summarise_run
+from wiw.errors import Error
 from wiw.report.export import export
 from wiw.report.page import write_report
 from wiw.report.site import write_view
@@ -44,6 +45,15 @@ class RunLog(Run):
     def costs(self) -> Records:
         """Return what each arm cost: one dict per arm, totals and per success; see `wiw.analysis.costs.Costs`."""
         return Records(line.as_dict() for line in costs(self))
+
+    def breakdown(self, name: str) -> Records:
+        """Return a further table as plain values: one dict per estimate, with value, low, high and n.
+
+        Args:
+            name: "kinds" (by kind of episode), "anytime" (scores if cut after so many primitives),
+                "anytime_differences" (paired), or "twins"; empty where the task has no such table.
+        """
+        return Records(line for each in self.numbers().breakdowns if each.name == name for line in each.list_cells())
 
     def fidelity(self) -> Records:
         """Return how true imagination was in each arm that was run with `fidelity=True`: one dict per arm.
@@ -97,10 +107,21 @@ class RunLog(Run):
         return self.numbers()._repr_html_()
 
 
-def load_run(path: str | Path) -> RunLog:
+def load_run(path: str | Path, judge: str | None = None) -> RunLog:
     """Open a run by its folder, also while it is still running.
+
+    Args:
+        path: the run's folder.
+        judge: name or digest of the judge whose marks are read (see `wiw.judge`); None for the run's own.
 
     Raises:
         StoreError: nothing there, damaged, or of another version.
+        ArgumentError: no judge or several of that name.
     """
-    return RunLog(RunStore.read(path))
+    store = RunStore.read(path)
+    try:
+        store.use_judge(judge)
+    except Error:
+        store.close()
+        raise
+    return RunLog(store)

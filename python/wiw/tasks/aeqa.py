@@ -20,15 +20,14 @@ from wiw.datasets.questions.mesh_table import NO_ATTRIBUTES, read_attributes
 from wiw.datasets.visibility import COARSE, measure_sizes
 from wiw.datasets.worlds import World, world
 from wiw.envs.episode_state import EpisodeState
-from wiw.errors import ArgumentError
-from wiw.judging import Judge, Judgement, Reference, make_judge
-from wiw.metrics import path_efficiency
+from wiw.errors import ArgumentError, JudgeError, StoreError, VlmError
+from wiw.judging import Judge, Judgement, make_judge
+from wiw.judging.judge import HIGHEST_MARK
 from wiw.scenes import is_generated, resolve
+from wiw.tasks.answer_record import CUTS, MARK_METRICS, AnswerRecord, Unanswered, make_reference, map_mark
 from wiw.tasks.navigation import NavigationTask
-from wiw.types import Episode, Goal, TextAnswer, Wording
+from wiw.types import Episode, Goal, TableSpec, TextAnswer, Wording
 
-CUTS = (30, 60, 120, 250)
-"""Primitives after which the anytime curve looks at what has been answered."""
 HALF_TURN = 8
 """Most primitives of a turn: 22.5 degrees each, the shorter way round."""
 SEEN = 0.008
@@ -50,9 +49,8 @@ class AEQARules:
     confirm: Literal["next_view", "same_view", "none"]
     """When a final answer ends the episode: given again after the next segment, given again at once on the same view
     (nothing is carried out in between), or the first time."""
-    unanswered: Literal["blind", "blind_with_path", "lowest"]
-    """Mark of an episode without a final answer: that of the answer by the text alone, with an SPL of 0 or with the
-    path's, or 1."""
+    unanswered: Unanswered
+    """Mark of an episode without a final answer."""
     turns: Literal["counted", "first_free"]
     """Whether the turn at the start of a segment counts as primitives."""
     motion: Literal["refuse", "slide"]
@@ -87,6 +85,7 @@ class AEQA(NavigationTask):
         way="to the nearest viewpoint",
         asked="The question",
     )
+    tables = TableSpec(kinds=("answer_score", "spl"), judged=MARK_METRICS, cuts=CUTS, kind="category")
 
     def __init__(
         self, *args: Any, judge: str | Judge = "rules", attributes: str | Path | None = None, **options: Any
@@ -156,9 +155,9 @@ class AEQA(NavigationTask):
         asked = [read_question(episode) for episode in episodes if episode.info.get("unbalanced")]
         if not asked:
             return []
-        references = [Reference(each.text, each.answer, each.extra_answers, each.answer_type) for each in asked]
+        references = [make_reference(each) for each in asked]
         guessed = make_judge("rules").judge(references, [blind_answer(each.text) for each in asked])
-        score = 100 * sum(_score(each.mark) for each in guessed) / len(asked)
+        score = 100 * sum(map_mark(each.mark) for each in guessed) / len(asked)
         return [
             "unbalanced: each question is asked in one scene only, so its text may give its answer away; guessing "
             f"what is most frequent in apartments scores {score:.0f} of 100"
@@ -214,8 +213,13 @@ class AEQA(NavigationTask):
         return bool(self.rules.confirm == "same_view" and isinstance(latest, TextAnswer) and latest.final)
 
     def is_success(self, state: EpisodeState) -> bool:
-        """Return whether the episode has ended with an answer of the highest mark."""
-        return bool(self.final_answer(state)) and self._judge_end(state).mark == 5
+        """Return whether the episode has ended with an answer of the highest mark.
+
+        One that could not be judged is none so far: that is an error of the episode, which `measure` reports.
+        """
+        answer = self.final_answer(state)
+        judged = self._judge(state, answer) if answer else None
+        return isinstance(judged, Judgement) and judged.mark == HIGHEST_MARK
 
     def final_answer(self, state: EpisodeState) -> str:
         """Return the answer that the episode has ended with; empty without one.
@@ -238,56 +242,80 @@ class AEQA(NavigationTask):
 
         Raises:
             JudgeError: the judge gave no mark.
+            VlmError: its language model could not be asked.
         """
-        answer, blind, judged = self.final_answer(state), self._judge_blind(state), self._judge_end(state)
-        score = _score(judged.mark)
-        counts = bool(answer) or self.rules.unanswered == "blind_with_path"
-        shortest = state.episode.geodesic if np.isfinite(state.episode.geodesic) else 0.0
-        cuts = {f"score_at_{cut}": score if answer and state.actions <= cut else _score(blind.mark) for cut in CUTS}
-        return {
-            "success": float(bool(answer) and judged.mark == 5),
-            "mark": float(judged.mark),
-            "answer_score": score,
-            "spl": float(path_efficiency([score if counts else 0.0], [shortest], [state.path_length])[0]),
-            "path_length": state.path_length,
-            "shortest": shortest,
-            "primitives": float(state.actions),
-            "answered": float(bool(answer)),
-            **cuts,
-            **self._measure_grounding(state),
-        }
+        record = self._make_record(state)
+        judgements = self._judge_answers(state, record)
+        for found in judgements.values():
+            if not isinstance(found, Judgement):
+                raise found
+        return record.compute_metrics(_select_judgements(judgements))
 
     def describe_end(self, state: EpisodeState) -> dict[str, Any]:
-        """Return the answer, what was expected, and who judged it how."""
-        answer, expected = self.final_answer(state), read_question(state.episode).answer
-        return {"answer": answer, "expected": expected, "judgement": self._judge_end(state).to_info()}
+        """Return the answer, what was expected, the answer by the text alone, and who judged them how."""
+        record = self._make_record(state)
+        if "measured" not in (found := record.describe(_select_judgements(self._judge_answers(state, record)))):
+            return found
+        return {**found, "measured": {**found["measured"], "decisions": float(state.decisions)}}
 
-    def _judge_end(self, state: EpisodeState) -> Judgement:
-        """Return the judgement of the final answer, or what the rules put in its place."""
-        if answer := self.final_answer(state):
-            return self._judge(state, answer)
-        blind = self._judge_blind(state)
-        return replace(blind, mark=1) if self.rules.unanswered == "lowest" else blind
+    @classmethod
+    def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
+        """Return the answers of a stored outcome; None where it has none because something other than a judge broke.
 
-    def _judge_blind(self, state: EpisodeState) -> Judgement:
-        return self._judge(state, blind_answer(read_question(state.episode).text))
+        Raises:
+            StoreError: the outcome lacks what its marks are computed from.
+        """
+        details, metrics = outcome["details"], outcome["metrics"]
+        walk = details.get("measured") if outcome["status"] == "error" else metrics
+        if walk is None:
+            return None
+        measured = {name: value for name, value in walk.items() if name not in MARK_METRICS}
+        question = read_question(episode)
+        try:
+            blind = details.get("blind", {"answer": blind_answer(question.text)})["answer"]
+            record = AnswerRecord(question, details["answer"], blind, task["unanswered"], measured)
+            record.require_whole()
+        except (KeyError, TypeError) as error:
+            place = f"outcome of {outcome['arm']} in episode {outcome['episode']}"
+            raise StoreError(f"{place}: no {error}; the run store was edited: bring back a copy of it") from error
+        return record
 
-    def _judge(self, state: EpisodeState, answer: str) -> Judgement:
-        """Return the judgement of an answer, each one asked for once per episode."""
-        known: dict[str, Judgement] = state.notes.setdefault("judgements", {})
+    def _make_record(self, state: EpisodeState) -> AnswerRecord:
+        """Return an ended episode with all that no mark changes."""
+        question, answer = read_question(state.episode), self.final_answer(state)
+        measured = {
+            "path_length": state.path_length,
+            "shortest": state.episode.geodesic if np.isfinite(state.episode.geodesic) else 0.0,
+            "primitives": float(state.actions),
+            "answered": float(bool(answer)),
+            **self._measure_grounding(state),
+        }
+        return AnswerRecord(question, answer, blind_answer(question.text), self.rules.unanswered, measured)
+
+    def _judge_answers(self, state: EpisodeState, record: AnswerRecord) -> dict[str, Judgement | JudgeError | VlmError]:
+        return {answer: self._judge(state, answer) for answer in record.answers}
+
+    def _judge(self, state: EpisodeState, answer: str) -> Judgement | JudgeError | VlmError:
+        """Return the judgement of an answer, or why there is none; each one is asked for once per episode."""
+        known: dict[str, Judgement | JudgeError | VlmError] = state.notes.setdefault("judgements", {})
         if answer not in known:
-            question = read_question(state.episode)
-            reference = Reference(question.text, question.answer, question.extra_answers, question.answer_type)
-            known[answer] = self.judge.judge([reference], [answer])[0]
+            try:
+                known[answer] = self.judge.judge([make_reference(read_question(state.episode))], [answer])[0]
+            except (JudgeError, VlmError) as error:
+                known[answer] = error
         return known[answer]
 
     def _measure_grounding(self, state: EpisodeState) -> dict[str, float]:
+        """Return whether all that the question is about has been in sight; measured once for each number of views."""
         targets = list(read_question(state.episode).target)
         if not targets:
             return {}
-        places = np.unique(np.stack([state.positions[i] for i in state.observed]), axis=0)
-        sizes = measure_sizes(state.world, places, COARSE)[:, targets]
-        return {"grounded": float((sizes.max(axis=0) >= SEEN).all())}
+        known: dict[int, float] = state.notes.setdefault("grounded", {})
+        if len(state.observed) not in known:
+            places = np.unique(np.stack([state.positions[i] for i in state.observed]), axis=0)
+            sizes = measure_sizes(state.world, places, COARSE)[:, targets]
+            known[len(state.observed)] = float((sizes.max(axis=0) >= SEEN).all())
+        return {"grounded": known[len(state.observed)]}
 
 
 def read_question(episode: Episode) -> Question:
@@ -301,6 +329,5 @@ def _describe(episode: Episode) -> Episode:
     return replace(episode, info={**episode.info, "task": question.category, "instruction": question.text})
 
 
-def _score(mark: float) -> float:
-    """Return a mark from 1 to 5 as a share (paper, "Answering Score")."""
-    return (mark - 1) / 4
+def _select_judgements(found: Mapping[str, Judgement | JudgeError | VlmError]) -> dict[str, Judgement]:
+    return {answer: each for answer, each in found.items() if isinstance(each, Judgement)}

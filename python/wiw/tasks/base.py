@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
-from wiw.types import PRIMITIVES, Episode, Wording
+from wiw.types import PRIMITIVES, Episode, TableSpec, Wording
 
 if TYPE_CHECKING:
     import gymnasium
 
     from wiw.datasets.worlds import World
     from wiw.tabletop.table import Table
+    from wiw.tasks.answer_record import AnswerRecord
 
 
 class Task(ABC):
@@ -43,6 +44,8 @@ class Task(ABC):
     """Labels that answers are chosen from, where the task asks for any."""
     wording: Wording = Wording()
     """How reports speak of its episodes."""
+    tables: TableSpec = TableSpec()
+    """What tables and plots of its runs show."""
     has_guide: bool = False
     """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
 
@@ -136,6 +139,17 @@ class Task(ABC):
 
     def open_world(self, episode: Episode) -> World | None:
         """Return the scene that reports draw from above, with its navigation mesh; None for no drawing."""
+        return None
+
+    @classmethod
+    def read_answers(cls, task: Mapping[str, Any], episode: Episode, outcome: Mapping[str, Any]) -> AnswerRecord | None:
+        """Return the answers of a stored outcome, so that they can be judged again; None where it has none.
+
+        Args:
+            task: what the task of the run says of itself (`describe`).
+            episode: that ended.
+            outcome: row of the run store: "status", "metrics", "details".
+        """
         return None
 
     def set_table(self, episode: Episode) -> Table | None:

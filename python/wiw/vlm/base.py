@@ -33,6 +33,9 @@ class Client(ABC):
         votes: samples to count where a server returns no log-probabilities.
     """
 
+    concurrency: int = 1
+    """Most requests at a time."""
+
     def __init__(
         self,
         *,

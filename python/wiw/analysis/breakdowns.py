@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of a run beyond one line per arm: by kind of episode, by budget (the anytime curve), over twins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from wiw.analysis.statistics import Estimate, compare, estimate_mean
+from wiw.metrics.metric import SUCCESS, Metric
+from wiw.types import Episode
+
+Done = Mapping[str, Mapping[int, Mapping[str, Any]]]
+"""By arm, scored episodes by index with "scene", "metrics", and "task" where there are kinds."""
+BOTH, ONE, NEITHER = "both right", "one right", "neither right"
+PAIRS = Metric("twins", "Twins", "rate", True, about="Percent of pairs of twins of which both are answered rightly.")
+
+
+@dataclass(frozen=True)
+class Breakdown:
+    """A table of estimates: arms one way, something else the other way."""
+
+    name: str
+    """Of the table in exports."""
+    title: str
+    heading: str
+    """The same for a page, which explains its metrics elsewhere."""
+    about: str
+    """What a reader of the table needs to know; may be empty."""
+    key_name: str
+    """What a key is, such as "cut"."""
+    metric: Metric
+    estimates: Mapping[str, Mapping[str, Estimate]]
+    """By arm, then by key."""
+    base: str = ""
+    """Arm that estimates are paired differences from; empty where they are means."""
+    arms_across: bool = False
+    """Whether arms are columns, as suits few arms and many keys."""
+    unit: str = "episodes"
+    """What estimates are over."""
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """All keys, in order."""
+        return tuple(dict.fromkeys(key for found in self.estimates.values() for key in found))
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Titles of the columns."""
+        return tuple(self.estimates) if self.arms_across else self.keys
+
+    @property
+    def rows(self) -> dict[str, dict[str, Estimate]]:
+        """By row, then by column."""
+        if not self.arms_across:
+            return {arm: dict(found) for arm, found in self.estimates.items()}
+        return {key: {arm: found[key] for arm, found in self.estimates.items() if key in found} for key in self.keys}
+
+    @property
+    def corner(self) -> str:
+        """Heading of the rows."""
+        return self.key_name if self.arms_across else f"arm minus {self.base}" if self.base else "arm"
+
+    @property
+    def reach(self) -> float:
+        """Largest distance from 0 of an interval's end."""
+        ends = [end for found in self.estimates.values() for one in found.values() for end in (one.low, one.high)]
+        return max([1e-6, *(abs(end) for end in ends if not math.isnan(end))])
+
+    def list_cells(self) -> list[dict[str, Any]]:
+        """Return the table as plain values, a dict per estimate."""
+        return [
+            {
+                "arm": arm,
+                **({"base": self.base} if self.base else {}),
+                self.key_name: key,
+                "metric": self.metric.name,
+                "value": one.value,
+                "low": one.low,
+                "high": one.high,
+                "n": one.n,
+            }
+            for arm, found in self.estimates.items()
+            for key, one in found.items()
+        ]
+
+
+def split_by_kind(done: Done, metrics: Sequence[Metric], kind: str, seed: int) -> list[Breakdown]:
+    """Return a table per metric, by kind of episode; none where there is one kind.
+
+    Args:
+        done: see `Done`.
+        metrics: to show.
+        kind: what a kind is called, such as "category".
+        seed: of the bootstrap.
+    """
+    kinds = dict.fromkeys(o["task"] for ended in done.values() for o in ended.values() if "task" in o)
+    found = []
+    for metric in metrics if len(kinds) > 1 else ():
+        estimates: dict[str, dict[str, Estimate]] = {}
+        for arm, ended in done.items():
+            for each in kinds:
+                own = [o for o in ended.values() if o.get("task") == each and metric.name in o["metrics"]]
+                if own:
+                    estimates.setdefault(arm, {})[each] = _estimate(own, metric, seed)
+        if estimates:
+            heading = "Success rate" if metric.name == SUCCESS.name else metric.label
+            title = f"{_title(metric)} by {kind}"
+            found.append(
+                Breakdown("kinds", title, f"{heading} by {kind}", "", kind, metric, estimates, arms_across=True)
+            )
+    return found
+
+
+def read_anytime_curve(done: Done, cuts: Sequence[int], metric: Metric, seed: int) -> list[Breakdown]:
+    """Return the score of each arm if every episode had been cut after so many primitives; none without cuts.
+
+    Args:
+        done: see `Done`; "score_at_30" and so on among the metrics.
+        cuts: primitives.
+        metric: the score that is cut.
+        seed: of the bootstrap.
+    """
+    estimates: dict[str, dict[str, Estimate]] = {}
+    for arm, ended in done.items():
+        for cut in cuts:
+            at = _make_cut_metric(metric, cut)
+            if ended and all(at.name in o["metrics"] for o in ended.values()):
+                estimates.setdefault(arm, {})[str(cut)] = _estimate(list(ended.values()), at, seed)
+    about = "What is not answered by then counts as the best guess from the question's text alone."
+    title = f"{_title(metric)} if cut after so many primitives"
+    heading = f"{metric.label} if cut after so many primitives"
+    return [Breakdown("anytime", title, heading, about, "cut", metric, estimates)] if estimates else []
+
+
+def compare_anytime_curves(
+    done: Done, pairs: Iterable[tuple[str, str]], cuts: Sequence[int], metric: Metric, seed: int
+) -> list[Breakdown]:
+    """Return paired differences of the anytime curve, a table per base.
+
+    Args:
+        done: see `Done`.
+        pairs: arms and what each is compared with.
+        cuts: primitives.
+        metric: the score that is cut.
+        seed: of the bootstrap.
+    """
+    found: dict[str, dict[str, dict[str, Estimate]]] = {}
+    for arm, base in pairs:
+        for cut in cuts:
+            at = _make_cut_metric(metric, cut)
+            both = [o["metrics"] for name in (arm, base) for o in done[name].values()]
+            difference = compare(arm, base, done, at, seed) if all(at.name in each for each in both) else None
+            if difference is not None:
+                found.setdefault(base, {}).setdefault(arm, {})[str(cut)] = difference.estimate
+    about = "Paired by episode."
+    return [
+        Breakdown(
+            "anytime_differences",
+            f"{metric.label} if cut, difference from {base}, points",
+            f"{metric.label} if cut, difference from {base}",
+            about,
+            "cut",
+            metric,
+            estimates,
+            base,
+        )
+        for base, estimates in found.items()
+    ]
+
+
+def score_twins(done: Done, twins: Sequence[tuple[int, int]], seed: int) -> list[Breakdown]:
+    """Return how often both, one or neither of two twins are answered rightly; nothing without twins.
+
+    Args:
+        done: see `Done`.
+        twins: indices of episodes that ask the same where something else is true.
+        seed: of the bootstrap.
+    """
+    estimates: dict[str, dict[str, Estimate]] = {}
+    for arm, ended in done.items():
+        pairs = [(ended[i], ended[j]) for i, j in twins if i in ended and j in ended]
+        pairs = [pair for pair in pairs if all("success" in o["metrics"] for o in pair)]
+        if not pairs:
+            continue
+        right = [sum(o["metrics"]["success"] for o in pair) for pair in pairs]
+        scenes = [first["scene"] for first, _ in pairs]
+        estimates[arm] = {
+            key: estimate_mean([float(count == wanted) for count in right], scenes, PAIRS, seed=seed)
+            for key, wanted in ((BOTH, 2), (ONE, 1), (NEITHER, 0))
+        }
+    about = (
+        "Twins ask the same, from the same start, in two copies of a home that differ in one thing. "
+        "Only who looks answers both rightly."
+    )
+    title = "Counterfactual twins, % of pairs"
+    return [Breakdown("twins", title, title, about, "outcome", PAIRS, estimates, unit="pairs")] if estimates else []
+
+
+def find_twins(episodes: Sequence[Episode]) -> list[tuple[int, int]]:
+    """Return the pairs of episodes that name each other as twins, by index, each pair once."""
+    places = {episode.episode_id: index for index, episode in enumerate(episodes)}
+    named = {index: places.get(_read_twin(episode)) for index, episode in enumerate(episodes)}
+    return [(i, j) for i, j in named.items() if j is not None and i < j and named[j] == i]
+
+
+def _read_twin(episode: Episode) -> str:
+    question = episode.info.get("question")
+    return str(question.get("twin") or "") if isinstance(question, Mapping) else ""
+
+
+def _make_cut_metric(metric: Metric, cut: int) -> Metric:
+    return Metric(f"score_at_{cut}", metric.label, metric.kind, metric.higher_is_better, least=metric.least)
+
+
+def _estimate(outcomes: Sequence[Mapping[str, Any]], metric: Metric, seed: int) -> Estimate:
+    values, scenes = [o["metrics"][metric.name] for o in outcomes], [o["scene"] for o in outcomes]
+    return estimate_mean(values, scenes, metric, seed=seed)
+
+
+def _title(metric: Metric) -> str:
+    return " ".join(part for part in (metric.label, metric.unit, "↑" if metric.higher_is_better else "↓") if part)
