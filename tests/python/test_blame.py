@@ -17,7 +17,7 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
-from wiw.analysis.blame import EpisodeBlame
+from wiw.analysis.blame import EpisodeBlame, read_blame
 from wiw.analysis.blame_schemes import LOOP
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
@@ -287,6 +287,16 @@ def test_reruns_begun_by_an_earlier_version_are_continued(old_run: Path) -> None
     assert len(found.episodes) == 2 and not found.rerun_errors
     assert before.items() < again(old_run).items()
     assert wiw.verify(old_run / "blame", episodes=1).same
+
+
+def test_what_an_earlier_version_found_reads_as_before(old_run: Path, tmp_path: Path) -> None:
+    """To the byte: other tasks than question answering have the stages that they had."""
+    data = Path(__file__).parents[1] / "data"
+    with RunStore.read(old_run) as store:
+        found = read_blame(store)
+    assert found is not None and found.to_json() == (data / "blame_schema_7.json").read_text()
+    page = wiw.load_run(old_run).report(tmp_path / "report.html").read_text()
+    assert (data / "blame_schema_7.html").read_text() in page
 
 
 def test_a_run_begun_by_an_earlier_version_is_resumed_by_the_same_call(old_run: Path) -> None:

@@ -193,7 +193,11 @@ def read_blame(run: RunStore) -> Blame | None:
             return None
         reruns = {(row["arm"], row["episode"]): row for row in store.outcomes()}
     lines = [_read_arm(run, one["name"], reruns) for one in run.config["arms"]]
-    return Blame(run.path.parent, tuple(line for line in lines if line.episodes or line.rerun_errors), choose_scheme(run.config["task"]))
+    return Blame(
+        run.path.parent,
+        tuple(line for line in lines if line.episodes or line.rerun_errors),
+        choose_scheme(run.config["task"]),
+    )
 
 
 def list_failures(run: RunStore, arm: str) -> list[int]:

@@ -85,7 +85,7 @@ QUESTIONS = Scheme(
         "perception": "ground-truth labels and colours of real views are enough",
         "exploration": "a tour of the whole home is enough",
         "joint": "only ground truth in both perception and exploration is enough",
-        "answering": "not even ground truth in both perception and exploration is enough: the map or the answer is wrong",
+        "answering": "not even ground truth in both perception and exploration is enough: the map or the answer",
     },
     policy="explorer",
     needs_guide=False,

@@ -200,7 +200,7 @@ def _describe_expected_agents(base: RunStore) -> dict[str, Any]:
         for rerun, made in scheme.reruns.items():
             counterpart = find_counterpart(base.info["agents"][arm]["policy"], made.stages)
             if counterpart is not None:
-                changed = {part: counterpart.identity for part in ("policy", "revision")}
+                changed = dict.fromkeys(("policy", "revision"), counterpart.identity)
             else:
                 changed = {part: {"ground_truth": rerun} for part in _WRAPPED.get(rerun, ())}
             if changed:
