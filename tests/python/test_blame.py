@@ -17,7 +17,8 @@ import pytest
 from fakes import LineAgent, LineTask
 
 import wiw
-from wiw.analysis.blame import RERUNS, VERDICTS, EpisodeBlame
+from wiw.analysis.blame import EpisodeBlame, read_blame
+from wiw.analysis.blame_schemes import LOOP
 from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, StoreError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
@@ -101,7 +102,7 @@ def test_a_proposer_that_only_turns_is_to_blame(blamed: Any) -> None:
 
 
 def test_the_oracle_is_not_told_the_truth_twice(blamed: Any) -> None:
-    assert set(blamed["oracle"].recovery) == {*RERUNS} - {"imagination"}
+    assert set(blamed["oracle"].recovery) == {*LOOP.reruns} - {"imagination"}
     assert not any(arm == "oracle/imagination" for arm, _ in again(blamed.run))
 
 
@@ -191,10 +192,10 @@ def test_the_least_that_mends_is_to_blame(mended: dict[str, bool], verdict: str)
 def test_what_is_shown_and_kept(blamed: Any, capsys: Any, tmp_path: Path) -> None:
     assert main(["blame", str(blamed.run), "--arm", "noise,liar"]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in (*RERUNS, *VERDICTS, "noise", "liar"))
+    assert all(word in shown for word in (*LOOP.reruns, *LOOP.verdicts, "noise", "liar"))
     kept = json.loads((blamed.run / "blame.json").read_text())
     assert {line["arm"] for line in kept["arms"]} == {"noise", "liar"}
-    assert all(one["verdict"] in VERDICTS for one in kept["episodes"])
+    assert all(one["verdict"] in LOOP.verdicts for one in kept["episodes"])
     log = wiw.load_run(blamed.run)
     lines = {line["arm"]: line for line in log.blame()}
     assert lines["noise"]["mended_all"] == 100 and lines["noise"]["blame_scoring"] == blamed["noise"].failures
@@ -278,7 +279,7 @@ def test_reruns_begun_by_an_earlier_version_are_continued(old_run: Path) -> None
     assert {arm for arm, _ in before} == {"copy/imagination", "copy/scoring", "copy/proposals", "copy/all"}
     with RunStore.read(old_run / "blame") as store:
         agents = [arm["agent"] for arm in store.config["arms"]]
-        assert [agent["ground_truth"] for agent in agents] == [list(stages) for stages in RERUNS.values()]
+        assert [agent["ground_truth"] for agent in agents] == [list(rerun.stages) for rerun in LOOP.reruns.values()]
         assert {agent["reviser"] for agent in agents} == {"climber"}
         built = store.info["built"]
     assert built["copy/scoring"]["revision"]["ground_truth"] == "scoring" and "swaps" not in built["copy/scoring"]
@@ -286,6 +287,16 @@ def test_reruns_begun_by_an_earlier_version_are_continued(old_run: Path) -> None
     assert len(found.episodes) == 2 and not found.rerun_errors
     assert before.items() < again(old_run).items()
     assert wiw.verify(old_run / "blame", episodes=1).same
+
+
+def test_what_an_earlier_version_found_reads_as_before(old_run: Path, tmp_path: Path) -> None:
+    """To the byte: other tasks than question answering have the stages that they had."""
+    data = Path(__file__).parents[1] / "data"
+    with RunStore.read(old_run) as store:
+        found = read_blame(store)
+    assert found is not None and found.to_json() == (data / "blame_schema_7.json").read_text()
+    page = wiw.load_run(old_run).report(tmp_path / "report.html").read_text()
+    assert (data / "blame_schema_7.html").read_text() in page
 
 
 def test_a_run_begun_by_an_earlier_version_is_resumed_by_the_same_call(old_run: Path) -> None:

@@ -1,13 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which stage of the loop causes an agent's failures, from reruns with ground truth in one stage at a time.
+"""Which stage causes an agent's failures, from reruns with ground truth in one stage at a time.
 
-`wiw.blame` reruns failures; this module reads the reruns. A verdict is the first of these that turns the failure into a
-success, ordered by how much it gives away:
-imagination: ground-truth futures; the agent's own plans and scores are good enough.
-scoring: ground-truth scores; the agent's own plans are good enough.
-proposals: a ground-truth plan among the proposals; the agent recognises a good plan when it has one.
-joint: ground truth in all three stages, but in no single one.
-beyond: not even all three: the budget, the actions, or an answer that is wrong from the best view.
+`wiw.blame` reruns failures; this module reads the reruns. Stages and verdicts are in `wiw.analysis.blame_schemes`.
 """
 
 from __future__ import annotations
@@ -19,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from wiw.analysis.blame_schemes import LOOP, Scheme, choose_scheme
 from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.analysis.summary import show_estimate
 from wiw.errors import ArgumentError
-from wiw.experiments.ground_truth import STAGES
 from wiw.files import atomic_file
 from wiw.metrics.metric import SUCCESS
 from wiw.runs.rows import to_json
@@ -30,15 +24,6 @@ from wiw.runs.store import RunStore
 
 FOLDER = "blame"
 """Folder inside the run's that holds the reruns: a run store with one arm per arm and rerun."""
-RERUNS: Mapping[str, tuple[str, ...]] = {**{stage: (stage,) for stage in STAGES}, "all": STAGES}
-"""Stages that use ground truth, by the rerun's name."""
-VERDICTS = {
-    "imagination": "ground-truth futures are enough",
-    "scoring": "ground-truth scores of the agent's own plans are enough",
-    "proposals": "a ground-truth plan among the proposals is enough",
-    "joint": "only ground truth in all three stages is enough",
-    "beyond": "not even ground truth in all three stages is enough",
-}
 
 
 @dataclass(frozen=True)
@@ -50,12 +35,12 @@ class EpisodeBlame:
     scene: str
     success: Mapping[str, bool]
     """By rerun, whether the episode succeeds; a rerun that changes nothing is left out."""
+    scheme: Scheme = LOOP
 
     @property
     def verdict(self) -> str:
-        """One of `VERDICTS`."""
-        single = next((stage for stage in STAGES if self.success.get(stage)), None)
-        return single or ("joint" if self.success["all"] else "beyond")
+        """One of the scheme's verdicts."""
+        return self.scheme.find_verdict(self.success)
 
 
 @dataclass(frozen=True)
@@ -75,6 +60,7 @@ class ArmBlame:
     """Failures whose rerun ended with an error, by episode: which rerun, and why."""
     recovery: Mapping[str, Estimate]
     """By rerun, percent of `episodes` that succeed; empty where there are none."""
+    scheme: Scheme = LOOP
 
     @property
     def remaining(self) -> int:
@@ -85,7 +71,7 @@ class ArmBlame:
     def verdicts(self) -> dict[str, int]:
         """Number of failures by verdict."""
         found = Counter(episode.verdict for episode in self.episodes)
-        return {verdict: found[verdict] for verdict in VERDICTS}
+        return {verdict: found[verdict] for verdict in self.scheme.verdicts}
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values: `mended_<rerun>` with `_low` and `_high` in percent, `blame_<verdict>` in episodes."""
@@ -104,6 +90,7 @@ class Blame:
 
     run: Path
     arms: tuple[ArmBlame, ...]
+    scheme: Scheme = LOOP
 
     def __getitem__(self, arm: str) -> ArmBlame:
         """Return one arm's failures."""
@@ -167,8 +154,8 @@ class Blame:
         gap = " " if console.width >= ROOMY or not console.is_terminal else "\n"
         console = Console(width=None if console.is_terminal else max(console.width, ROOMY))
         for title, columns, cells in (
-            ("Failures that succeed with ground truth in one stage, %", (*RERUNS,), _recovery_cells),
-            ("Stage to blame, episodes", (*VERDICTS,), _verdict_cells),
+            ("Failures that succeed with ground truth in one stage, %", (*self.scheme.reruns,), _recovery_cells),
+            ("Stage to blame, episodes", (*self.scheme.verdicts,), _verdict_cells),
         ):
             table = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
             table.add_column("arm", style="bold", overflow="fold")
@@ -188,7 +175,7 @@ ROOMY = 120
 
 def _recovery_cells(line: ArmBlame) -> list[str]:
     """Return a cell per rerun, e.g. "46.3 [38.9, 54.0]"; a dash where it changes nothing or nothing was rerun."""
-    return [show_estimate(line.recovery[rerun]) if rerun in line.recovery else "–" for rerun in RERUNS]
+    return [show_estimate(line.recovery[rerun]) if rerun in line.recovery else "–" for rerun in line.scheme.reruns]
 
 
 def _verdict_cells(line: ArmBlame) -> list[str]:
@@ -209,7 +196,11 @@ def read_blame(run: RunStore) -> Blame | None:
             return None
         reruns = {(row["arm"], row["episode"]): row for row in store.outcomes()}
     lines = [_read_arm(run, one["name"], reruns) for one in run.config["arms"]]
-    return Blame(run.path.parent, tuple(line for line in lines if line.episodes or line.rerun_errors))
+    return Blame(
+        run.path.parent,
+        tuple(line for line in lines if line.episodes or line.rerun_errors),
+        choose_scheme(run.config["task"]),
+    )
 
 
 def list_failures(run: RunStore, arm: str) -> list[int]:
@@ -228,7 +219,7 @@ def list_reruns(run: RunStore, arm: str) -> list[str]:
     """Return the reruns that make a difference for an arm: the oracle's rollouts are the ground truth already."""
     agent = next(one["agent"] for one in run.config["arms"] if one["name"] == arm)
     exact = agent.get("model") == "oracle" and "placebo" not in agent
-    return [rerun for rerun in RERUNS if not (exact and rerun == "imagination")]
+    return [rerun for rerun in choose_scheme(run.config["task"]).reruns if not (exact and rerun == "imagination")]
 
 
 def name_rerun(arm: str, rerun: str) -> str:
@@ -239,7 +230,7 @@ def name_rerun(arm: str, rerun: str) -> str:
 def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[str, Any]]) -> ArmBlame:
     ended = [row for row in run.outcomes() if row["arm"] == arm]
     scenes = {row["episode"]: row["scene"] for row in ended}
-    failures, names = list_failures(run, arm), list_reruns(run, arm)
+    failures, names, scheme = list_failures(run, arm), list_reruns(run, arm), choose_scheme(run.config["task"])
     examined, errors = [], dict[int, str]()
     for episode in failures:
         rows = {name: reruns.get((name_rerun(arm, name), episode)) for name in names}
@@ -247,7 +238,7 @@ def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[
             errors[episode] = cause
         elif all(row is not None for row in rows.values()):
             success = {name: bool(row["metrics"]["success"]) for name, row in rows.items() if row is not None}
-            examined.append(EpisodeBlame(arm, episode, scenes[episode], success))
+            examined.append(EpisodeBlame(arm, episode, scenes[episode], success, scheme))
     return ArmBlame(
         arm,
         sum(row["status"] == "done" for row in ended),
@@ -256,6 +247,7 @@ def _read_arm(run: RunStore, arm: str, reruns: Mapping[tuple[str, int], Mapping[
         tuple(examined),
         errors,
         {name: _estimate_recovery(examined, name, run.config["seed"]) for name in names} if examined else {},
+        scheme,
     )
 
 

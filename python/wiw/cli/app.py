@@ -59,7 +59,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
-    (blame, "blame", "Find the stage of the loop that causes a run's failures."),
+    (blame, "blame", "Find the stage that causes a run's failures."),
     (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "Compute how many episodes a run needs to show a difference."),

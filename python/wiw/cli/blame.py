@@ -21,7 +21,7 @@ def blame(
     workers: Annotated[int | None, arg(metavar="N")] = None,
     retry_errors: bool = False,
 ) -> int:
-    """Find the stage of the loop that causes the failures of a run: imagination, scoring or proposals.
+    """Find the stage that causes the failures of a run: imagination, scoring or proposals; perception or exploration.
 
     $ wiw blame runs/first
     $ wiw blame runs/first --arm warp
@@ -36,6 +36,16 @@ def blame(
       proposals    a ground-truth plan is enough: the agent recognises a good plan, and proposed none
       joint        only all three together are enough
       beyond       not even all three: the budget, the actions, or the answer
+
+    Question answering (aeqa) by policy explorer has other stages. Its failures, marks below 5, are rerun with the
+    oracle as the world model, with true labels and colours of real views, with a tour of the whole home before the
+    first decision, and with both of the latter:
+
+      imagination  ground-truth futures are enough: a better world model helps
+      perception   true labels and colours are enough: the agent went to the right places
+      exploration  a tour is enough: the agent recognises what it sees, and had not seen enough
+      joint        only perception and exploration together are enough
+      answering    not even both: the map, or the answer that is read from it
 
     Ctrl-C and SIGTERM lose nothing: the same command continues, also with more episodes. Reruns are stored in
     RUN/blame, a run for `wiw view RUN/blame`; `wiw report RUN` and `wiw view RUN` show the verdicts.

@@ -74,7 +74,8 @@ class AgentFlags:
     """Proposes plans; name or path.py:Class. If not given, the task's: matcher, for ar recogniser, for manipulation
     scripted."""
     policy_option: Options = ()
-    """An option of --policy, such as weights=FILE; may be given again."""
+    """An option of --policy, such as weights=FILE; may be given again. Privileged counterparts in --arms take it
+    too."""
     revision: MaybeName = None
     """Scores imagined futures; the policy's own choice if not given."""
     vlm: Annotated[str | None, arg(metavar="URL")] = None

@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from wiw.analysis.blame import RERUNS, VERDICTS, Blame, read_blame
+from wiw.analysis.blame import Blame, read_blame
 from wiw.analysis.costs import cost_columns, costs
 from wiw.analysis.fidelity import ArmFidelity, choose_columns, fidelity
 from wiw.analysis.marks import BLIND
@@ -113,8 +113,8 @@ def render(run: Run, episodes: int | None = None, scale: float = 1.0, remark: st
             fidelity=[(line, line.cells(measured)) for line in truths],
             fidelity_columns=[(column.title, column.about) for column in measured],
             blame=blamed.arms if blamed else (),
-            reruns=list(RERUNS),
-            verdicts=VERDICTS,
+            reruns=blamed.scheme.reruns if blamed else {},
+            verdicts=blamed.scheme.verdicts if blamed else {},
             blame_notes=blamed.notes() if blamed else [],
             errors=[row for row in run.episodes if row["status"] == "error"],
             radius=config["task"].get("radius"),

@@ -35,8 +35,11 @@ BLAME_COLORS = {
     "imagination": "#4c78a8",
     "scoring": "#d1495b",
     "proposals": "#b5651d",
+    "perception": "#d1495b",
+    "exploration": "#b5651d",
     "joint": "#8e6bbf",
     "beyond": "#8b9099",
+    "answering": "#8b9099",
 }
 TICKS = 5
 """Most intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
@@ -113,7 +116,8 @@ def blame_by_arm(found: Blame) -> Markup:
     lines = list(reversed(found.arms))
     figure, axes = _figure()
     left = np.zeros(len(lines))
-    for verdict, color in BLAME_COLORS.items():
+    for verdict in found.scheme.verdicts:
+        color = BLAME_COLORS[verdict]
         counts = np.array([line.verdicts[verdict] for line in lines], np.float64)
         axes.barh(range(len(lines)), counts, left=left, height=0.55, color=color, label=verdict)
         for y, (start, count) in enumerate(zip(left, counts, strict=True)):

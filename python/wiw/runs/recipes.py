@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
+from wiw.experiments.counterparts import is_counterpart
 from wiw.experiments.placebos import PLACEBOS
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
@@ -114,6 +115,13 @@ class AgentRecipe(AgentConfig):
             return self
         none = isinstance(model, str) and model == "none"
         return replace(self, model=None if none else model, model_options={})
+
+    def with_policy(self, policy: str) -> AgentRecipe:
+        """Return the same agent with another policy; a privileged counterpart takes the options of its original."""
+        if not is_counterpart(policy, self.policy) or self.policy not in self.policy_options:
+            return replace(self, policy=policy)
+        options = {policy: self.policy_options[self.policy], **self.policy_options}
+        return replace(self, policy=policy, policy_options=options)
 
     def as_placebo(self, kind: str, model: Any = None) -> AgentRecipe:
         """Return the same agent with a placebo of its world model (or of another one)."""
@@ -360,7 +368,7 @@ def _make_arm(agent: AgentRecipe, name: str | None, model: Any) -> tuple[str, Ag
         raise ArgumentError(f"arms: '{model}' has the names '{name}' and '{arm.name}'; expected one of them")
     policy, of_model = _split_policy(arm.model)
     kind, named = placebo_of(of_model)
-    own = agent if policy is None else replace(agent, policy=policy)
+    own = agent if policy is None else agent.with_policy(policy)
     changed = own.with_model(of_model) if kind is None else own.as_placebo(kind, named)
     changed = _with_options(changed, arm)
     given = arm.name if name is None else name

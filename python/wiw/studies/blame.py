@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rerun the failures of a run with ground truth in one stage of the loop at a time, and in all of them.
+"""Rerun the failures of a run with ground truth in one stage at a time, and in several.
 
 Episodes, keys, agents and limits are the run's own, so that a rerun differs by its ground truth and nothing else.
 """
@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import Any
 
 from wiw._core import core
-from wiw.analysis.blame import FOLDER, RERUNS, Blame, list_failures, list_reruns, name_rerun, read_blame
+from wiw.analysis.blame import FOLDER, Blame, list_failures, list_reruns, name_rerun, read_blame
+from wiw.analysis.blame_schemes import Scheme, choose_scheme
 from wiw.errors import ArgumentError
+from wiw.experiments.counterparts import find_counterpart
 from wiw.runs.execute import recipes_of, require_own_sources, require_scenes, run_pending
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import AgentRecipe
@@ -33,15 +35,17 @@ def blame(
     *,
     retry_errors: bool = False,
 ) -> Blame:
-    """Find the stage that causes the failures of a run: imagination, scoring or proposals.
+    """Find the stage that causes the failures of a run: imagination, scoring, proposals; perception, exploration.
 
         found = wiw.blame("runs/first", "warp")
         found.summary()
         found["warp"].verdicts      # {"imagination": 3, "scoring": 12, "proposals": 7, "joint": 1, "beyond": 0}
 
     Each failure is rerun with the oracle world model, with ground-truth scores, with a ground-truth plan among the
-    proposals, and with all three (`wiw.experiments.ground_truth`). Reruns are stored in the folder `blame` of the run;
-    a second call continues where the first one stopped, and runs nothing twice.
+    proposals, and with all three (`wiw.experiments.ground_truth`). For question answering by policy `explorer`, the
+    stages after imagination are others: true labels and colours of real views, a tour of the whole home, and both
+    (`wiw.experiments.privileged_explorers`). Reruns are stored in the folder `blame` of the run; a second call
+    continues where the first one stopped, and runs nothing twice.
 
     Args:
         run: the run's folder.
@@ -54,7 +58,8 @@ def blame(
 
     Raises:
         ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success
-            or progress is, or an agent that cannot use the ground truth, such as one without a reviser.
+            or progress is, or an agent that cannot use the ground truth, such as one without a reviser, or one that
+            answers questions with another policy than `explorer`.
         StoreError: no readable run, one that was begun with objects in memory or by another version, or whose task,
             agents or navigation meshes have changed.
         FileError: a scene is not there.
@@ -71,7 +76,7 @@ def blame(
         run_pending(store, task, agents, pending, workers or base.info["workers"], progress)
         found = read_blame(base)
         assert found is not None
-        return Blame(found.run, tuple(line for line in found.arms if line.arm in wanted))
+        return replace(found, arms=tuple(line for line in found.arms if line.arm in wanted))
 
 
 def _choose_failures(base: RunStore, arms: str | Sequence[str] | None, most: int | None) -> dict[str, set[int]]:
@@ -80,6 +85,7 @@ def _choose_failures(base: RunStore, arms: str | Sequence[str] | None, most: int
     names = known if arms is None else [arms] if isinstance(arms, str) else list(arms)
     if unknown := [name for name in names if name not in known]:
         raise ArgumentError(f"blame: no arm '{unknown[0]}' in {base.path.parent}; it has {', '.join(known)}")
+    _require_allowed(base, names)
     failures = {arm: list_failures(base, arm) for arm in dict.fromkeys(names)}
     if not any(failures.values()):
         errors = sum(row["status"] == "error" and row["arm"] in failures for row in base.outcomes())
@@ -87,6 +93,35 @@ def _choose_failures(base: RunStore, arms: str | Sequence[str] | None, most: int
         raise ArgumentError(f"blame: {', '.join(failures)} in {base.path.parent} has no failure to explain{more}")
     seed = base.config["seed"]
     return {arm: {*sorted(found, key=lambda episode: _draw(seed, episode))[:most]} for arm, found in failures.items()}
+
+
+def _require_allowed(base: RunStore, arms: Sequence[str]) -> None:
+    """Check that the failures of these arms can be blamed on the stages of the run's scheme.
+
+    Raises:
+        ArgumentError: an arm's agent has no such stages.
+    """
+    scheme, agents = choose_scheme(base.config["task"]), base.info["agents"]
+    named = {arm: agent for arm, agent in agents.items() if agent is not None}  # objects in memory are refused later
+    if refused := next((arm for arm in arms if arm in named and not scheme.allows(named[arm])), None):
+        raise ArgumentError(f"blame: {_explain_refusal(base, scheme, refused, named)}")
+
+
+def _explain_refusal(base: RunStore, scheme: Scheme, arm: str, agents: Mapping[str, Any]) -> str:
+    """Return why an arm's failures cannot be blamed on any stage, and what to do."""
+    policy, reviser = agents[arm]["policy"], agents[arm].get("reviser")
+    own = f"policy '{policy}'" + ("" if reviser is None else f" and reviser '{reviser}'")
+    stages = ", ".join(list(scheme.reruns)[:-1])
+    allowed = ",".join(name for name, agent in agents.items() if scheme.allows(agent))
+    todo = (
+        f"choose from the arms that have it: --arm {allowed}"
+        if allowed
+        else f"`wiw run {base.config['task'].get('task')} --policy {scheme.policy}` makes a run with such arms"
+    )
+    return (
+        f"arm '{arm}' answers questions with {own}; only policy '{scheme.policy}' has stages that can be rerun with "
+        f"ground truth ({stages}); {todo}"
+    )
 
 
 def _draw(seed: int, episode: int) -> int:
@@ -104,23 +139,27 @@ def _recipes(base: RunStore, wanted: Mapping[str, set[int]]) -> tuple[Any, dict[
     base.require_version()
     task, agents = recipes_of(base)
     require_own_sources(base, task, agents)
-    built, episodes = task.build(), base.episodes()
+    built, episodes, scheme = task.build(), base.episodes(), choose_scheme(base.config["task"])
     base.require_task(built.describe())
-    if not built.has_guide:
+    if scheme.needs_guide and not built.has_guide:
         raise ArgumentError(
             f"blame: task '{base.config['task'].get('task')}' does not define the true value of a plan; derive it "
             "from wiw.tasks.navigation.NavigationTask, or write `guide` of its environment and set `has_guide`"
         )
     require_scenes(built, base, [episodes[index] for found in wanted.values() for index in found])
     return task, {
-        name_rerun(arm, rerun): _with_ground_truth(recipe, RERUNS[rerun])
+        name_rerun(arm, rerun): _with_ground_truth(recipe, scheme.reruns[rerun].stages)
         for arm, recipe in agents.items()
+        if scheme.allows(base.info["agents"][arm])
         for rerun in list_reruns(base, arm)
     }
 
 
 def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRecipe:
     """Return the agent with ground truth in some stages; a model that the oracle replaces is not built."""
+    if (counterpart := find_counterpart(recipe.policy, stages)) is not None:
+        own = recipe.with_policy(counterpart.policy)
+        return own if recipe.reviser is None else replace(own, reviser=counterpart.policy)
     own = replace(recipe.with_model("oracle"), placebo=None) if "imagination" in stages else recipe
     return replace(own, ground_truth=stages)
 
@@ -156,8 +195,19 @@ def _explicit_options(recipe: AgentRecipe) -> dict[str, Any]:
 
 def _describe_expected_agents(base: RunStore) -> dict[str, Any]:
     """Return how the agents of reruns must describe themselves, so that weights other than the run's are refused."""
-    return {
-        name_rerun(arm, stage): {**agent, part: {**agent[part], "ground_truth": stage}}
-        for arm, agent in base.info.get("built", {}).items()
-        for part, stage in (("revision", "scoring"), ("policy", "proposals"))
-    }
+    scheme, found = choose_scheme(base.config["task"]), dict[str, Any]()
+    for arm, agent in base.info.get("built", {}).items():
+        for rerun, made in scheme.reruns.items():
+            counterpart = find_counterpart(base.info["agents"][arm]["policy"], made.stages)
+            if counterpart is not None:
+                changed = dict.fromkeys(("policy", "revision"), counterpart.identity)
+            else:
+                changed = {part: {"ground_truth": rerun} for part in _WRAPPED.get(rerun, ())}
+            if changed:
+                own = {part: {**agent[part], **changes} for part, changes in changed.items()}
+                found[name_rerun(arm, rerun)] = {**agent, **own}
+    return found
+
+
+_WRAPPED = {"scoring": ("revision",), "proposals": ("policy",)}
+"""Part of an agent that is wrapped for a rerun, and says so."""
