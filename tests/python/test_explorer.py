@@ -224,7 +224,7 @@ def test_it_finds_the_sofa_and_answers_from_its_map(episode):  # noqa: F811
     sink = run(task, moved)
     (result,) = sink.results
     assert result.status == "done", result.error
-    assert result.metrics["answered"] == 1 and result.metrics["success"] == 1 and result.metrics["grounded"] == 1
+    assert result.metrics["answered"] == 1 and result.metrics["success"] == 1
     assert sink.answers[-1].final and sink.answers[-2].final and sink.answers[-1].confidence >= 0.5
 
 

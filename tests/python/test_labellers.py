@@ -314,7 +314,7 @@ def test_a_network_of_chance_is_below_the_floors(held_out: Any) -> None:
     torch.manual_seed(0)
     states = LearnedLabeller().card["states"]
     network = Network(len(CATEGORIES), len(STATES), (6, 8, 8, 10), normalised=False)
-    per_view = ("images", "category", "state", "hfov_deg")
+    per_view = ("images", "depth", "category", "state", "hfov_deg")
     few = replace(held_out, **{name: getattr(held_out, name)[:4] for name in per_view})
     found = evaluate(network, states, few, 0)
     assert found["plain"]["pixel_accuracy"] < 0.5 and found["plain"]["mean_iou"] < 0.1

@@ -19,8 +19,9 @@ from wiw.perception.scene_labels import CATEGORIES, STATES
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.perception.labelling_network import FOCAL  # noqa: E402
+from wiw.perception.labelling_network import CHANNELS, FOCAL  # noqa: E402
 from wiw.perception.learned_labeller import LearnedLabeller  # noqa: E402
+from wiw.scenes import possible_edits  # noqa: E402
 from wiw.training import color_naming  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.labelled_views import (  # noqa: E402
@@ -28,6 +29,7 @@ from wiw.training.labelled_views import (  # noqa: E402
     FIELDS,
     LabelledViews,
     ViewRules,
+    change_states,
     merge_views,
     read_instances,
     record_views,
@@ -70,6 +72,7 @@ def made_up(count: int, seed: int) -> LabelledViews:
         color.append(COLORS.index("red" if shade[0] > 100 else "blue"))
     return LabelledViews(
         np.clip(images, 0, 255).astype(np.uint8),
+        np.where(np.kron(category, np.ones((2, 2))) == LAMP, 1.5, 3.0).astype(np.float16),
         category,
         state,
         np.full(count, FIELD, np.float32),
@@ -82,7 +85,7 @@ def made_up(count: int, seed: int) -> LabelledViews:
 @pytest.fixture(scope="module")
 def lesson() -> Any:
     views = made_up(96, 0)
-    network, recipe = train(views, Recipe(epochs=10, widths=SMALL, bfloat16=False, degraded=0.3))
+    network, recipe = train(views, Recipe(epochs=10, widths=SMALL, bfloat16=False, imagined=0.3))
     assert recipe.epochs == 10
     return network, find_possible_states(views)
 
@@ -152,15 +155,37 @@ def test_degraded_views_keep_their_labels() -> None:
 @pytest.mark.parametrize("coarse", [False, True])
 def test_batches_are_aligned(coarse: bool) -> None:
     views = made_up(8, 0)
-    recipe = Recipe(batch=3, degraded=0.0)
+    recipe = Recipe(batch=3, imagined=0.0)
     batch = sample_batch(views, recipe, _compute_sampling_weights(views.category), np.random.default_rng(0), coarse)
     size = (32, 48) if coarse else SIZE
-    assert batch.shown.shape == (6 if coarse else 3, 5, *size)
+    assert batch.shown.shape == (6 if coarse else 3, CHANNELS, *size)
     assert batch.category.shape == (len(batch.shown), size[0] // 2, size[1] // 2) == batch.state.shape
     colored = np.ptp(batch.shown[:, :3, 1::2, 1::2].numpy(), axis=1) > 0.3
     assert (colored == (batch.category.numpy() == LAMP)).mean() > 0.96
+    near = batch.shown[:, 5, 1::2, 1::2].exp().numpy() < 2
+    assert (near == (batch.category.numpy() == LAMP)).mean() > 0.96 and (batch.shown[:, 7] == 1).all()
+    height = batch.shown[:, 5].exp() * batch.shown[:, 4]
+    assert torch.allclose(batch.shown[:, 6], height, atol=0.01)
     assert ((batch.state.numpy() > 0) == (batch.category.numpy() == LAMP)).all()
     assert (batch.shown[:, 4, 0] > 0).all() and (batch.shown[:, 4, -1] < 0).all()  # up and down
+
+
+def test_views_like_imagined_ones_have_no_depth() -> None:
+    views, rng = made_up(8, 0), np.random.default_rng(0)
+    weights = _compute_sampling_weights(views.category)
+    batch = sample_batch(views, Recipe(batch=8, imagined=1.0), weights, rng)
+    assert (batch.shown[:, 5:] == 0).all()
+
+
+def test_apartments_are_recorded_in_other_states_too() -> None:
+    changed = change_states("apartments:train/3", 0)
+    assert changed is not None and changed == change_states("apartments:train/3", 0)
+    edits = changed.partition("?")[2].split("&")
+    assert len(edits) > 3 and set(edits) <= set(possible_edits("apartments:train/3"))
+    assert all(edit.startswith("state:") for edit in edits)
+    assert len({edit.partition("=")[0] for edit in edits}) == len(edits)  # each thing in one state
+    assert change_states("apartments:train/3", 1) != changed
+    assert change_states("house.glb", 0) is None
 
 
 def test_recipes_are_checked() -> None:
@@ -220,7 +245,7 @@ def test_recorded_views_show_what_their_labels_say() -> None:
 
     from wiw._core import core
 
-    key = core.fold_key([3, 0x4C20])
+    key = core.fold_key([3, 0x4C20, 0])
     point = place.ground.put_down(place.navmesh.sample(2, key)).astype(np.float64)[0]
     turn = core.uniform(core.fold_key([key, 1]), 4)[0]
     pose = camera_pose(point, float(2 * np.pi * turn))
@@ -238,9 +263,9 @@ def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.Capture
     printed = capsys.readouterr().out
     assert "pixel accuracy" in printed and "colours of things" in printed and "IoU by category: wall" in printed
     card = LearnedLabeller(out).card
-    assert card["scenes"] == "apartments:train:2" and card["views"] == 32 and card["held_out"]["views"] == 16
+    assert card["scenes"] == "apartments:train:2" and card["views"] == 64 and card["held_out"]["views"] == 32
     assert card["held_out"]["plain"]["pixel_accuracy"] > 0.2 and card["held_out"]["colors"]["accuracy"] > 0.2
     assert out.stat().st_size < 4 * 2**20
     ColorNamer.load(tmp_path / "weights.colors.json")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["looks", "weights.colors.json", "weights.safetensors"]
-    assert len(list(cache.iterdir())) == 3
+    assert len(list(cache.iterdir())) == 6
