@@ -43,6 +43,8 @@ SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
 LOOK_ACTIONS = 3
 """Most primitives of a plan that only takes a second look."""
+MOST_GAIN = 12.0
+"""Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
 PATIENCE = 6
 """Decisions after which a place that could not be reached is given up; six lead up to 18 m."""
 LAST_ACTIONS = 18
@@ -136,8 +138,8 @@ class Explorer(Policy):
         perception: Any = "learned",
         sure: float = 0.5,
         imagination: float = 8.0,
-        path: float = 0.6,
-        affinity: float = 4.0,
+        path: float = 2.0,
+        affinity: float = 6.0,
         budget: int = 250,
         calibrated: bool = True,
     ) -> None:
@@ -280,7 +282,8 @@ class Explorer(Policy):
         named = memory.question.slots.get("room") if memory.question is not None else None
         likely = self.knowledge.measure_affinity(kind, memory.wanted) if kind else 0.3
         likely = max(likely, float(kind == named)) if named else likely
-        return place.gain + place.interest + self.affinity * likely - self.path * metres
+        gain = min(place.gain, MOST_GAIN)
+        return gain + place.interest + self.affinity * likely - self.path * metres
 
     # -- imagined views ------------------------------------------------------------------------------------------------
 

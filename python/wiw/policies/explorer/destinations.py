@@ -18,7 +18,7 @@ NEAR = 1.2
 """Metres from which a thing is looked at."""
 LOOKED_AT = 1.6
 """Metres from which a thing has been looked at as nearly as it will be."""
-INTEREST = 6.0
+INTEREST = 12.0
 """Worth of a nearer look at what the question is about, in square metres of new floor."""
 LEAST_GAIN = 0.4
 """Square metres of new floor from which on a frontier is worth going to."""
