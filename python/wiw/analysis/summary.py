@@ -344,13 +344,13 @@ def is_under_test(arm: str, role: str) -> bool:
 
 
 def load_metrics() -> tuple[Metric, ...]:
-    """Return all metrics: built-in ones, then those of installed packages that can be loaded."""
-    return _load_metrics_on(tuple(sys.path))
+    """Return all metrics: built-in ones, then registered ones and those of installed packages that can be loaded."""
+    return _load_metrics_on(tuple(sys.path), tuple((name, id(thing)) for name, thing in METRICS.registered.items()))
 
 
 @cache
-def _load_metrics_on(path: tuple[str, ...]) -> tuple[Metric, ...]:
-    """Load metrics once per state of `sys.path`: the search for packages takes longer than a whole summary."""
+def _load_metrics_on(path: tuple[str, ...], registered: tuple[tuple[str, int], ...]) -> tuple[Metric, ...]:
+    """Load metrics once per state of `sys.path` and registry: the search for packages takes longer than a summary."""
     found = []
     for name in METRICS.names():
         try:

@@ -172,11 +172,11 @@ class Attempt:
             return "infrastructure error, excluded from scores"
         metrics = self.outcome["metrics"]
         count = f"{len(self.steps)} decision{'' if len(self.steps) == 1 else 's'}"
+        due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
         if self.verdict is not None:
-            return f"{self.verdict.text}, after {count}"
+            return f"{self.verdict.text}, after {count}{due}"
         if self.success:
             return f"{self.words.won} in {count}"
-        due = f" · to blame: {self.outcome['blame']}" if "blame" in self.outcome else ""
         if self.choices:
             label = final_answer(metrics, self.choices)
             return (f"answered {label} after {count}" if label else f"no answer after {count}") + due
