@@ -77,7 +77,7 @@ def train(
     beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
     val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
     diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults,
-    those of perception in half the epochs.
+    those of perception in a quarter of the epochs.
 
     Args:
         what: recogniser, warpnet, perception, armnet or diffuser.
@@ -409,11 +409,12 @@ def _report_warpnet(card: dict[str, Any]) -> None:
 
 def _report_perception(card: dict[str, Any]) -> None:
     held_out = card["held_out"]
-    plain, degraded, colors = held_out["plain"], held_out["degraded"], held_out["colors"]
+    plain, colors = held_out["plain"], held_out["colors"]
+    kinds = {"with depth": plain, "without": held_out["no_depth"], "degraded too": held_out["degraded"]}
     print(f"{card['views']} views, {card['recipe']['epochs']} epochs; held out: {held_out['views']} views")
-    print(f"{'':<20}{'as rendered':>14}{'degraded':>14}")
+    print(f"{'':<20}" + "".join(f"{name:>14}" for name in kinds))
     for name, key in (("pixel accuracy", "pixel_accuracy"), ("mean IoU", "mean_iou"), ("states", "state_accuracy")):
-        print(f"  {name:<18}" + "".join(f"{_to_percent(part[key]):>14}" for part in (plain, degraded)))
+        print(f"  {name:<18}" + "".join(f"{_to_percent(part[key]):>14}" for part in kinds.values()))
     print(f"  {'colours of things':<18}{_to_percent(colors['accuracy']):>14}")
     print("IoU by category: " + ", ".join(f"{name} {value:.2f}" for name, value in plain["iou"].items() if name))
     for name, values in plain["states"].items():
