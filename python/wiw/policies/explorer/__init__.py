@@ -136,7 +136,7 @@ class Explorer(Policy):
     def __init__(
         self,
         perception: Any = "learned",
-        sure: float = 0.5,
+        sure: float = 0.45,
         imagination: float = 8.0,
         path: float = 2.0,
         affinity: float = 6.0,
