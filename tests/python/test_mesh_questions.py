@@ -179,6 +179,13 @@ def test_a_house_of_meshes_has_rooms_colors_and_questions(house):
     assert not any("made of" in text or "open" in text or " left " in text for text in asked)
 
 
+def test_questions_do_not_depend_on_the_folder(house, tmp_path):
+    for file in Path(house).parent.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    first, moved = (look_around(world(path, "cpu"), 0, RULES) for path in (house, str(tmp_path / "house.obj")))
+    assert np.array_equal(first.survey.points, moved.survey.points)
+
+
 def test_what_dim_light_makes_doubtful_has_no_color(house):
     """White in dim light is rendered as a grey that a little more light would make white."""
     colors = {thing.category: thing.color for thing in look_around(world(house, "cpu"), 0, RULES).table.things}

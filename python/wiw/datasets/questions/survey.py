@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.questions.answers import Sight
 from wiw.datasets.questions.facts import SceneTable
 from wiw.datasets.worlds import World
+from wiw.scenes import is_generated
 
 HFOV = 105.0
 """Degrees of the views that a viewpoint is judged by, as those that an agent is shown."""
@@ -91,8 +93,9 @@ def survey(world: World, points: NDArray[np.float64]) -> Survey:
 
 
 def place_key(seed: int, scene: str) -> int:
-    """Return the key that places of a scene are drawn with."""
-    return core.fold_key([seed, 0xAE0A, *scene.encode()])
+    """Return the key that places of a scene are drawn with; of a file whatever folder it lies in."""
+    name = scene if is_generated(scene) else Path(scene).name
+    return core.fold_key([seed, 0xAE0A, *name.encode()])
 
 
 def _headings() -> NDArray[np.float64]:
