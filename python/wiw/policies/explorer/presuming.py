@@ -23,6 +23,8 @@ SEVERAL = frozenset({"exists", "where_colored"})
 """Templates whose object may be there more than once, or not at all."""
 ON_ANCHOR = frozenset({"on_top", "count_on"})
 """Templates that take for granted that something stands on their anchor."""
+MOST_LEVELS = 16
+"""Levels of support at most that are tried."""
 LEAST_KIND = 0.02
 """Probability from which on a room may be of a kind that a question names."""
 
@@ -91,5 +93,6 @@ def _doubt(home: Home, question: ParsedQuestion, table: SceneTable) -> Iterator[
         rest = (thing for thing in table.things if thing is anchor or thing.category in SMALL | STRUCTURE)
         yield replace(table, things=tuple(rest))
     weights = {thing.id: home.weigh(thing) for thing in table.things}
-    for least in sorted({weight for weight in weights.values() if np.isfinite(weight)}):
+    levels = sorted({weight for weight in weights.values() if np.isfinite(weight)})
+    for least in levels[:: -(-len(levels) // MOST_LEVELS) or 1]:
         yield replace(table, things=tuple(thing for thing in table.things if weights[thing.id] > least))
