@@ -250,6 +250,13 @@ def test_the_step_that_was_refused_is_found(blocked: int | None) -> None:
     assert expected is None or np.allclose(found, expected)
 
 
+def test_where_all_steps_were_refused_the_first_is_found() -> None:
+    actions = [int(a) for a in (TURN_LEFT, FORWARD, FORWARD, TURN_LEFT, FORWARD, TURN_RIGHT)]
+    found = find_refused(np.array([1.0, -2.0, 0.3]), actions, np.array([1.0, -2.0, 0.3 + np.radians(22.5)]))
+    assert found is not None and np.allclose(found, [1.0, -2.0, 0.3 + np.radians(22.5)])
+    assert find_refused(np.zeros(3), [int(TURN_LEFT)] * 2, np.array([0.0, 0.0, np.radians(45)])) is None
+
+
 @pytest.mark.parametrize("turn_deg", [-40.0, 0.0, 17.0, 44.0])
 def test_the_walls_azimuth_is_found_whatever_the_heading(turn_deg: float) -> None:
     tour = walk("apartments:val/3", 4)

@@ -255,12 +255,15 @@ def find_refused(
     found = _simulate(pose, list(actions), True)
     if np.hypot(*(found.poses[-1] - end)[:2]) < STEP / 4:
         return None
-    ahead = [i for i, action in enumerate(actions) if int(action) == int(FORWARD)]
+    ids = np.asarray(actions)
+    ahead = np.flatnonzero(ids == int(FORWARD))
     misses = []
-    for first in ahead:  # what refuses a step refuses those after it, until the agent turns
-        last = next((i for i in range(first, len(actions)) if int(actions[i]) != int(FORWARD)), len(actions))
-        carried = [*actions[:first], *actions[last:]]
-        misses.append(float(np.hypot(*(_simulate(pose, carried, True).poses[-1] - end)[:2])))
+    for first in ahead:
+        # What refuses a step refuses those after it, until the agent turns; then all go well, or none.
+        turn = first + np.argmax(np.append(ids[first:] != int(FORWARD), True))
+        rest = ids[turn:]
+        ends = [_simulate(pose, [*ids[:first], *later], True).poses[-1] for later in (rest, rest[rest != int(FORWARD)])]
+        misses.append(min(float(np.hypot(*(each - end)[:2])) for each in ends))
     return found.poses[ahead[int(np.argmin(misses))]] if misses else None
 
 

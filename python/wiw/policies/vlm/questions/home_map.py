@@ -9,12 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.mapping.landmarks import Landmark, LandmarkFinder
 from wiw.mapping.marks import MarkedViews, draw_marks
 from wiw.mapping.object_map import BACKGROUND, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
-from wiw.mapping.routes import STEP, TURN
+from wiw.mapping.routes import STEP, find_refused
 from wiw.mapping.views import Views
 from wiw.perception.scene_labels import STATES, SceneLabels
 from wiw.types import Observation
@@ -70,12 +69,11 @@ class HomeMap:
     def _mark_refusal(self, pose: NDArray[np.float64], executed: NDArray[np.int8]) -> None:
         """Mark what has refused all steps ahead, where depth shows no obstacle."""
         before, self._pose = self._pose, pose.copy()
-        steps = np.flatnonzero(executed == int(FORWARD))
-        if before is None or not len(steps) or np.linalg.norm(pose[:2] - before[:2]) > MOVED:
+        if before is None or np.linalg.norm(pose[:2] - before[:2]) > MOVED:
             return
-        turns = executed[: steps[0]]
-        turned = int((turns == int(TURN_LEFT)).sum() - (turns == int(TURN_RIGHT)).sum())
-        self.grid.mark_blocked(np.array([*pose[:2], before[2] + TURN * turned]), STEP)
+        blocked = find_refused(before, executed, pose)
+        if blocked is not None:
+            self.grid.mark_blocked(blocked, STEP)
 
 
 def find_named(landmarks: Sequence[Landmark], question: str) -> list[int]:
