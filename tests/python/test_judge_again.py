@@ -144,7 +144,7 @@ def test_a_reply_that_takes_too_long_is_an_error_of_its_episode(run: Path) -> No
     with VlmServer(MockClient(slow, model="m")) as server:
         try:
             found = wiw.judge(
-                run, f"rules+llm:{server.url}#m", progress=False, cache="off", attempts=1, timeout=6.0, concurrency=4
+                run, f"rules+llm:{server.url}#m", progress=False, cache="off", attempts=1, timeout=6.0, concurrency=1
             )
         finally:
             ended.set()
