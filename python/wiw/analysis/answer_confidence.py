@@ -17,8 +17,10 @@ from scipy.optimize import isotonic_regression
 from wiw.datasets.questions import Question
 from wiw.errors import ArgumentError
 from wiw.files import atomic_file
-from wiw.judging import Reference, make_judge
+from wiw.judging import make_judge
+from wiw.judging.judge import HIGHEST_MARK
 from wiw.runs.store import RunStore
+from wiw.tasks.answer_record import make_reference
 
 KNOTS = 6
 """Points of a curve at most."""
@@ -43,7 +45,6 @@ def calibrate_confidence(run: str | Path) -> dict[str, dict[str, list[float]]]:
         ArgumentError: nothing was answered in it.
     """
     samples = defaultdict[str, list[Sample]](list)
-    episodes: Counter[str] = Counter()
     judge = make_judge("rules")
     with RunStore.read(run) as store:
         questions = [Question.from_info(episode.info["question"]) for episode in store.episodes()]
@@ -52,11 +53,10 @@ def calibrate_confidence(run: str | Path) -> dict[str, dict[str, list[float]]]:
     counts = Counter((arm, episode) for arm, episode, _ in supported)
     for arm, episode, answer in supported:
         asked = questions[episode]
-        reference = Reference(asked.text, asked.answer, asked.extra_answers, asked.answer_type)
-        right = float(judge.judge([reference], [answer["label"]])[0].mark == 5)
+        right = float(judge.judge([make_reference(asked)], [answer["label"]])[0].mark == HIGHEST_MARK)
         for name in (asked.answer_type, ""):
             samples[name].append((answer["confidence"], right, 1 / counts[arm, episode]))
-    episodes.update(questions[episode].answer_type for _, episode in counts)
+    episodes = Counter(questions[episode].answer_type for _, episode in counts)
     if not samples:
         raise ArgumentError(f"calibrate_confidence: expected a run of policy explorer, got {run}, which has no answers")
     return {name: fit_curve(found) for name, found in sorted(samples.items()) if not name or episodes[name] >= LEAST}

@@ -23,7 +23,8 @@ from wiw.perception.colors import COLORS
 from wiw.perception.oracle_labeller import OracleLabeller
 from wiw.perception.scene_labels import SceneLabels
 from wiw.policies.base import Situation
-from wiw.policies.explorer import VIEW_SIZE, Explorer, Look
+from wiw.policies.explorer import Explorer, Look
+from wiw.policies.explorer.drawing import VIEW_SIZE
 
 UNLEARNED = ("ball", "bunk bed", "speaker")
 """Categories of apartments that are too rare for the built-in labeller."""
@@ -70,13 +71,13 @@ class PrivilegedExplorer(Explorer, Privileged):
         if self.tour and not situation.memory.grid.visits:
             yield from take_tour(env, self.true_labels)
         for look in super().look_around(situation):
-            yield look.with_ids(env.instances()[0]) if self.true_labels else look
+            yield replace(look, ids=env.instances()[0]) if self.true_labels else look
 
     def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
         """Return the views and their labels; where ids are given by these, and each thing painted in its colour."""
         if look.ids is None:
             return super().perceive(situation, look, pose)
-        instances = self._environments.find(situation.key).instances()[1]
+        instances = self._environments.find(situation.key).state.world.scene.instances
         views, ids = cut_views(look.panorama, look.depth, pose, VIEW_SIZE), cut_labels(look.ids, VIEW_SIZE)
         labels = OracleLabeller(instances, self.map_categories).label(views.images, HFOV_DEG, ids)
         return replace(views, images=_paint_colors(instances)[ids]), labels

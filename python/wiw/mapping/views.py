@@ -65,10 +65,17 @@ def cut_views(
         raise ArgumentError(
             f"cut_views: expected a panorama of {(*depth.shape, 3)}, the size of its depth, got {panorama.shape}"
         )
-    plan = _get_plan((depth.shape[0], depth.shape[1]), size, hfov_deg)
-    images = plan(panorama, VIEW_YAWS_DEG)
+    images = cut_images(panorama, size, hfov_deg)
     distance = cut_labels(depth, size, hfov_deg)
     return Views(images, distance_to_planar(distance, hfov_deg), place_cameras(odometry), odometry.copy(), hfov_deg)
+
+
+def cut_images(
+    panorama: NDArray[np.uint8], size: tuple[int, int] = SIZE, hfov_deg: float = HFOV_DEG
+) -> NDArray[np.uint8]:
+    """Cut the four views out of a panorama uint8 [H, W, 3]: [4, h, w, 3]."""
+    plan = _get_plan((panorama.shape[0], panorama.shape[1]), size, hfov_deg)
+    return plan(panorama, VIEW_YAWS_DEG)
 
 
 def cut_labels(values: NDArray[Any], size: tuple[int, int] = SIZE, hfov_deg: float = HFOV_DEG) -> NDArray[Any]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from wiw.judging.normalise import normalise
+from wiw.tasks.answer_record import read_end_judgement
 from wiw.types import Episode
 
 
@@ -84,18 +85,12 @@ def list_beliefs(decisions: Sequence[Mapping[str, Any]], expected: Sequence[str]
 
 def read_verdict(details: Mapping[str, Any]) -> Verdict | None:
     """Return the judgement that an outcome's details hold; None where the task has no judge."""
-    found = details.get("judgement")
+    found = read_end_judgement(details)
     if found is None:
         return None
-    judge = f"{found['judge']} ({found['model']})" if found.get("model") else str(found["judge"])
-    return Verdict(
-        str(details.get("answer", "")),
-        str(details.get("expected", "")),
-        int(found["mark"]),
-        judge,
-        bool(found.get("approximate")),
-        str(found.get("reply", "")),
-    )
+    judge = f"{found.judge} ({found.model})" if found.model else found.judge
+    answer, expected = (str(details.get(name, "")) for name in ("answer", "expected"))
+    return Verdict(answer, expected, found.mark, judge, found.approximate, found.reply)
 
 
 def _count_same(labels: Sequence[str | None]) -> int:

@@ -78,11 +78,13 @@ def list_judgements(run: Run) -> Table:
         judged = run.store.judged_outcomes(judge.digest)
         for (arm, episode), row in ({**recorded, **judged} if judge.own else judged).items():
             key = {"judge": judge.digest, "judge_name": judge.label, "own": judge.own, "arm": arm, "episode": episode}
-            found += [{**key, **each, "kind": row["kind"], "error": row["error"]} for each in _judged(row["details"])]
+            found += [
+                {**key, **each, "kind": row["kind"], "error": row["error"]} for each in _list_judgements(row["details"])
+            ]
     return found
 
 
-def _judged(details: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _list_judgements(details: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Yield the answers of an outcome, the agent's and the one from the text alone, with their judgements."""
     blind = details.get("blind") or {}
     pairs = (

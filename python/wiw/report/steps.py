@@ -46,11 +46,11 @@ def step(
         ", ".join(f"{reason} ({count})" for reason, count in Counter(row["refused"]).items()),
         f"shot-{name}" if isinstance(way, Poses) else "",
         belief=belief,
-        believed=_believed(images, album, name),
+        believed=_make_belief_pictures(images, album, name),
     )
 
 
-def _believed(images: Mapping[str, bytes], album: Album, name: str) -> tuple[tuple[str, Picture], ...]:
+def _make_belief_pictures(images: Mapping[str, bytes], album: Album, name: str) -> tuple[tuple[str, Picture], ...]:
     """Return the pictures of what the policies believed, with their names."""
     found = {title.removeprefix(PREFIX): image for title, image in images.items() if title.startswith(PREFIX)}
     size = album.belief_width, album.belief_quality, album.scale

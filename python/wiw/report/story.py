@@ -215,7 +215,7 @@ class Story:
         return str(self.episode.info.get("instruction", ""))
 
     @property
-    def expected(self) -> tuple[str, ...]:
+    def expected_answers(self) -> tuple[str, ...]:
         """The answers in words that count as right, where the task is a question."""
         return list_expected(self.episode) if "question" in self.episode.info else ()
 

@@ -23,21 +23,18 @@ from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
 from wiw.mapping.object_map import ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.mapping.routes import STEP, find_refused
-from wiw.mapping.views import HFOV_DEG, VIEW_YAWS_DEG, Views, cut_views, unproject
-from wiw.panorama import to_perspective
+from wiw.mapping.views import HFOV_DEG, Views, cut_images, cut_views, unproject
 from wiw.perception.colors import name_color
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.explorer.answering import Belief, answer, list_wanted
 from wiw.policies.explorer.confidence import estimate_confidence
 from wiw.policies.explorer.destinations import Destination, Rate, choose_destinations, plan_route
-from wiw.policies.explorer.drawing import draw_beliefs
+from wiw.policies.explorer.drawing import VIEW_SIZE, draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
 from wiw.registry import LABELLERS
 from wiw.types import Decision, Goal, Key, Proposal, Rollout, TextAnswer
 
-VIEW_SIZE = (192, 224)
-"""(H, W) of the views that are labelled."""
 SURFACES = ("floor", "wall")
 SURFACE_STRIDE = 24
 """Pixels between the looks at floors and walls, along rows and columns."""
@@ -64,10 +61,6 @@ class Look:
     ids: NDArray[np.uint32] | None = None
     """The simulator's instance of each pixel, for explorers that are given the truth."""
 
-    def with_ids(self, ids: NDArray[np.uint32]) -> Look:
-        """Return the same look with instance ids."""
-        return replace(self, ids=ids)
-
 
 @dataclass
 class Memory:
@@ -88,7 +81,6 @@ class Memory:
     """Primitives until then."""
     destinations: list[Destination] = field(default_factory=list)
     """Places worth going to from there, the most worth first."""
-
     tries: Counter[tuple[int, int]] = field(default_factory=Counter)
     """Decisions in which a place, in half metres, was the most worth going to."""
 
@@ -106,7 +98,7 @@ class Memory:
         return turn_odometry(look.odometry, self.azimuth)
 
     @cached_property
-    def wanted(self) -> tuple[str, ...]:
+    def wanted_categories(self) -> tuple[str, ...]:
         """Categories to look for, the one that is asked about first."""
         return list_wanted(self.question)
 
@@ -126,8 +118,8 @@ class Explorer(Policy):
 
     Raises:
         ArgumentError: a labeller that needs the simulator's instance ids.
-        BackendError: torch is not installed.
-        FileError: the weights cannot be read.
+        DependencyError: torch is not installed.
+        WeightsError: the weights cannot be read.
     """
 
     needs = ("depth",)
@@ -280,7 +272,7 @@ class Explorer(Policy):
         room = memory.home.room_names.get(memory.grid.find_room(place.position[None]), "")
         kind = room.rpartition(" ")[0]
         named = memory.question.slots.get("room") if memory.question is not None else None
-        likely = self.knowledge.measure_affinity(kind, memory.wanted) if kind else 0.3
+        likely = self.knowledge.measure_affinity(kind, memory.wanted_categories) if kind else 0.3
         likely = max(likely, float(kind == named)) if named else likely
         gain = min(place.gain, MOST_GAIN)
         return gain + place.interest + self.affinity * likely - self.path * metres
@@ -298,7 +290,7 @@ class Explorer(Policy):
         labels = iter(self._label_views(ends))
         scores = []
         for situation, plans in zip(situations, proposals, strict=True):
-            shown = [self._measure_evidence(next(labels), situation.memory.wanted) for _ in plans]
+            shown = [self._measure_evidence(next(labels), situation.memory.wanted_categories) for _ in plans]
             prior = np.array([plan.prior for plan in plans], np.float64)
             scores.append(prior + self.imagination * np.array(shown))
         return scores
@@ -361,5 +353,5 @@ def _cut_end(rollout: Rollout) -> tuple[NDArray[np.uint8], float]:
     """Return the views at the end of a rollout, uint8 [V, H, W, 3], one if it shows the front alone; and their HFOV."""
     end = rollout.frames[-1]
     if rollout.view == "panorama":
-        return np.stack([to_perspective(end, HFOV_DEG, VIEW_SIZE, yaw) for yaw in VIEW_YAWS_DEG]), HFOV_DEG
+        return cut_images(end, VIEW_SIZE), HFOV_DEG
     return end[None] if end.ndim == 3 else end, 90.0

@@ -24,7 +24,7 @@ from wiw.types import Decision
 OVERHEAD = 1.8
 """Metres above the floor from which on a thing hangs above the agent."""
 VIEW_SIZE = (192, 224)
-"""(H, W) of the views in which things are found again."""
+"""(H, W) of the views that are labelled, and in which things are found again."""
 SHOWN_SIZE = (288, 336)
 """(H, W) of the views that are drawn."""
 LINE = 15

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw import annotate
-from wiw.mapping.views import HFOV_DEG, SIZE, VIEW_NAMES, VIEW_YAWS_DEG
-from wiw.panorama import to_perspective
+from wiw.mapping.views import VIEW_NAMES, cut_images
 from wiw.policies.vlm.questions.home_map import Sight
 from wiw.types import Rollout
 
@@ -43,7 +42,7 @@ def render_end(rollout: Rollout) -> Image:
     end = rollout.frames[-1]
     kind = "real" if rollout.real[-1] else "imagined"
     if rollout.view == "panorama":
-        return _join(np.stack([to_perspective(end, HFOV_DEG, SIZE, yaw) for yaw in VIEW_YAWS_DEG]), kind)
+        return _join(cut_images(end), kind)
     return _join(end[None] if end.ndim == 3 else end, kind)
 
 
