@@ -195,7 +195,7 @@ class Wording:
 
 @dataclass(frozen=True)
 class TableSpec:
-    """What the tables and plots of a task's runs show beside the metrics of each arm."""
+    """Contents of the tables and plots of a task's runs, beside the metrics of each arm."""
 
     kinds: tuple[str, ...] = ("success",)
     """Metrics that are shown for each kind of episode, where there are several."""
@@ -204,7 +204,7 @@ class TableSpec:
     cuts: tuple[int, ...] = ()
     """Primitives at which the anytime curve is read, from the metrics "score_at_30" and so on."""
     kind: str = "kind of task"
-    """What a kind is called."""
+    """Word for a kind."""
 
 
 @dataclass(frozen=True)

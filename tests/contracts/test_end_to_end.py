@@ -334,7 +334,7 @@ def test_questions_with_every_kind(kind: Any, server: VlmServer, two_rooms: str,
 
 
 def check_end(end: Any, accepts: Any) -> None:
-    """What a plan ends with: the front view that was imagined, or four views around."""
+    """Check the view at the end of a plan: the front view that was imagined, or four views around."""
     if accepts.view == "perspective":
         assert end.shape[1] == VIEW
         check_front(end[-VIEW:], accepts)

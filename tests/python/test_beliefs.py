@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What policies believe: pictures that they draw, and how pages show beliefs and judgements."""
+"""Beliefs of policies: pictures that they draw, and how pages show beliefs and judgements."""
 
 from __future__ import annotations
 

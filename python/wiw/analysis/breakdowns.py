@@ -23,14 +23,14 @@ class Breakdown:
     """A table of estimates: arms one way, something else the other way."""
 
     name: str
-    """Of the table in exports."""
+    """Name of the table in exports."""
     title: str
     heading: str
     """The same for a page, which explains its metrics elsewhere."""
     about: str
-    """What a reader of the table needs to know; may be empty."""
+    """Notes that a reader of the table needs; may be empty."""
     key_name: str
-    """What a key is, such as "cut"."""
+    """Meaning of a key, such as "cut"."""
     metric: Metric
     estimates: Mapping[str, Mapping[str, Estimate]]
     """By arm, then by key."""
@@ -39,7 +39,7 @@ class Breakdown:
     arms_across: bool = False
     """Whether arms are columns, as suits few arms and many keys."""
     unit: str = "episodes"
-    """What estimates are over."""
+    """Unit that estimates are means over."""
 
     @property
     def keys(self) -> tuple[str, ...]:

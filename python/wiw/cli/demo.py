@@ -31,7 +31,7 @@ class Part:
     options: dict[str, Any] = field(default_factory=dict)
     """Of the task."""
     requires: Requirements = field(default_factory=Requirements)
-    """What the policy needs."""
+    """Packages that the policy needs."""
 
 
 TORCH = Requirements(("torch", "safetensors"), "torch")

@@ -15,7 +15,7 @@ class Counterpart:
     policy: str
     """Its name in the registry."""
     identity: Mapping[str, Any]
-    """What differs in its description."""
+    """Fields that differ in its description."""
 
 
 COUNTERPARTS: Mapping[str, Mapping[tuple[str, ...], Counterpart]] = {

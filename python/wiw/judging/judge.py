@@ -64,7 +64,7 @@ class Judgement:
     unanswered: bool = False
     """Whether there was no answer; the mark is the lowest then."""
     seed: int | None = None
-    """Of the language model's sampling; None without one."""
+    """Sampling setting of the language model; None without one."""
     temperature: float | None = None
 
     def __post_init__(self) -> None:

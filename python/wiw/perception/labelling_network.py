@@ -27,7 +27,7 @@ MULTIPLE = 16
 STRIDE = 2
 """Input pixels per output pixel."""
 CHANNELS = 8
-"""Of the input; see `to_network_input`."""
+"""Channels of the input; see `to_network_input`."""
 
 
 class Network(nn.Module):

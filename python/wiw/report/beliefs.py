@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an agent believed when: its answer at each decision of an episode, and who judged the last one how."""
+"""Beliefs over an episode: the answer at each decision, and the judgement of the last one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Verdict:
     """With its model, e.g. "llm (qwen)"."""
     approximate: bool
     reply: str
-    """Of a language model."""
+    """Reply of a language model."""
 
     @property
     def text(self) -> str:

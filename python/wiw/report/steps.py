@@ -17,7 +17,7 @@ from wiw.report.story import Album, Candidate, Picture, Step
 from wiw.runs.rows import select_frames
 
 PREFIX = "believed/"
-"""Of the names of pictures of what the policies believed."""
+"""Prefix of the names of pictures of what policies believed."""
 
 
 def step(

@@ -42,7 +42,7 @@ class Album:
     """Pixels of the front views of a gripper: of real ones, and of imagined ones."""
     goal_side, map_side = 280, 700
     belief_width, belief_quality = 440, 35
-    """Of pictures of what policies believe, which have lines and letters."""
+    """Pixels across and JPEG quality of pictures of what policies believe, which have lines and letters."""
     belief_count: int | None = 1
     """How many of these a decision shows at most; None means all."""
     whole = False

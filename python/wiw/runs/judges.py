@@ -16,7 +16,7 @@ DIGITS = 12
 SHORTEST_PREFIX = 4
 """Digits of a digest that name a judge, where no other begins with them."""
 JUDGE_ERROR = "judge/"
-"""What kinds of errors of a judge begin with."""
+"""Prefix of the kinds of a judge's errors."""
 NOT_JUDGED = "judge/missing"
 """Kind of an outcome that a judge has not been asked about."""
 _SHORT_NAMES = {"rules": "rules+approximate"}

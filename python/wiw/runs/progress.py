@@ -77,7 +77,7 @@ class AnswerProgress:
 
 
 class Progress(Protocol):
-    """What a board shows of a piece of work."""
+    """Progress of a piece of work, as a board shows it."""
 
     @property
     def total(self) -> int:

@@ -61,7 +61,7 @@ class Run:
 
     @property
     def tables(self) -> TableSpec:
-        """What its task has tables and plots show; runs from before that was recorded have what the task says now."""
+        """Return what its task has tables and plots show; of older runs, what the task says now."""
         kept, task = self.store.info.get("tables"), self.store.config["task"].get("task")
         if kept is not None:
             values: dict[str, Any] = {str(name): tuple(v) if isinstance(v, list) else v for name, v in kept.items()}

@@ -44,7 +44,7 @@ class MissingMarks:
 
 @dataclass(frozen=True)
 class JudgedRun:
-    """What judging a run came to."""
+    """The result of judging a run."""
 
     log: RunLog
     """The run, read with the judge's marks."""

@@ -37,7 +37,7 @@ class AnswerRecord:
 
     @property
     def reference(self) -> Reference:
-        """What answers are compared with."""
+        """The reference that answers are compared with."""
         return make_reference(self.question)
 
     @property

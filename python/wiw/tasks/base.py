@@ -45,7 +45,7 @@ class Task(ABC):
     wording: Wording = Wording()
     """How reports speak of its episodes."""
     tables: TableSpec = TableSpec()
-    """What tables and plots of its runs show."""
+    """Contents of the tables and plots of its runs."""
     has_guide: bool = False
     """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
 

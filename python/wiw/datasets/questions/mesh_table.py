@@ -44,7 +44,7 @@ Overlay = Mapping[str, Mapping[str, str]]
 
 @dataclass(frozen=True)
 class Attributes:
-    """What a file says of instances, by their names."""
+    """Attributes of instances that a file gives, by their names."""
 
     overlay: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
 

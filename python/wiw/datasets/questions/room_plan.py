@@ -112,7 +112,7 @@ class PlannedRoom(Room):
 
 @dataclass(frozen=True, eq=False)
 class Floor:
-    """What is floor between walls, furnished or not."""
+    """The floor between walls, furnished or not."""
 
     origin: NDArray[np.float64]
     open: NDArray[np.bool_]

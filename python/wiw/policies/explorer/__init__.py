@@ -74,7 +74,7 @@ class Memory:
     belief: Belief = field(default_factory=lambda: Belief("", 0.0))
     home: Any = None
     azimuth: float | None = None
-    """Of the walls in the frame of the start; the map's x axis points along it."""
+    """Azimuth of the walls in the frame of the start; the map's x axis points along it."""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     """x, y, azimuth in the map at the last decision."""
     executed: int = 0

@@ -35,7 +35,7 @@ class Belief:
     confidence: float
     """From 0 to 1; 0 where nothing observed supports the answer."""
     things: tuple[MapObject, ...] = ()
-    """What the answer rests on, best looked at next to be surer."""
+    """Things that the answer rests on, best looked at next to be surer."""
 
 
 def list_wanted(question: ParsedQuestion | None) -> tuple[str, ...]:

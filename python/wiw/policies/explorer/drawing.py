@@ -36,7 +36,7 @@ RGB: Mapping[str, Color] = {
     "pink": (236, 158, 186),
 }  # fmt: skip
 NO_COLOR: Color = (204, 200, 214)
-"""Of things whose colour is not known."""
+"""Fill of things whose colour is not known."""
 
 
 def draw_beliefs(memory: Any, situation: Situation, decision: Decision, north: float) -> dict[str, NDArray[np.uint8]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a question takes for granted about a home: that what it speaks of is there, once, and in the room it names.
+"""Presuppositions of a question: that what it speaks of is there, once, and in the room it names.
 
 A map has a thing twice, or two rooms that might be the kitchen; the question knows better. It says nothing of the
 answer.

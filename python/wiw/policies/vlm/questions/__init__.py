@@ -41,7 +41,7 @@ class QuestionMemory(Memory):
 
     home: HomeMap
     sight: Sight | None = None
-    """Of the present decision."""
+    """View of the present decision."""
     commands: dict[bytes, Command] = field(default_factory=dict)
     """Commands of the present decision by the plans that they became."""
     answer: tuple[Key, str] | None = None

@@ -35,7 +35,7 @@ _NOTHING = ("", "none", "null", "n/a")
 
 @dataclass(frozen=True)
 class Command:
-    """What the high-level planner wants done."""
+    """A command of the high-level planner."""
 
     plan: str
     """In its words."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the agent keeps of a home: objects, floor, and the landmarks that are within sight now."""
+"""The agent's map of a home: objects, floor, and the landmarks that are within sight now."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MOVED = 0.05
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen now, with the landmarks marked."""
+    """The present views, with the landmarks marked."""
 
     views: Views
     marked: MarkedViews
@@ -37,7 +37,7 @@ class HomeMap:
     """Objects and floor of a home, from real views alone."""
 
     categories: tuple[str, ...]
-    """Those of the labeller."""
+    """Categories of the labeller."""
     objects: ObjectMap = field(init=False)
     grid: OccupancyGrid = field(default_factory=OccupancyGrid)
     finder: LandmarkFinder = field(default_factory=LandmarkFinder)
