@@ -255,7 +255,7 @@ py::array_t<std::int64_t> owners(const Batch& batch) {
 void bind_spec(py::module_& module) {
   py::class_<ModelSpec>(module, "ModelSpec", "What the planner has to know about a world model.")
       .def(py::init([](bool causal, int frames, const std::string& padding, const std::string& leading, int max_rows,
-                       const action::ActionSpace& space) {
+                       const action::ActionSpace& space, bool ends) {
              ModelSpec spec{
                  .causal = causal,
                  .frames = frames,
@@ -265,18 +265,21 @@ void bind_spec(py::module_& module) {
                      {{"none", Leading::kNone}, {"same_direction", Leading::kSameDirection}, {"any", Leading::kAny}},
                      "leading"),
                  .max_rows = max_rows,
+                 .ends = ends,
                  .space = space};
              spec.check();
              return spec;
            }),
            py::arg("causal") = false, py::arg("frames") = 0, py::arg("padding") = "forward",
            py::arg("leading") = "same_direction", py::arg("max_rows") = 0, py::arg("space") = action::ActionSpace{},
+           py::arg("ends") = false,
            "frames: length of a rollout with the observation, 0 any. leading: turns answered by the real panorama, "
            "'same_direction' (up to the first forward or reversing turn), 'any' or 'none'. max_rows: rows a call, 0 "
-           "any.")
+           "any. ends: of each plan only the last observation is read, and is its only step.")
       .def_readonly("causal", &ModelSpec::causal)
       .def_readonly("frames", &ModelSpec::frames)
       .def_readonly("max_rows", &ModelSpec::max_rows)
+      .def_readonly("ends", &ModelSpec::ends)
       .def_readonly("space", &ModelSpec::space);
 }
 

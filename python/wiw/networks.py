@@ -34,6 +34,13 @@ def resolve_device(name: str | None) -> str:
     return name
 
 
+def has_bfloat16() -> bool:
+    """Return whether the CPU has instructions for products in bfloat16; without them, float32 is faster."""
+    import torch
+
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
 OUT_OF_MEMORY_WORDS = ("out of memory", "ALLOC_FAILED")
 """Error texts of CUDA and its libraries for a full GPU, where they allocate memory past torch's allocator."""
 

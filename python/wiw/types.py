@@ -229,7 +229,8 @@ class Control:
     """One row of a world model's batch: the same plan in every form, of which the model reads what it declared.
 
     Frame 0 is the observation; frame k is what follows action k. Frames 1..`shared` of this row are answered by an
-    earlier row of the batch and never read, so a model that computes frames one by one may leave them unwritten.
+    earlier row of the batch, or the policy reads only ends; they are never read, so a model that computes frames one by
+    one may leave them unwritten.
     """
 
     actions: NDArray[np.int8]

@@ -87,7 +87,8 @@ def export(out, target, kind, **_):
 
 WORK = {"evaluate": evaluate, "report": report, "export": export}
 IMPORTS = (
-    *("fakes", "wiw.loop.scheduler", "wiw.studies.evaluate", "wiw.report.recording"),
+    *("fakes", "wiw.loop.scheduler", "wiw.studies.evaluate"),
+    *("wiw.report.export", "wiw.report.page", "wiw.report.site", "wiw.report.recording"),
     *("pyarrow.parquet", "pyarrow.pandas_compat", "pandas", "rerun"),
 )
 """All that victims need, imported once: a victim is to die at its work, and imports take ten times as long."""

@@ -66,7 +66,7 @@ def plain_colors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Name colours by the nearest of a few, so that no weights are needed."""
     names, values = list(PALETTE), np.array(list(PALETTE.values()), float)
 
-    def name_color(pixels: np.ndarray) -> tuple[str, float]:
+    def name_color(pixels: np.ndarray, category: str) -> tuple[str, float]:
         return names[int(((values - pixels.mean(axis=0)) ** 2).sum(axis=1).argmin())], 0.8
 
     monkeypatch.setattr(explorer, "name_color", name_color)

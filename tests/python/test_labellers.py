@@ -250,7 +250,7 @@ def test_fused_networks_compute_the_same() -> None:
     torch.manual_seed(1)
     network = Network(5, len(STATES), (6, 8, 8, 10))
     views = to_network_input(
-        np.random.default_rng(3).integers(0, 256, (2, 32, 48, 3), np.uint8),
+        np.random.default_rng(3).integers(0, 256, (2, 64, 96, 3), np.uint8),
         compute_tangents((32, 48), InputSize(32, 48, 24.0)),
     )
     for _ in range(20):  # running means away from 0 and 1

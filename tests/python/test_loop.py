@@ -13,6 +13,7 @@ import wiw
 from wiw._core import core
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, TextTemplate
 from wiw.errors import ArgumentError, ContractError
+from wiw.experiments.fidelity import FidelityObserver
 from wiw.loop.attempts import TRIES, Attempted
 from wiw.loop.config import AgentConfig
 from wiw.loop.memory import Query
@@ -133,6 +134,41 @@ def test_the_oracle_imagines_what_then_happens(task: ImageNav) -> None:
             real = env.run([action]).observation.panorama
             # A rolled panorama and one rendered after the turn differ by rounding on edges.
             assert (np.abs(rollout.frames[k].astype(int) - real) > 2).mean() < 5e-3, (proposal, k)
+
+
+class Chunked(Stamp):
+    """Answers two primitives a call, each frame brighter than the one before."""
+
+    accepts = wiw.accepts(control="trajectory", view="panorama", frames=3)
+
+    def rollout(self, observations, controls, seeds):
+        steps = np.arange(1, 4, dtype=np.uint8)[None, :, None, None, None]
+        return np.minimum(observations.image[:, None] // 2 + steps, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "model", ["oracle", "warp", "copy", Stamp(), Chunked()], ids=["oracle", "warp", "copy", "stamp", "chunked"]
+)
+def test_a_policy_that_reads_only_ends_is_shown_the_same_ends(task: ImageNav, model) -> None:
+    class Whole(Greedy):
+        frames = FrameSpec("panorama", (72, 128))
+
+    class Ends(Greedy):
+        frames = FrameSpec("panorama", (72, 128), ends=True)
+
+    whole, ends = (
+        run(task, wiw.Agent(policy(), model, candidates=4, observers=[FidelityObserver()]), count=2)
+        for policy in (Whole, Ends)
+    )
+    assert whole.decisions.keys() == ends.decisions.keys()
+    for name, record in whole.decisions.items():
+        one, other = record.decision, ends.decisions[name].decision
+        np.testing.assert_array_equal(one.scores, other.scores)
+        np.testing.assert_array_equal(one.fidelity.scores, other.fidelity.scores)
+        for every, last in zip(one.rollouts, other.rollouts, strict=True):
+            assert last.frames.shape == (1, 72, 128, 3) and last.real.shape == (1,)
+            np.testing.assert_array_equal(every.frames[-1], last.frames[0])
+            assert every.real[-1] == last.real[0]
 
 
 def test_a_decision_keeps_its_evidence(task: ImageNav) -> None:

@@ -204,7 +204,7 @@ def test_states_and_colours_are_voted_for_by_size_and_confidence() -> None:
         views, category = blank_views(), np.zeros((4, *SIZE), np.uint8)
         add_square(views, category, 2, (2.0, 0.0, 1.0), half)
         shade = "red" if half > 0.2 else "blue"
-        objects.add(views, labels_of(category, confidence, state), lambda pixels, shade=shade: (shade, 0.8))
+        objects.add(views, labels_of(category, confidence, state), lambda pixels, _, shade=shade: (shade, 0.8))
     (chair,) = objects.objects
     assert (chair.state, chair.color, chair.decisions) == ("off", "red", 4)
     assert (chair.first, chair.last) == (0, 3) and 0.5 < chair.color_share < 1 and 0.5 < chair.state_share < 1

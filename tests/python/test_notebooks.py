@@ -14,6 +14,7 @@ SIZES = {  # names of the cell that is tagged "parameters", and what is enough t
     "01_quickstart": {},
     "02_compare_world_models": {"apartments": 2, "starts": 1, "decisions": 2},
     "03_plug_in_your_model": {"apartments": 2, "places": 16, "training_steps": 20, "starts": 1, "decisions": 2},
+    "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 40},
 }
 
 

@@ -19,16 +19,19 @@ from wiw.perception.scene_labels import CATEGORIES, STATES
 
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
-from wiw.perception.labelling_network import CHANNELS, FOCAL  # noqa: E402
+from wiw.perception.labelling_network import CHANNELS, COLOR_CHANNELS, FOCAL, PIXELS  # noqa: E402
 from wiw.perception.learned_labeller import LearnedLabeller  # noqa: E402
 from wiw.scenes import possible_edits  # noqa: E402
 from wiw.training import color_naming  # noqa: E402
 from wiw.training.checkpoint import Checkpoint  # noqa: E402
 from wiw.training.labelled_views import (  # noqa: E402
+    CANDIDATES,
+    CLOSE,
     COLOR_SAMPLES,
     FIELDS,
     LabelledViews,
     ViewRules,
+    _choose_close_places,
     change_states,
     merge_views,
     read_instances,
@@ -46,8 +49,8 @@ from wiw.training.perception import (  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
-SIZE, FIELD = (64, 96), float(np.degrees(2 * np.arctan(48 / FOCAL)))
-"""The network takes such views as they are."""
+CELLS, FIELD = (32, 48), float(np.degrees(2 * np.arctan(24 / FOCAL)))
+"""Views of so many cells, which the network takes as they are."""
 WALL, FLOOR, LAMP = (CATEGORIES.index(name) for name in ("wall", "floor", "table lamp"))
 ON, OFF = STATES.index("on"), STATES.index("off")
 SMALL = (8, 8, 12, 16)
@@ -56,8 +59,8 @@ SMALL = (8, 8, 12, 16)
 def made_up(count: int, seed: int) -> LabelledViews:
     """Grey walls over grey floors, in which nothing but the height tells them apart, and a lamp that is on or off."""
     rng = np.random.default_rng(seed)
-    images = rng.normal(120, 6, (count, *SIZE, 3))
-    category = np.full((count, SIZE[0] // 2, SIZE[1] // 2), WALL, np.uint8)
+    images = rng.normal(120, 6, (count, PIXELS * CELLS[0], PIXELS * CELLS[1], 3))
+    category = np.full((count, *CELLS), WALL, np.uint8)
     category[:, category.shape[1] // 2 :] = FLOOR
     state = np.zeros_like(category)
     pixels, color = [], []
@@ -72,7 +75,7 @@ def made_up(count: int, seed: int) -> LabelledViews:
         color.append(COLORS.index("red" if shade[0] > 100 else "blue"))
     return LabelledViews(
         np.clip(images, 0, 255).astype(np.uint8),
-        np.where(np.kron(category, np.ones((2, 2))) == LAMP, 1.5, 3.0).astype(np.float16),
+        np.where(category == LAMP, 1.5, 3.0).astype(np.float16),
         category,
         state,
         np.full(count, FIELD, np.float32),
@@ -157,24 +160,25 @@ def test_batches_are_aligned(coarse: bool) -> None:
     views = made_up(8, 0)
     recipe = Recipe(batch=3, imagined=0.0)
     batch = sample_batch(views, recipe, _compute_sampling_weights(views.category), np.random.default_rng(0), coarse)
-    size = (32, 48) if coarse else SIZE
-    assert batch.shown.shape == (6 if coarse else 3, CHANNELS, *size)
-    assert batch.category.shape == (len(batch.shown), size[0] // 2, size[1] // 2) == batch.state.shape
-    colored = np.ptp(batch.shown[:, :3, 1::2, 1::2].numpy(), axis=1) > 0.3
-    assert (colored == (batch.category.numpy() == LAMP)).mean() > 0.96
-    near = batch.shown[:, 5, 1::2, 1::2].exp().numpy() < 2
-    assert (near == (batch.category.numpy() == LAMP)).mean() > 0.96 and (batch.shown[:, 7] == 1).all()
-    height = batch.shown[:, 5].exp() * batch.shown[:, 4]
-    assert torch.allclose(batch.shown[:, 6], height, atol=0.01)
-    assert ((batch.state.numpy() > 0) == (batch.category.numpy() == LAMP)).all()
-    assert (batch.shown[:, 4, 0] > 0).all() and (batch.shown[:, 4, -1] < 0).all()  # up and down
+    cells = (16, 32) if coarse else CELLS
+    assert batch.shown.shape == (6 if coarse else 3, CHANNELS, *cells)
+    assert batch.category.shape == (len(batch.shown), *cells) == batch.state.shape
+    colors, rest = batch.shown[:, :COLOR_CHANNELS], batch.shown[:, COLOR_CHANNELS:]
+    lamp = batch.category.numpy() == LAMP
+    for pixel in range(PIXELS**2):
+        colored = np.ptp(colors[:, 3 * pixel : 3 * pixel + 3].numpy(), axis=1) > 0.3
+        assert (colored == lamp).mean() > 0.96
+    assert ((rest[:, 2].exp().numpy() < 2) == lamp).mean() > 0.96 and (rest[:, 4] == 1).all()
+    assert torch.allclose(rest[:, 3], rest[:, 2].exp() * rest[:, 1], atol=0.01)
+    assert ((batch.state.numpy() > 0) == lamp).all()
+    assert (rest[:, 1, 0] > 0).all() and (rest[:, 1, -1] < 0).all()  # up and down
 
 
 def test_views_like_imagined_ones_have_no_depth() -> None:
     views, rng = made_up(8, 0), np.random.default_rng(0)
     weights = _compute_sampling_weights(views.category)
     batch = sample_batch(views, Recipe(batch=8, imagined=1.0), weights, rng)
-    assert (batch.shown[:, 5:] == 0).all()
+    assert (batch.shown[:, COLOR_CHANNELS + 2 :] == 0).all()
 
 
 def test_apartments_are_recorded_in_other_states_too() -> None:
@@ -230,16 +234,37 @@ def test_instances_become_labels() -> None:
     assert [COLORS[i] if i >= 0 else "" for i in table.color] == ["", "", "green", "", ""]
 
 
+def test_half_of_the_places_are_close_to_things_whose_categories_take_turns() -> None:
+    place = world("apartments:train/0")
+    candidates = place.navmesh.sample(CANDIDATES, 5)
+    things = [each for each in place.scene.instances if each["category"] in ("chair", "cup", "bottle")]
+    rows = _choose_close_places(candidates, [*things, *place.scene.instances[:1]], 40, 3)
+    assert len(rows) == 40 and (rows == _choose_close_places(candidates, things, 40, 3)).all()
+    near = dict.fromkeys(("chair", "cup", "bottle"), 0)
+    for point in candidates[rows]:
+        found = set()
+        for each in things:
+            across, _, along = np.mean(each["bounds"], axis=0) - point
+            if CLOSE[0] - 1e-4 <= np.hypot(across, along) <= CLOSE[1] + 1e-4:
+                found.add(each["category"])
+        assert found
+        for name in found:
+            near[name] += 1
+    assert min(near.values()) >= 40 // len({each["category"] for each in things})
+    assert len(record_views(place, 0, ViewRules(places=3, close=0.0, views=2))) == 6
+    assert not len(_choose_close_places(candidates, [], 40, 3))
+
+
 def test_recorded_views_show_what_their_labels_say() -> None:
     place, rules = world("apartments:train/0"), ViewRules(places=2, views=2, fields=(105.0, 105.0))
     views = record_views(place, 3, rules)
     again = record_views(place, 3, rules)
     for name in FIELDS:
         np.testing.assert_array_equal(getattr(views, name), getattr(again, name))
-    assert len(views) == 4 and views.images.shape[1:] == (176, 208, 3) and views.category.shape[1:] == (88, 104)
+    assert len(views) == 4 and views.images.shape[1:] == (352, 416, 3) and views.category.shape[1:] == (176, 208)
     names = {CATEGORIES[i] for i in np.unique(views.category)}
     assert {"wall", "floor"} <= names
-    middle = views.category[:, :, 52]
+    middle = views.category[:, :, 104]
     assert (middle[:, 0] != FLOOR).all() and (middle[:, -1] != CATEGORIES.index("ceiling")).all()
     assert views.pixels.shape[1:] == (COLOR_SAMPLES, 3) and len(views.pixels) == len(views.color) > 4
 
@@ -251,7 +276,7 @@ def test_recorded_views_show_what_their_labels_say() -> None:
     pose = camera_pose(point, float(2 * np.pi * turn))
     direct = place.renderer.perspective(pose[None], (352, 416), 105.0, outputs=("instance",))["instance"][0]
     table = read_instances(place.scene.instances)
-    expected = table.category[direct[2::4, 2::4]]
+    expected = table.category[direct[1::2, 1::2]]
     assert (expected == views.category[0]).mean() > 0.93  # edges differ by a pixel
 
 
@@ -263,7 +288,7 @@ def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.Capture
     printed = capsys.readouterr().out
     assert "pixel accuracy" in printed and "colours of things" in printed and "IoU by category: wall" in printed
     card = LearnedLabeller(out).card
-    assert card["scenes"] == "apartments:train:2" and card["views"] == 64 and card["held_out"]["views"] == 32
+    assert card["scenes"] == "apartments:train:2" and card["views"] == 48 and card["held_out"]["views"] == 24
     assert card["held_out"]["plain"]["pixel_accuracy"] > 0.2 and card["held_out"]["colors"]["accuracy"] > 0.2
     assert out.stat().st_size < 4 * 2**20
     ColorNamer.load(tmp_path / "weights.colors.json")

@@ -83,6 +83,29 @@ TEST_CASE("calls are no larger than asked") {
   CHECK(batch.calls()[1].shared == std::vector<int>{0, 0});  // the row it shares with is in another call
 }
 
+TEST_CASE("where only ends are read, frames before them are marked") {
+  const Plans plans = {{{F, F}, {F, F, L, F}, {F, F, R}, {L, L}, {}}};
+  const Batch batch(plans, {.causal = true, .ends = true});
+  REQUIRE(batch.rows().size() == 2);
+  CHECK(batch.sources(0) == std::vector<Source>{{0, 2}});
+  CHECK(batch.sources(1) == std::vector<Source>{{0, 4}});
+  CHECK(batch.sources(2) == std::vector<Source>{{1, 3}});
+  CHECK(batch.sources(3) == std::vector<Source>{{-1, 2}});
+  CHECK(batch.sources(4).empty());
+  CHECK(batch.longest() == 1);
+  REQUIRE(batch.calls().size() == 1);
+  CHECK(batch.calls()[0].length == std::vector<int>{4, 3});
+  CHECK(batch.calls()[0].shared == std::vector<int>{1, 2});  // frame 2 of the first row is where the first plan ends
+}
+
+TEST_CASE("a later call begins with a frame of the one before, so all of these are written") {
+  const Batch batch({{{F, F, F, L, L}}}, {.frames = 4, .ends = true});
+  REQUIRE(batch.calls().size() == 2);
+  CHECK(batch.calls()[0].shared == std::vector<int>{0});
+  CHECK(batch.calls()[1].shared == std::vector<int>{0});
+  CHECK(batch.sources(0) == std::vector<Source>{{0, 5}});
+}
+
 TEST_CASE("impossible models are refused") {
   CHECK_THROWS_AS(Batch({}, {.frames = 1}), ArgumentError);
   CHECK_THROWS_AS(Batch({}, {.max_rows = -1}), ArgumentError);

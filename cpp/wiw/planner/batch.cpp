@@ -48,10 +48,11 @@ Batch::Batch(const Plans& plans, const ModelSpec& spec) : spec_(spec) {
     merge(splits, static_cast<int>(episode));
   }
   share();
-  schedule();
   for (auto& steps : sources_) {
     for (Source& source : steps) source = canonical(source);
   }
+  if (spec_.ends) keep_ends();
+  schedule();
 }
 
 void Batch::merge(const std::vector<SplitPlan>& splits, int episode) {
@@ -106,6 +107,21 @@ void Batch::share() {
         rows_[later].shared = common;
       }
     }
+  }
+}
+
+/// Drops all but the last step of each candidate. Where one call answers a row, frames before those are unread; a later
+/// call begins with one of them.
+void Batch::keep_ends() {
+  for (Row& row : rows_) row.unread = static_cast<int>(row.actions.size());
+  for (auto& steps : sources_) {
+    if (steps.size() > 1) steps.erase(steps.begin(), steps.end() - 1);
+    if (steps.empty() || steps.back().row < 0) continue;
+    int& unread = rows_[static_cast<std::size_t>(steps.back().row)].unread;
+    unread = std::min(unread, steps.back().frame - 1);
+  }
+  for (Row& row : rows_) {
+    if (spec_.steps() > 0 && static_cast<int>(row.actions.size()) > spec_.steps()) row.unread = 0;
   }
 }
 

@@ -19,6 +19,7 @@ struct Row {
   action::ActionSequence actions;  // from there on, without padding
   int parent = -1;                 // earlier row that begins alike,
   int shared = 0;                  // for this many frames
+  int unread = 0;                  // leading frames that nobody reads
 };
 
 /// Where the observation after one step of a candidate comes from.
@@ -36,7 +37,7 @@ struct ModelCall {
   std::vector<int> rows;                        // index into Batch::rows
   std::vector<action::ActionSequence> actions;  // padded to `steps`
   std::vector<int> length;                      // actions that are the plan's own
-  std::vector<int> shared;    // leading frames of this call answered by an earlier row of the same call
+  std::vector<int> shared;    // leading frames of this call answered by an earlier row of it, or read by nobody
   std::vector<Source> start;  // frame that the call begins with; only where first > 0
 };
 
@@ -54,7 +55,8 @@ class Batch {
   /// Candidates of all episodes in order.
   [[nodiscard]] std::size_t candidates() const { return sources_.size(); }
   [[nodiscard]] const std::vector<int>& episodes() const { return episodes_; }
-  /// Sources of the candidate's steps; a frame that several rows share is named by the row that answers it.
+  /// Sources of the candidate's steps, of the last one alone where only ends are read; a frame that several rows share
+  /// is named by the row that answers it.
   [[nodiscard]] const std::vector<Source>& sources(std::size_t candidate) const { return sources_[candidate]; }
   [[nodiscard]] std::size_t longest() const;
 
@@ -69,6 +71,7 @@ class Batch {
  private:
   void merge(const std::vector<SplitPlan>& splits, int episode);
   void share();
+  void keep_ends();
   void schedule();
   void add_calls(int first, const std::vector<int>& rows);
   void add_call(int first, int steps, const std::vector<int>& rows);

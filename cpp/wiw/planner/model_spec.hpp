@@ -19,6 +19,7 @@ struct ModelSpec {
   action::Padding padding = action::Padding::kForward;
   Leading leading = Leading::kSameDirection;
   int max_rows = 0;  // most rows in one call; 0: all at once
+  bool ends = false;  // of each plan only the last observation is read
   action::ActionSpace space;
 
   /// Actions one call answers; 0: any number.

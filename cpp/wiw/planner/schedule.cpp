@@ -19,7 +19,7 @@ void Batch::schedule() {
       any = true;
       const int end = spec_.steps() == 0 ? length : std::min(length, first + spec_.steps());
       places_[r].emplace_back();
-      if (rows_[r].shared >= end) continue;  // answered whole by an earlier row
+      if (std::max(rows_[r].shared, rows_[r].unread) >= end) continue;  // answered by an earlier row, or read by nobody
       by_length[spec_.steps() == 0 && !spec_.causal ? length : 0].push_back(static_cast<int>(r));
     }
     for (auto& [length, rows] : by_length) add_calls(first, rows);
@@ -50,7 +50,7 @@ void Batch::add_call(int first, int steps, const std::vector<int>& rows) {
     call.actions.push_back(action::pad(own, static_cast<std::size_t>(steps), spec_.padding));
     call.length.push_back(length);
     const bool here = row.parent >= rows.front() && std::find(rows.begin(), rows.end(), row.parent) != rows.end();
-    call.shared.push_back(here ? std::clamp(row.shared - first, 0, length) : 0);
+    call.shared.push_back(std::clamp(std::max(here ? row.shared : 0, row.unread) - first, 0, length));
     if (first > 0) call.start.push_back(canonical({rows[i], first}));
     places_[static_cast<std::size_t>(rows[i])].back() = {static_cast<int>(calls_.size()), static_cast<int>(i), 0};
   }

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special  # its functions load ten times faster than scipy.stats
 
 from wiw.errors import ArgumentError
 
@@ -32,7 +32,7 @@ def wilson(mean: float, n: int, confidence: float = 0.95) -> Interval:
 
     Also holds, conservatively, for the mean of any values in [0, 1]: their variance is at most mean * (1 - mean).
     """
-    z = stats.norm.ppf(0.5 + confidence / 2)
+    z = special.ndtri(0.5 + confidence / 2)
     center = (mean + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
     return max(0.0, float(center - half)), min(1.0, float(center + half))
@@ -43,7 +43,7 @@ def student(values: ArrayLike, confidence: float = 0.95) -> Interval:
     data = np.asarray(values, np.float64)
     if len(data) < 2:
         return float("nan"), float("nan")
-    half = stats.t.ppf(0.5 + confidence / 2, len(data) - 1) * data.std(ddof=1) / np.sqrt(len(data))
+    half = special.stdtrit(len(data) - 1, 0.5 + confidence / 2) * data.std(ddof=1) / np.sqrt(len(data))
     return float(data.mean() - half), float(data.mean() + half)
 
 
@@ -57,7 +57,7 @@ def agresti_min(differences: ArrayLike, confidence: float = 0.95) -> Interval:
     n = len(data) + 2
     wins, losses = data.clip(0).sum() + 0.5, (-data).clip(0).sum() + 0.5
     center = (wins - losses) / n
-    half = stats.norm.ppf(0.5 + confidence / 2) * np.sqrt(wins + losses - (wins - losses) ** 2 / n) / n
+    half = special.ndtri(0.5 + confidence / 2) * np.sqrt(wins + losses - (wins - losses) ** 2 / n) / n
     return max(-1.0, float(center - half)), min(1.0, float(center + half))
 
 
@@ -106,7 +106,7 @@ def t_of_sums(
     """
     mean = sums.sum(-1) / counts.sum()
     center, variance = stabilise_mean(sums, squares, counts, kind)
-    half = stats.t.ppf(0.5 + confidence / 2, len(counts) - 1) * np.sqrt(variance)
+    half = special.stdtrit(len(counts) - 1, 0.5 + confidence / 2) * np.sqrt(variance)
     low, high = np.minimum(center - half, mean), np.maximum(center + half, mean)
     least, most = {"rate": (0.0, 1.0), "difference": (-1.0, 1.0), "length": (-np.inf, np.inf)}[kind]
     return np.maximum(low, least), np.minimum(high, most)
@@ -134,7 +134,7 @@ def stabilise_mean(
 
 def count_pseudo_episodes(clusters: int) -> float:
     """Return the number of pseudo-episodes that stabilise an interval over `clusters` clusters."""
-    return float(2 * (stats.norm.ppf(0.975) / stats.t.ppf(0.975, clusters - 1)) ** 2)
+    return float(2 * (special.ndtri(0.975) / special.stdtrit(clusters - 1, 0.975)) ** 2)
 
 
 def jackknife_covariance(
@@ -209,8 +209,8 @@ def _bca_levels(
     spread = np.sum(influence**2)
     if not 0 < below < 1 or spread < 1e-24:
         return tails
-    bias = stats.norm.ppf(below)
+    bias = special.ndtri(below)
     acceleration = np.sum(influence**3) / (6 * spread**1.5)
-    shifted = bias + stats.norm.ppf(tails)
-    levels: NDArray[np.float64] = stats.norm.cdf(bias + shifted / (1 - acceleration * shifted))
+    shifted = bias + special.ndtri(tails)
+    levels: NDArray[np.float64] = special.ndtr(bias + shifted / (1 - acceleration * shifted))
     return levels

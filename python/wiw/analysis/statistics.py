@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from wiw.analysis.intervals import Interval, Kind, agresti_min, clustered_bootstrap, clustered_t, student, wilson
 from wiw.metrics.metric import Metric
@@ -72,7 +72,7 @@ def mcnemar(arm: ArrayLike, base: ArrayLike) -> float:
     """Return the two-sided p of the exact McNemar test on paired 0/1 outcomes."""
     data = np.asarray(arm, np.float64) - np.asarray(base, np.float64)
     wins, differing = int((data > 0).sum()), int((data != 0).sum())
-    return 1.0 if differing == 0 else float(stats.binomtest(wins, differing).pvalue)
+    return 1.0 if differing == 0 else min(1.0, 2 * float(special.bdtr(min(wins, differing - wins), differing, 0.5)))
 
 
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:

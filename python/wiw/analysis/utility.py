@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from wiw.analysis.intervals import (
     Interval,
@@ -92,7 +92,7 @@ def ratio(gains: ArrayLike, spans: ArrayLike, clusters: ArrayLike, confidence: f
         for all_squares, sums in zip(squares, (over, under), strict=True)
     ]
     covariance = _correlation(over, under, counts, apart) * math.sqrt(var_a * var_b)
-    t_square = float(stats.t.ppf(0.5 + confidence / 2, len(counts) - 1)) ** 2
+    t_square = float(special.stdtrit(len(counts) - 1, 0.5 + confidence / 2)) ** 2
     square, half_linear, constant = b * b - t_square * var_b, a * b - t_square * covariance, a * a - t_square * var_a
     if b <= 0 or square <= 0:
         return UNKNOWN

@@ -69,15 +69,15 @@ def train(
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
-    it again. Training then takes 15 to 30 minutes on two idle cores; diffuser takes a night, or less with --minutes.
-    An interrupted training of perception, armnet or diffuser resumes from its checkpoint, which lies beside FILE.
+    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes an hour, diffuser takes a night;
+    less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint beside
+    FILE.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
     beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
     val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
-    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults,
-    those of perception in a quarter of the epochs.
+    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults.
 
     Args:
         what: recogniser, warpnet, perception, armnet or diffuser.
@@ -88,10 +88,10 @@ def train(
             one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 16 for perception,
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 3 for perception,
             4 for armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
-        places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 10), or walks
+        places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 12), or walks
             recorded in each scene, for warpnet (default: 24).
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.

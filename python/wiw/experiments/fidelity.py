@@ -92,7 +92,7 @@ def _replay(
         [ModelInput(query.observation) for query in queries],
         plans,
         [range(len(own)) for own in plans],
-        _view_of(imagined[0][0]),
+        _view_of(imagined[0][0], batch.reviser.frames.ends),
         Clock(),
     )
     oracle = ModelImaginer(Attempted(WORLD_MODELS.make("oracle", space=batch.reviser.space), math.inf))
@@ -114,8 +114,8 @@ def _copy_memory(situation: Situation) -> Situation:
     return replace(situation, memory=deepcopy(situation.memory))
 
 
-def _view_of(rollout: Rollout) -> FrameSpec:
-    return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]))
+def _view_of(rollout: Rollout, ends: bool) -> FrameSpec:
+    return FrameSpec(rollout.view, (rollout.frames.shape[-3], rollout.frames.shape[-2]), ends)
 
 
 def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _Truth) -> Fidelity:

@@ -23,11 +23,10 @@ from wiw.perception.colors import COLORS
 from wiw.perception.oracle_labeller import OracleLabeller
 from wiw.perception.scene_labels import SceneLabels
 from wiw.policies.base import Situation
-from wiw.policies.explorer import Explorer, Look
+from wiw.policies.explorer import Explorer
 from wiw.policies.explorer.drawing import VIEW_SIZE
+from wiw.policies.explorer.memory import Look
 
-UNLEARNED = ("ball", "bunk bed", "speaker")
-"""Categories of apartments that are too rare for the built-in labeller."""
 SPACING = 1.2
 """Metres within which a tour passes every place that can be reached."""
 SURVEY = 500
@@ -59,12 +58,6 @@ class PrivilegedExplorer(Explorer, Privileged):
         given = (("perception", self.true_labels), ("tour", self.tour))
         return {**super().describe(), "privileged": [name for name, whether in given if whether]}
 
-    @property
-    def map_categories(self) -> tuple[str, ...]:
-        """Names of what the map can hold; those that no labeller learns too where they are given."""
-        known = self.labeller.categories
-        return (*known, *(name for name in UNLEARNED if name not in known)) if self.true_labels else known
-
     def look_around(self, situation: Situation) -> Iterator[Look]:
         """Yield the looks of a tour, where one is due, and then the real one; with ids where these are given."""
         env = self._environments.find(situation.key)
@@ -79,13 +72,13 @@ class PrivilegedExplorer(Explorer, Privileged):
             return super().perceive(situation, look, pose)
         instances = self._environments.find(situation.key).state.world.scene.instances
         views, ids = cut_views(look.panorama, look.depth, pose, VIEW_SIZE), cut_labels(look.ids, VIEW_SIZE)
-        labels = OracleLabeller(instances, self.map_categories).label(views.images, HFOV_DEG, ids)
+        labels = OracleLabeller(instances, self.labeller.categories).label(views.images, HFOV_DEG, ids)
         return replace(views, images=_paint_colors(instances)[ids]), labels
 
-    def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+    def name_color(self, pixels: NDArray[np.uint8], category: str) -> tuple[str, float]:
         """Return the colour word that painted pixels stand for, or that real ones show."""
         if not self.true_labels:
-            return super().name_color(pixels)
+            return super().name_color(pixels, category)
         return COLORS[int(np.bincount(pixels[:, 0]).argmax())], 1.0
 
     def is_final(self, situation: Situation) -> bool:

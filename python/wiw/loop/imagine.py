@@ -64,7 +64,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
     accepts, clock = model.accepts, request.clock
     with clock("platform"):
         plans = [[plan.actions for plan in own] for own in request.plans]
-        batch = planner.Batch.build(plans, make_model_spec(accepts))
+        batch = planner.Batch.build(plans, make_model_spec(accepts, request.frames.ends))
         panoramas = np.stack([observation.panorama for observation in request.observations])
         parts, conditioning = batch.parts, _conditioning(accepts, batch, request.inputs)
         histories = None
@@ -102,9 +102,9 @@ def _show(
     return rollouts
 
 
-def make_model_spec(accepts: Accepts) -> Any:
-    """Return the model's properties that the planner needs."""
-    return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch)
+def make_model_spec(accepts: Accepts, ends: bool = False) -> Any:
+    """Return the model's properties that the planner needs; `ends` as in `FrameSpec`."""
+    return planner.ModelSpec(causal=accepts.causal, frames=accepts.frames, max_rows=accepts.best_batch, ends=ends)
 
 
 def _conditioning(accepts: Accepts, batch: Any, inputs: Sequence[ModelInput]) -> Conditioning:

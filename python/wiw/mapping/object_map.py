@@ -58,8 +58,8 @@ CONFUSABLE: tuple[frozenset[str], ...] = (
 )
 """Categories that are taken for each other."""
 
-NameColor = Callable[[NDArray[np.uint8]], tuple[str, float]]
-"""Names the colour of pixels uint8 [n, 3], with a confidence."""
+NameColor = Callable[[NDArray[np.uint8], str], tuple[str, float]]
+"""Names the colour of pixels uint8 [n, 3] of a thing of some category, with a confidence."""
 
 
 @dataclass(frozen=True)
@@ -190,13 +190,26 @@ class ObjectMap:
         """
         self._decision += 1
         fragments = find_fragments(views, labels, self._things, len(self.states), self.least_confidence)
-        colors = _name_colors(views, fragments, name_color)
+        colors = self._name_colors(views, fragments, name_color)
         owners = np.zeros(len(fragments) + 1, np.int32)
         order = np.lexsort((np.arange(1, len(owners)), -fragments.pixels[1:])) + 1  # the largest first
         for part in order.tolist():
             new = self._make_object(fragments, part, colors[part], views.size)
             owners[part] = self._absorb(new)
         return self._unite_touched(owners)[fragments.index]
+
+    def _name_colors(
+        self, views: Views, fragments: Fragments, name_color: NameColor | None
+    ) -> list[tuple[str, float] | None]:
+        """Return the colour of each fragment, and its confidence."""
+        if name_color is None:
+            return [None] * (len(fragments) + 1)
+        pixels = views.images.reshape(-1, 3)
+        found: list[tuple[str, float] | None] = [None]
+        for where, category in zip(fragments.samples[1:], fragments.category[1:], strict=True):
+            some = where[:: -(-len(where) // COLOR_PIXELS)]
+            found.append(name_color(pixels[some], self.categories[category]))
+        return found
 
     def _make_object(
         self, fragments: Fragments, part: int, color: tuple[str, float] | None, size: tuple[int, int]
@@ -350,16 +363,6 @@ def _tabulate_overlaps(categories: Sequence[str], groups: Iterable[frozenset[str
         table[np.ix_(members, members)] = CONFUSABLE_OVERLAP
     np.fill_diagonal(table, OVERLAP)
     return table
-
-
-def _name_colors(views: Views, fragments: Fragments, name_color: NameColor | None) -> list[tuple[str, float] | None]:
-    if name_color is None:
-        return [None] * (len(fragments) + 1)
-    pixels = views.images.reshape(-1, 3)
-    found: list[tuple[str, float] | None] = [None]
-    for where in fragments.samples[1:]:
-        found.append(name_color(pixels[where[:: -(-len(where) // COLOR_PIXELS)]]))
-    return found
 
 
 def _add_votes(

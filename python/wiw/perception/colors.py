@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour words of things under the light of a scene, calibrated on apartments whose colours are known."""
+"""Colour words of things under the light of a scene, calibrated on apartments whose colours are known.
+
+A floor that looks orange is brown wood under a warm lamp, a sofa may well be orange: what a thing is helps to name its
+colour.
+"""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -36,10 +40,13 @@ _TO_LAB = np.array(
 
 @dataclass(frozen=True)
 class ColorNamer:
-    """A small network that names the colour of a set of pixels.
+    """A small network that names the colour of a set of pixels of one thing.
 
     Made by `wiw train perception`; arrays are float64.
     """
+
+    categories: tuple[str, ...]
+    """What things may be; index 0 is "", where that is not known."""
 
     shift: NDArray[np.float64]
     """[FEATURES]; features are normalised by (x - shift) * scale."""
@@ -50,11 +57,16 @@ class ColorNamer:
     output: NDArray[np.float64]
     """[len(COLORS), hidden]."""
     output_bias: NDArray[np.float64]
+    category_hidden: NDArray[np.float64]
+    """[len(categories), hidden]: added to the hidden units."""
+    category_output: NDArray[np.float64]
+    """[len(categories), len(COLORS)]: added to the output."""
 
     def __post_init__(self) -> None:
-        units = len(self.hidden_bias)
+        units, count = len(self.hidden_bias), len(self.categories)
         expected = [(FEATURES,), (FEATURES,), (units, FEATURES), (units,), (len(COLORS), units), (len(COLORS),)]
-        arrays = [getattr(self, name) for name in self.__dataclass_fields__]
+        expected += [(count, units), (count, len(COLORS))]
+        arrays = [getattr(self, name) for name in self.__dataclass_fields__ if name != "categories"]
         if [array.shape for array in arrays] != expected or not all(np.isfinite(array).all() for array in arrays):
             raise ArgumentError(
                 f"ColorNamer: expected finite arrays of {expected}, got {[array.shape for array in arrays]}"
@@ -71,7 +83,8 @@ class ColorNamer:
             values = json.loads(Path(path).expanduser().read_text())
             if values.pop("colors") != list(COLORS):
                 raise ValueError(f"its colours are not {', '.join(COLORS)}")
-            return cls(**{name: np.array(value, np.float64) for name, value in values.items()})
+            categories = tuple(values.pop("categories"))
+            return cls(categories, **{name: np.array(value, np.float64) for name, value in values.items()})
         except (OSError, ValueError, KeyError, TypeError, AttributeError, ArgumentError) as error:
             raise WeightsError(
                 f"{path}: expected parameters of colour naming: {error}; `wiw train perception` makes some",
@@ -84,40 +97,57 @@ class ColorNamer:
         Raises:
             FileError: the file cannot be written.
         """
-        values: dict[str, Any] = {"colors": list(COLORS)}
-        values |= {name: np.asarray(value).round(5).tolist() for name, value in asdict(self).items()}
+        arrays = asdict(self)
+        values: dict[str, Any] = {"colors": list(COLORS), "categories": arrays.pop("categories")}
+        values |= {name: np.asarray(value).round(4).tolist() for name, value in arrays.items()}
         with atomic_file(path) as draft:
             try:
                 draft.write_text(json.dumps(values) + "\n")
             except OSError as error:
                 raise FileError(f"{path}: cannot be written: {error}") from error
 
-    def compute_probabilities(self, features: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the probability of each colour for rows of features: float64 [N, len(COLORS)]."""
-        inner = np.maximum((features - self.shift) * self.scale @ self.hidden.T + self.hidden_bias, 0.0)
-        logits = inner @ self.output.T + self.output_bias
+    def compute_probabilities(
+        self, features: NDArray[np.float64], category: NDArray[np.integer[Any]]
+    ) -> NDArray[np.float64]:
+        """Return the probability of each colour for rows of features: float64 [N, len(COLORS)].
+
+        Args:
+            features: float64 [N, FEATURES].
+            category: [N]: index into `categories`.
+        """
+        inner = (features - self.shift) * self.scale @ self.hidden.T + self.hidden_bias + self.category_hidden[category]
+        logits = np.maximum(inner, 0.0) @ self.output.T + self.output_bias + self.category_output[category]
         weights = np.exp(logits - logits.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
-    def __call__(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+    def __call__(self, pixels: NDArray[np.uint8], category: str = "") -> tuple[str, float]:
         """Name the colour of pixels; see `name_color`."""
         if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or pixels.ndim != 2 or pixels.shape[1] != 3:
             came = f"{pixels.dtype} {pixels.shape}" if isinstance(pixels, np.ndarray) else type(pixels).__name__
             raise ArgumentError(f"name_color: expected pixels uint8 [n, 3], got {came}")
         if not len(pixels):
             return "", 0.0
-        found = self.compute_probabilities(compute_features(pixels[None]))[0]
+        row = self._rows.get(category, 0)
+        found = self.compute_probabilities(compute_features(pixels[None]), np.array([row]))[0]
         best = int(found.argmax())
         return COLORS[best], float(found[best])
 
+    @cached_property
+    def _rows(self) -> dict[str, int]:
+        return {name: row for row, name in enumerate(self.categories)}
 
-def name_color(pixels: NDArray[np.uint8]) -> tuple[str, float]:
-    """Return the colour word for the pixels uint8 [n, 3] of a mask, and its probability; ("", 0.0) for no pixels.
+
+def name_color(pixels: NDArray[np.uint8], category: str = "") -> tuple[str, float]:
+    """Return the colour word for the pixels of a thing, and its probability; ("", 0.0) for no pixels.
+
+    Args:
+        pixels: uint8 [n, 3].
+        category: of the thing, if known: one of `wiw.perception.scene_labels.CATEGORIES`; others count as unknown.
 
     Raises:
         ArgumentError: an array of another shape or type.
     """
-    return _load_built_in()(pixels)
+    return _load_built_in()(pixels, category)
 
 
 @cache

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network of the learned labeller: a U-Net that gives each second pixel of a view category and state logits.
+"""The network of the learned labeller: a U-Net that gives each cell of a view category and state logits.
 
-Its input is a view in a fixed angular resolution, with the direction of each pixel beside its colours, so that it
-serves any field of view: on a level camera the row says how high things are. Depth, where it is known, says how large.
+A cell is a square of 2 x 2 pixels of a view in a fixed angular resolution. The network reads its four colours, and its
+direction, so that it serves any field of view: on a level camera the row says how high things are. Depth, where it is
+known, says how large. Inside, the network works on every second cell, and its last layer tells four cells apart.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,13 +22,18 @@ from torch.nn import functional
 
 from wiw.errors import ArgumentError
 
+Value = TypeVar("Value", bound=np.generic)
+
 FOCAL = 80.0
-"""Focal length of the network's input in pixels: 208 columns for 105 degrees."""
+"""Focal length in cells: 208 columns for 105 degrees."""
 MULTIPLE = 16
-"""The input's sides are multiples of this."""
-STRIDE = 2
-"""Input pixels per output pixel."""
-CHANNELS = 8
+"""A view has a multiple of this many rows and columns of cells."""
+PIXELS = 2
+"""Rows and columns of pixels in a cell."""
+FINE_CELLS = 4
+"""Cells that each output of the finest level stands for, 2 x 2."""
+COLOR_CHANNELS = 3 * PIXELS**2
+CHANNELS = COLOR_CHANNELS + 5
 """Channels of the input; see `to_network_input`."""
 
 
@@ -35,7 +42,7 @@ class Network(nn.Module):
 
     Args:
         categories, states: number of logits of each kind.
-        widths: channels of the levels, at a half, a quarter, an eighth and a sixteenth of the input's size.
+        widths: channels of the levels, at a half, a quarter, an eighth and a sixteenth of the cells.
         normalised: whether convolutions are followed by batch normalisation, as in training; `fuse` merges the two.
     """
 
@@ -61,18 +68,27 @@ class Network(nn.Module):
             ]
         )
         self.context = nn.Linear(d, d)
-        self.narrow = nn.ModuleList([nn.Conv2d(d, c, 1), nn.Conv2d(c, b, 1), nn.Conv2d(b, a, 1)])
-        self.up = nn.ModuleList([block(2 * c, c, c), block(2 * b, b, b), block(2 * a, a, a)])
-        self.head = nn.Conv2d(a, categories + states, 1)
+        self.narrow = nn.ModuleList([Pointwise(d, c), Pointwise(c, b), Pointwise(b, a)])
+        self.up = nn.ModuleList([block(c, c, c), block(b, b), block(a, a)])
+        self.head = nn.Linear(a, FINE_CELLS * (categories + states))
 
     def forward(self, views: Tensor) -> tuple[Tensor, Tensor]:
-        """Return category logits [B, categories, H/2, W/2] and state logits [B, states, H/2, W/2].
+        """Return category logits [B, categories, H, W] and state logits [B, states, H, W].
 
         Args:
             views: float [B, CHANNELS, H, W]; see `to_network_input`.
         """
-        logits = self.head(self.compute_features(views)[-1])
-        return logits[:, : self.categories], logits[:, self.categories :]
+        logits = ungroup_cells(torch.cat(self.compute_logits(self.compute_features(views)[-1]), dim=-1))
+        return logits.permute(0, 3, 1, 2).split([self.categories, self.states], dim=1)
+
+    def compute_logits(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Return category and state logits of cells in groups, [B, H/2, W/2, FINE_CELLS, N]; see `group_cells`.
+
+        Args:
+            features: float [B, widths[0], H/2, W/2], of the finest level.
+        """
+        logits = self.head(features.permute(0, 2, 3, 1)).unflatten(-1, (FINE_CELLS, self.categories + self.states))
+        return logits.split([self.categories, self.states], dim=-1)
 
     def compute_features(self, views: Tensor) -> list[Tensor]:
         """Return the features that are decoded at each level, [B, widths[i], h, w], the coarsest first."""
@@ -84,8 +100,16 @@ class Network(nn.Module):
         found = [x + self.context(x.mean(dim=(2, 3)))[:, :, None, None]]  # which room it is
         for narrow, level in zip(self.narrow, self.up, strict=True):
             coarse = functional.interpolate(narrow(found[-1]), scale_factor=2.0, mode="nearest")
-            found.append(level(torch.cat([coarse, levels.pop()], dim=1)))
+            found.append(level(coarse + levels.pop()))
         return found
+
+
+class Pointwise(nn.Linear):
+    """A linear layer for each pixel of [B, C, H, W]; on CPUs faster than a 1 x 1 convolution."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map each pixel."""
+        return super().forward(x.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
 
 
 class Convolution(nn.Module):
@@ -101,6 +125,20 @@ class Convolution(nn.Module):
         """Convolve."""
         y = self.norm(self.weights(x))
         return functional.relu(y + x if self.residual else y)
+
+
+def group_cells(values: Tensor) -> Tensor:
+    """Return the values of cells [B, H, W, ...] in groups of 2 x 2, [B, H/2, W/2, FINE_CELLS, ...], row by row."""
+    count, height, width, *rest = values.shape
+    grouped = values.reshape(count, height // 2, 2, width // 2, 2, *rest).transpose(2, 3)
+    return grouped.reshape(count, height // 2, width // 2, FINE_CELLS, *rest)
+
+
+def ungroup_cells(values: Tensor) -> Tensor:
+    """Return the values of cells [B, H, W, ...] from those of groups; the inverse of `group_cells`."""
+    count, height, width, _, *rest = values.shape
+    spread = values.reshape(count, height, width, 2, 2, *rest).transpose(2, 3)
+    return spread.reshape(count, 2 * height, 2 * width, *rest)
 
 
 def fuse(network: Network) -> Network:
@@ -121,7 +159,7 @@ def fuse(network: Network) -> Network:
 
 @dataclass(frozen=True)
 class InputSize:
-    """The network's input for views of one size and field of view."""
+    """The rows and columns of cells of views of one size and field of view."""
 
     height: int
     width: int
@@ -137,55 +175,57 @@ class InputSize:
 
 
 def resize_view(view: NDArray[np.uint8], size: InputSize) -> NDArray[np.uint8]:
-    """Resize a view [H, W, 3] to the network's size, averaging pixels where it shrinks."""
-    if view.shape[:2] == (size.height, size.width):
+    """Resize a view [H, W, 3] to the pixels of its cells, averaging where it shrinks."""
+    height, width = PIXELS * size.height, PIXELS * size.width
+    if view.shape[:2] == (height, width):
         return view
-    shrinks = view.shape[0] >= size.height and view.shape[1] >= size.width
-    return np.asarray(
-        cv2.resize(view, (size.width, size.height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    )
+    shrinks = view.shape[0] >= height and view.shape[1] >= width
+    return np.asarray(cv2.resize(view, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
 
 
-def resize_depth(depth: NDArray[np.float32], size: InputSize) -> NDArray[np.float32]:
-    """Pick the depth [H, W] in the middle of each pixel of the network's size; edges are not blurred."""
+def sample_cells(values: NDArray[Value], size: InputSize) -> NDArray[Value]:
+    """Pick the value, of those of each pixel [..., H, W], in the middle of each cell: depth and labels, not blurred."""
     rows, columns = (
         (np.arange(new) * 2 + 1) * old // (2 * new)
-        for new, old in zip((size.height, size.width), depth.shape, strict=True)
+        for new, old in zip((size.height, size.width), values.shape[-2:], strict=True)
     )
-    return depth[rows[:, None], columns]
+    return values[..., rows[:, None], columns]
 
 
 def to_network_input(
     views: NDArray[np.uint8], tangents: NDArray[np.float32], depth: NDArray[np.float32] | None = None
 ) -> Tensor:
-    """Return float [B, CHANNELS, H, W], channels last.
+    """Return float [B, CHANNELS, H, W], channels last, for H x W cells.
 
-    The channels are colours from -1 to 1, directions, and of what is seen the logarithm of its planar depth, its height
-    above the camera in metres, and whether these two are known; they are 0 where not.
+    The channels are the pixels' colours from -1 to 1, the cell's direction, and of what is seen the logarithm of its
+    planar depth, its height above the camera in metres, and whether these two are known; they are 0 where not.
 
     Args:
-        views: uint8 [B, H, W, 3] in the network's size.
+        views: uint8 [B, PIXELS * H, PIXELS * W, 3].
         tangents: float32 [B or 1, H, W, 2]; see `compute_tangents`.
         depth: float32 [B, H, W]: planar, in metres; 0 where unknown. None means unknown everywhere.
     """
-    made = np.zeros((*views.shape[:3], CHANNELS), np.float32)
-    np.multiply(views, 1 / 127.5, out=made[..., :3])
-    made[..., :3] -= 1
-    made[..., 3:5] = tangents
+    count, height, width = len(views), views.shape[1] // PIXELS, views.shape[2] // PIXELS
+    made = np.zeros((count, height, width, CHANNELS), np.float32)
+    colors, rest = made[..., :COLOR_CHANNELS], made[..., COLOR_CHANNELS:]
+    cells = views.reshape(count, height, PIXELS, width, PIXELS, 3).transpose(0, 1, 3, 2, 4, 5)
+    np.multiply(cells.reshape(colors.shape), 1 / 127.5, out=colors)
+    colors -= 1
+    rest[..., :2] = tangents
     if depth is not None:
         known = depth > 0
-        made[..., 5] = np.log(depth, where=known, out=np.zeros_like(depth, np.float32))
-        made[..., 6] = depth * tangents[..., 1]
-        made[..., 7] = known
+        rest[..., 2] = np.log(depth, where=known, out=np.zeros_like(depth, np.float32))
+        rest[..., 3] = depth * tangents[..., 1]
+        rest[..., 4] = known
     return torch.from_numpy(made).permute(0, 3, 1, 2)
 
 
 def compute_tangents(size: Sequence[int], input_size: InputSize) -> NDArray[np.float32]:
-    """Return, for each pixel of the network's input, x / -z and y / -z of its ray: float32 [h, w, 2].
+    """Return, for each cell, x / -z and y / -z of the ray through its middle: float32 [h, w, 2].
 
     Args:
         size: (H, W) of the views.
-        input_size: of the network's input.
+        input_size: of their cells.
     """
     made = np.empty((input_size.height, input_size.width, 2), np.float32)
     across = (np.arange(input_size.width) + 0.5) / input_size.width - 0.5

@@ -106,13 +106,13 @@ class LearnedLabeller(Labeller):
         input_size: InputSize,
         tangents: NDArray[np.float32],
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
-        """Return category, confidence and state of one view, in the network's size."""
+        """Return category, confidence and state of the cells of one view."""
         import torch
 
-        from wiw.perception.labelling_network import resize_depth, resize_view, to_network_input
+        from wiw.perception.labelling_network import resize_view, sample_cells, to_network_input
 
         shown = resize_view(np.ascontiguousarray(image), input_size)
-        distances = None if depth is None else resize_depth(depth, input_size)[None]
+        distances = None if depth is None else sample_cells(depth, input_size)[None]
         with torch.inference_mode(), single_thread():
             category_logits, state_logits = self._network(to_network_input(shown[None], tangents[None], distances))
             confidence, category = category_logits[0].permute(1, 2, 0).softmax(dim=2).max(dim=2)
@@ -139,12 +139,9 @@ def _plan_input(size: tuple[int, int], hfov_deg: float) -> tuple[InputSize, NDAr
     return found, compute_tangents(size, found)
 
 
-def _map_pixels(pixels: int, network_pixels: int) -> NDArray[np.intp]:
-    """Return the index of the network's output that each pixel of a view lies in."""
-    from wiw.perception.labelling_network import STRIDE
-
-    outputs = network_pixels // STRIDE
-    return (np.arange(pixels) * outputs // pixels).astype(np.intp)
+def _map_pixels(pixels: int, cells: int) -> NDArray[np.intp]:
+    """Return the index of the cell that each pixel lies in, along one side of a view."""
+    return (np.arange(pixels) * cells // pixels).astype(np.intp)
 
 
 def require_torch() -> None:

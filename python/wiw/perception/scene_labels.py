@@ -20,12 +20,13 @@ CATEGORIES = (
     "", *STRUCTURE,
     "door", "curtain", "picture", "photo", "mirror", "radiator", "clock", "rug",
     "ceiling lamp", "pendant lamp", "table lamp", "floor lamp", "candles",
-    "chair", "office chair", "armchair", "sofa", "stool", "bench", "pouf", "bed",
+    "chair", "office chair", "armchair", "sofa", "stool", "bench", "pouf", "bed", "bunk bed",
     "dining table", "coffee table", "side table", "console table", "desk", "nightstand", "tv stand",
     "bookshelf", "wardrobe", "dresser", "sideboard", "wall shelf", "shoe rack", "coat rack",
     "kitchen cabinet", "kitchen counter", "kitchen sink", "stove", "refrigerator", "microwave", "range hood", "kettle",
     "sink", "toilet", "bathtub", "shower", "towel rail", "washing machine", "laundry basket", "bin",
-    "plant", "plant pot", "vase", "books", "bowl", "cup", "bottle", "box", "toy box", "television", "laptop", "piano",
+    "plant", "plant pot", "vase", "books", "bowl", "cup", "bottle", "box", "toy box",
+    "television", "laptop", "speaker", "piano", "ball",
 )  # fmt: skip
 """Categories of the built-in labellers, in the apartments' words; index 0 is everything else."""
 MERGED = {"door frame": "opening", "passage": "opening"}

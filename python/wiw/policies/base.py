@@ -26,6 +26,9 @@ class FrameSpec:
     view: str = "front"
     """"front" (HFOV 90), "surround" (front, left, right, back) or "panorama"."""
     size: tuple[int, int] = (384, 384)
+    ends: bool = False
+    """Whether only what each plan ends with is shown: rollouts of one frame. Models that compute frames one by one then
+    compute no other."""
 
 
 @dataclass(frozen=True)

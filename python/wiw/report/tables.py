@@ -30,7 +30,6 @@ from wiw.analysis.summary import (
     show_p,
     show_utility,
 )
-from wiw.report.page import summary_html
 from wiw.runs.run import Run
 
 COUNTS = (("n", "scored_of_total", ""), ("errors", "errors", "red"), ("to run", "pending", ""))
@@ -60,6 +59,8 @@ class SummaryTable(Summary):
         yield summary_tables(self, options.max_width)
 
     def _repr_html_(self) -> str:
+        from wiw.report.page import summary_html
+
         return summary_html(self)
 
 

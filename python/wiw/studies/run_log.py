@@ -10,9 +10,6 @@ from wiw.analysis.costs import costs
 from wiw.analysis.fidelity import fidelity
 from wiw.analysis.summary import arm_table, summarise_run
 from wiw.errors import Error
-from wiw.report.export import export
-from wiw.report.page import write_report
-from wiw.report.site import write_view
 from wiw.report.tables import SummaryTable, print_summary
 from wiw.runs.progress import in_notebook
 from wiw.runs.run import Records, Run
@@ -90,17 +87,23 @@ class RunLog(Run):
             ArgumentError: a number out of range, or less than the tables and plots take.
             FileError: the file cannot be written; what was there before is kept.
         """
+        from wiw.report.page import write_report
+
         file = Path(path) if path is not None else self.path / "report.html"
         return write_report(self, file, episodes=episodes, max_mb=max_mb, remark=remark)
 
     def view(self, folder: str | Path | None = None) -> Path:
         """Write pages to walk through all episodes and decisions; return the one to open, `view/index.html`."""
+        from wiw.report.site import write_view
+
         return write_view(self, Path(folder) if folder is not None else self.path / "view").index
 
     def export(
         self, csv: str | Path | None = None, parquet: str | Path | None = None, rerun: str | Path | None = None
     ) -> list[Path]:
         """Write tables into new folders, a recording for the Rerun viewer, or several of these; return the files."""
+        from wiw.report.export import export
+
         return export(self, *(None if path is None else Path(path) for path in (csv, parquet, rerun)))
 
     def _repr_html_(self) -> str:

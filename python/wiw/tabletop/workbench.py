@@ -15,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from wiw.errors import ArgumentError
 from wiw.physics import Articulation, Box, Gripper, World, WorldState, place
@@ -207,6 +206,8 @@ class Workbench:
         """float64 [7]: x, y, z, roll, pitch, yaw of the point between the finger tips, and the opening of the
         fingers.
         """
+        from scipy.spatial.transform import Rotation
+
         tip = self._world.link_poses(self._arm)[self.robot.tool_index]
         angles = Rotation.from_matrix(tip[:3, :3]).as_euler("xyz")
         return np.array([*tip[:3, 3], *angles, self._gripper.opening])

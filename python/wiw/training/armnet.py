@@ -15,6 +15,7 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
+from wiw.networks import has_bfloat16
 from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.plays import POSES, Plays
 from wiw.training.trainer import run_training, warmup_cosine_schedule
@@ -75,7 +76,7 @@ class Recipe:
     shares: float = 0.05
     """Weight of the cross-entropy between the mixing shares and the nearest source, where things change."""
     bfloat16: bool = True
-    """Compute products in bfloat16: faster on CPUs with AVX512-BF16, slower on others."""
+    """Compute products in bfloat16 on CPUs that have instructions for it, where it is faster."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -134,7 +135,7 @@ class _Trainer(ResumableTrainer):
         batch = sample_sequences(self.plays, recipe.batch, recipe.steps, rng)
         predict = predict_free_running if rng.random() < recipe.free else predict_teacher_forced
         network = self.network.train()
-        for part in predict(network, batch, recipe.bfloat16):
+        for part in predict(network, batch, recipe.bfloat16 and has_bfloat16()):
             loss = _compute_loss(part, recipe) * len(part.prediction) / (recipe.batch * recipe.steps)
             loss.backward()
             total += float(loss.detach())

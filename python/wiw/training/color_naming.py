@@ -17,6 +17,8 @@ from wiw.training.labelled_views import LabelledViews
 
 HIDDEN = 48
 STEPS, BATCH, RATE, DECAY = 3000, 256, 3e-3, 1e-3
+UNKNOWN = 0.15
+"""Share of the sets of pixels whose category is withheld, so that colours can be named without it."""
 BALANCE = 0.5
 """Sets of pixels are sampled with the frequency of their category and colour to minus this."""
 
@@ -32,24 +34,27 @@ def calibrate(views: LabelledViews, seed: int, steps: int = STEPS) -> ColorNamer
     features = compute_features(views.pixels)
     shift, scale = features.mean(axis=0), 1 / (features.std(axis=0) + 1e-3)
     inputs = torch.from_numpy(((features - shift) * scale).astype(np.float32))
-    targets = torch.from_numpy(views.color.astype(np.int64))
+    targets, categories = (torch.from_numpy(each.astype(np.int64)) for each in (views.color, views.colored_category))
     torch.manual_seed(core.fold_key([seed, 0x4C24]) % 2**63)
     first, last = torch.nn.Linear(FEATURES, HIDDEN), torch.nn.Linear(HIDDEN, len(COLORS))
-    network = torch.nn.Sequential(first, torch.nn.ReLU(), last)
-    optimiser = torch.optim.AdamW(network.parameters(), RATE, weight_decay=DECAY)
+    category_hidden, category_output = (
+        torch.zeros(len(CATEGORIES), size, requires_grad=True) for size in (HIDDEN, len(COLORS))
+    )
+    parts: tuple[torch.Tensor, ...] = (*first.parameters(), *last.parameters(), category_hidden, category_output)
+    optimiser = torch.optim.AdamW(parts, RATE, weight_decay=DECAY)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     rng = np.random.default_rng(core.fold_key([seed, 0x4C25]))
     weights = _compute_weights(views)
     for _ in range(steps):
         rows = torch.from_numpy(rng.choice(len(inputs), BATCH, p=weights))
-        loss = torch.nn.functional.cross_entropy(network(inputs[rows]), targets[rows])
+        known = torch.where(torch.from_numpy(rng.random(BATCH) < UNKNOWN), 0, categories[rows])
+        logits = last(torch.relu(first(inputs[rows]) + category_hidden[known])) + category_output[known]
+        loss = torch.nn.functional.cross_entropy(logits, targets[rows])
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         optimiser.step()
         schedule.step()
-    parts: tuple[torch.Tensor, ...] = (*first.parameters(), *last.parameters())
-    arrays = [each.detach().double().numpy() for each in parts]
-    return ColorNamer(shift, scale, *arrays)
+    return ColorNamer(CATEGORIES, shift, scale, *(each.detach().double().numpy() for each in parts))
 
 
 def _compute_weights(views: LabelledViews) -> NDArray[np.float64]:
@@ -69,7 +74,8 @@ def evaluate(namer: ColorNamer, views: LabelledViews) -> dict[str, Any]:
     """
     if not len(views.pixels):
         return {"things": 0, "accuracy": None, "structure": None, "by_category": {}, "by_color": {}}
-    right = namer.compute_probabilities(compute_features(views.pixels)).argmax(axis=1) == views.color
+    probabilities = namer.compute_probabilities(compute_features(views.pixels), views.colored_category)
+    right = probabilities.argmax(axis=1) == views.color
     names = np.array(CATEGORIES)[views.colored_category]
     colors = np.array(COLORS)[views.color]
     structure = np.isin(names, STRUCTURE)

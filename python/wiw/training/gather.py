@@ -111,7 +111,7 @@ def gather_views(
         ArgumentError: nowhere in the scenes can one stand.
     """
     make = partial(_build_views, seed=seed, rules=rules)
-    identity = ("views", 2, list(CATEGORIES), seed, asdict(rules))
+    identity = ("views", 3, list(CATEGORIES), seed, asdict(rules))
     job = Job(f"views of {specs}", VIEW_FIELDS, make, identity)
     sources = _resolve_scenes(specs)
     if change:

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,21 +16,25 @@ from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError
 from wiw.panorama import PerspectivePlan, distance_to_planar
 from wiw.perception.colors import COLORS
-from wiw.perception.labelling_network import FOCAL, STRIDE, InputSize, compute_tangents, resize_depth
-from wiw.perception.scene_labels import CATEGORIES, STATES, merge_category
+from wiw.perception.labelling_network import FOCAL, PIXELS, InputSize, compute_tangents, resize_view, sample_cells
+from wiw.perception.scene_labels import CATEGORIES, STATES, STRUCTURE, merge_category
 from wiw.scenes import is_generated, possible_edits
 
 SIZE = (384, 448)
 """(H, W) of the views as they are cut out of panoramas."""
 PANORAMA_SIZE = (576, 1024)
 INPUT = InputSize(176, 208, FOCAL)
-"""The views as they are stored."""
+"""The cells of the views as they are stored."""
 STATE_WORDS = {"half drawn": "closed"}
 """States of scenes that are learned under another name. A curtain that is half drawn is on the closed side of one that
 is open, so that the network learns to look at how much of the window shows.
 """
 COLOR_SAMPLES = 64
 """Pixels stored of an instance in a view, for learning colour names."""
+CLOSE = (0.7, 2.2)
+"""Least and greatest horizontal distance in metres of a close place from the middle of its thing."""
+CANDIDATES = 2000
+"""Places from which close ones are chosen."""
 LEAST_PIXELS = 150
 """Pixels of a view that an instance must fill for its colour to be learned: 8 by 8 centimetres at 1 m."""
 HELD_OUT_FIELD = 105.0
@@ -44,8 +47,12 @@ COLORLESS = ("mirror", "picture", "photo", "window", "opening", "")
 class ViewRules:
     """How a scene is sampled."""
 
-    places: int = 10
-    views: int = 4
+    places: int = 12
+    close: float = 0.5
+    """Share of the places that lie close to a thing, whose categories take turns; the others lie anywhere. Small and
+    rare things would otherwise be seen seldom, and from afar.
+    """
+    views: int = 3
     """Views of a place, in directions spread evenly around it."""
     fields: tuple[float, float] = (90.0, 110.0)
     """Least and greatest horizontal field of view in degrees."""
@@ -56,13 +63,13 @@ class LabelledViews:
     """N views and what they show, and the colours of the K instances in them."""
 
     images: NDArray[np.uint8]
-    """uint8 [N, h, w, 3] in the network's size."""
+    """uint8 [N, PIXELS * h, PIXELS * w, 3] for h x w cells of the network."""
     depth: NDArray[np.float16]
     """float16 [N, h, w]: planar, in metres; 0 where nothing is hit."""
     category: NDArray[np.uint8]
-    """uint8 [N, h/2, w/2]: index into `CATEGORIES`."""
+    """uint8 [N, h, w]: index into `CATEGORIES`."""
     state: NDArray[np.uint8]
-    """uint8 [N, h/2, w/2]: index into `STATES`."""
+    """uint8 [N, h, w]: index into `STATES`."""
     hfov_deg: NDArray[np.float32]
     """float32 [N]."""
     pixels: NDArray[np.uint8]
@@ -141,7 +148,7 @@ def read_instances(instances: Sequence[Mapping[str, Any]]) -> InstanceTable:
 def record_views(world: World, seed: int, rules: ViewRules = ViewRules()) -> LabelledViews:
     """Record views of a scene from places where an agent can stand; a pure function of (scene, seed, rules)."""
     key = core.fold_key([seed, 0x4C20, int("?" in world.scene.name)])
-    points = world.ground.put_down(world.navmesh.sample(rules.places, key)).astype(np.float64)
+    points = world.ground.put_down(_sample_places(world, rules, key)).astype(np.float64)
     draws = core.uniform(core.fold_key([key, 1]), len(points) * 2).reshape(-1, 2)
     table = read_instances(world.scene.instances)
     parts = []
@@ -165,6 +172,42 @@ def record_views(world: World, seed: int, rules: ViewRules = ViewRules()) -> Lab
     return merge_views(parts)
 
 
+def _sample_places(world: World, rules: ViewRules, key: int) -> NDArray[np.float32]:
+    """Return places where an agent can stand, float32 [N, 3]: anywhere, and close to things."""
+    candidates = world.navmesh.sample(CANDIDATES, core.fold_key([key, 3]))
+    count = round(rules.close * rules.places)
+    close = _choose_close_places(candidates, world.scene.instances, count, core.fold_key([key, 4]))
+    return np.concatenate([world.navmesh.sample(rules.places - len(close), key), candidates[close]])
+
+
+def _choose_close_places(
+    candidates: NDArray[np.float32], instances: Sequence[Mapping[str, Any]], count: int, key: int
+) -> NDArray[np.intp]:
+    """Return the rows of at most `count` places that lie close to things, whose categories take turns.
+
+    Args:
+        candidates: float32 [N, 3].
+        instances: as a scene has them.
+        count: number of places.
+        key: what chance depends on.
+    """
+    rng = np.random.default_rng(key)
+    by_category: dict[str, list[NDArray[np.float64]]] = {}
+    for each in instances:
+        name = merge_category(each["category"])
+        if name in CATEGORIES and name not in ("", *STRUCTURE):
+            by_category.setdefault(name, []).append(np.asarray(each["bounds"], np.float64).mean(axis=0))
+    chosen: list[int] = []
+    names = [name for _ in range(count) for name in rng.permutation(sorted(by_category))]
+    for name in names:
+        middle = by_category[name][rng.integers(len(by_category[name]))]
+        distance = np.hypot(*(candidates - middle)[:, [0, 2]].T)
+        near = np.flatnonzero((distance >= CLOSE[0]) & (distance <= CLOSE[1]))
+        if len(chosen) < count and len(near):
+            chosen.append(int(rng.choice(near)))
+    return np.array(chosen, np.intp)
+
+
 def _label_views(
     images: NDArray[np.uint8],
     depth: NDArray[np.float32],
@@ -173,15 +216,13 @@ def _label_views(
     hfov_deg: float,
     key: int,
 ) -> LabelledViews:
-    rows = (np.arange(INPUT.height // STRIDE) * 2 + 1) * SIZE[0] * STRIDE // (2 * INPUT.height)
-    columns = (np.arange(INPUT.width // STRIDE) * 2 + 1) * SIZE[1] * STRIDE // (2 * INPUT.width)
-    small = ids[:, rows[:, None], columns]
-    shrunk = [cv2.resize(image, (INPUT.width, INPUT.height), interpolation=cv2.INTER_AREA) for image in images]
+    numbers = sample_cells(ids, INPUT)
+    resized = np.array([resize_view(image, INPUT) for image in images], np.uint8)
     return LabelledViews(
-        np.array(shrunk, np.uint8).reshape(-1, INPUT.height, INPUT.width, 3),
-        np.array([resize_depth(each, INPUT) for each in depth], np.float16).reshape(-1, INPUT.height, INPUT.width),
-        table.category[small],
-        table.state[small],
+        resized.reshape(-1, PIXELS * INPUT.height, PIXELS * INPUT.width, 3),
+        sample_cells(depth, INPUT).astype(np.float16),
+        table.category[numbers],
+        table.state[numbers],
         np.full(len(images), hfov_deg, np.float32),
         *_sample_colors(images, ids, table, np.random.default_rng(key)),
     )
@@ -207,6 +248,6 @@ def _sample_colors(
 
 
 def compute_view_tangents(hfov_deg: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the directions of the pixels of stored views, which are (h, w) in size: float32 [N, h, w, 2]."""
+    """Return the directions of the cells of stored views, h x w of them: float32 [N, h, w, 2]."""
     focal = SIZE[1] / (2 * np.tan(np.radians(hfov_deg.astype(np.float64)) / 2))
     return np.stack([compute_tangents(SIZE, InputSize(*size, float(each))) for each in focal])

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -16,13 +16,18 @@ from torch.nn import functional
 
 from wiw._core import core
 from wiw.errors import ArgumentError
+from wiw.networks import has_bfloat16
 from wiw.perception.labelling_network import (
+    FINE_CELLS,
     MULTIPLE,
-    STRIDE,
+    PIXELS,
     InputSize,
     Network,
+    Pointwise,
     fuse,
-    resize_depth,
+    group_cells,
+    resize_view,
+    sample_cells,
     to_network_input,
 )
 from wiw.perception.learned_labeller import LearnedLabeller
@@ -31,35 +36,37 @@ from wiw.training.checkpoint import Checkpoint, ResumableTrainer
 from wiw.training.labelled_views import LabelledViews, compute_view_tangents
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 
-LEAST_PIXELS = 20
-"""Pixels of the network's output that an object must fill for its state to be evaluated."""
+LEAST_CELLS = 40
+"""Cells that an object must fill for its state to be evaluated."""
 
 
 @dataclass(frozen=True)
 class Recipe:
     """Hyper-parameters of the training."""
 
-    epochs: int = 16
+    epochs: int = 3
     """How often each view is used, on average."""
     batch: int = 4
-    widths: tuple[int, int, int, int] = (24, 48, 96, 160)
+    widths: tuple[int, int, int, int] = (32, 64, 128, 192)
     """Channels of the U-Net's levels."""
     rate: float = 2e-3
     decay: float = 0.01
     balance: float = 0.4
     """Weight of a category's pixels is their frequency to minus this."""
     states: float = 0.3
-    """Weight of the states' loss beside that of the categories."""
+    """Weight of the states' loss beside that of the categories. Each state of each category counts by its frequency to
+    minus a half, so that a lamp that is off weighs as much as many doors that are closed.
+    """
     coarse: float = 0.5
     """While the learning rate is above this share of its peak, views are shown at half size, twice as many in a batch:
     several times as many views in the same time. The rest of the training is at full size.
     """
     auxiliary: float = 0.25
     """Weight of the losses of the network's coarser levels, which speed up its training."""
-    imagined: float = 0.4
+    imagined: float = 0.3
     """Share of views without depth, as imagined ones are; two thirds of them are warped, blurred and noisy too."""
     bfloat16: bool = True
-    """Compute products in bfloat16: faster on CPUs with AVX512-BF16, slower on others."""
+    """Compute products in bfloat16 on CPUs that have instructions for it, where it is faster."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -96,6 +103,18 @@ def train(
     return fuse(trainer.network), recipe
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Views as the network takes them, and the labels of their cells."""
+
+    shown: Tensor
+    """float [B, CHANNELS, h, w]."""
+    category: Tensor
+    """int64 [B, h, w]."""
+    state: Tensor
+    """int64 [B, h, w]."""
+
+
 class _Trainer(ResumableTrainer):
     """The network in training, with everything that its next step depends on."""
 
@@ -105,29 +124,36 @@ class _Trainer(ResumableTrainer):
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C21]) % 2**63)
         self.views, self.recipe = views, recipe
         self.network = Network(len(CATEGORIES), len(STATES), recipe.widths)
-        self._auxiliary = torch.nn.ModuleList(
-            torch.nn.Conv2d(width, len(CATEGORIES), 1) for width in reversed(recipe.widths[1:])
-        )
-        self._set_prior()
+        coarser = [Pointwise(width, len(CATEGORIES)) for width in reversed(recipe.widths[1:])]
+        self._auxiliary = torch.nn.ModuleList(coarser)
+        self._set_prior(coarser)
         self.network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         parameters = [*self.network.parameters(), *self._auxiliary.parameters()]
         self._optimiser = torch.optim.AdamW(parameters, recipe.rate, weight_decay=recipe.decay)
         self._sampling_weights = _compute_sampling_weights(views.category)
+        self._bfloat16 = recipe.bfloat16 and has_bfloat16()
         self._category_weights = torch.from_numpy(_compute_category_weights(views.category, recipe.balance))
+        self._state_weights = torch.from_numpy(_compute_state_weights(views.category, views.state))
 
     def _compute_category_loss(self, logits: Tensor, category: Tensor) -> Tensor:
-        """Return the loss of logits at any level: they are compared with the middles of their pixels."""
-        factor = category.shape[1] // logits.shape[2]
-        middles = category[:, factor // 2 :: factor, factor // 2 :: factor]
-        return functional.cross_entropy(logits.float(), middles, self._category_weights)
+        """Return the loss of logits [..., categories]."""
+        return functional.cross_entropy(logits.float().flatten(0, -2), category.flatten(), self._category_weights)
 
-    def _set_prior(self) -> None:
+    def _compute_state_loss(self, logits: Tensor, category: Tensor, state: Tensor) -> Tensor:
+        """Return the loss of logits [..., states], of cells that show something with a state."""
+        known = state > 0
+        weights = self._state_weights[category[known], state[known]]
+        losses = functional.cross_entropy(logits[known].float(), state[known], reduction="none")
+        return (losses * weights).sum() / weights.sum()
+
+    def _set_prior(self, coarser: Sequence[Pointwise]) -> None:
         """Let all heads start from the categories' frequencies, as they are weighted."""
         share = np.bincount(self.views.category.ravel(), minlength=len(CATEGORIES)) / self.views.category.size
         prior = np.log(np.maximum(share, 1e-5) ** (1 - self.recipe.balance))
         with torch.no_grad():
-            for head in (self.network.head, *self._auxiliary):
-                head.bias[: len(CATEGORIES)] = torch.from_numpy(prior)
+            for head in coarser:
+                head.bias[:] = torch.from_numpy(prior)
+            self.network.head.bias.view(FINE_CELLS, -1)[:, : len(CATEGORIES)] = torch.from_numpy(prior)
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch of views and return its loss."""
@@ -136,18 +162,20 @@ class _Trainer(ResumableTrainer):
         rng = np.random.default_rng(core.fold_key([self.recipe.seed, 0x4C22, self.step_count]))
         coarse = learning_rate > self.recipe.coarse * self.recipe.rate
         batch = sample_batch(self.views, self.recipe, self._sampling_weights, rng, coarse)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=self._bfloat16):
             features = self.network.train().compute_features(batch.shown)
-            categories, states = self.network.head(features[-1]).split([len(CATEGORIES), len(STATES)], dim=1)
+            category_logits, state_logits = self.network.compute_logits(features[-1])
             coarser = [head(each) for head, each in zip(self._auxiliary, features[:-1], strict=True)]
-        loss = self._compute_category_loss(categories, batch.category)
+        some = rng.choice(FINE_CELLS, FINE_CELLS // 2, replace=False)  # neighbouring cells teach nearly the same
+        category_logits, state_logits = category_logits[..., some, :], state_logits[..., some, :]
+        category, state = (group_cells(labels)[..., some] for labels in (batch.category, batch.state))
+        loss = self._compute_category_loss(category_logits, category)
         for logits in coarser:
-            loss = loss + self.recipe.auxiliary * self._compute_category_loss(logits, batch.category)
-        stateful = batch.state > 0
-        if stateful.any():
-            loss = loss + self.recipe.states * functional.cross_entropy(
-                states.float().permute(0, 2, 3, 1)[stateful], batch.state[stateful]
-            )
+            factor = batch.category.shape[1] // logits.shape[2]
+            middles = batch.category[:, factor // 2 :: factor, factor // 2 :: factor]
+            loss = loss + self.recipe.auxiliary * self._compute_category_loss(logits.permute(0, 2, 3, 1), middles)
+        if (state > 0).any():
+            loss = loss + self.recipe.states * self._compute_state_loss(state_logits, category, state)
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -169,15 +197,11 @@ def _compute_category_weights(category: NDArray[np.uint8], balance: float) -> ND
     return np.asarray(weights / (weights * share).sum(), np.float32)
 
 
-@dataclass(frozen=True)
-class Batch:
-    """Views as the network takes them, and their labels."""
-
-    shown: Tensor
-    """float [B, 5, h, w]."""
-    category: Tensor
-    """int64 [B, h/2, w/2]."""
-    state: Tensor
+def _compute_state_weights(category: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the weights of the states of each category, float32 [categories, states]."""
+    pairs = category.astype(np.int64) * len(STATES) + state
+    counts = np.bincount(pairs.ravel(), minlength=len(CATEGORIES) * len(STATES))
+    return (np.maximum(counts, 1) ** -0.5).reshape(len(CATEGORIES), len(STATES)).astype(np.float32)
 
 
 def sample_batch(
@@ -201,7 +225,7 @@ def sample_batch(
         array[mirrored] = array[mirrored, :, ::-1]
     light = rng.uniform(0.75, 1.3, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
     images = np.clip(images * light.astype(np.float32), 0, 255).astype(np.uint8)
-    tangents = compute_view_tangents(views.hfov_deg[rows], (images.shape[1], images.shape[2]))
+    tangents = compute_view_tangents(views.hfov_deg[rows], (category.shape[1], category.shape[2]))
     if coarse:
         images, depth, category, state, tangents = _halve(images, depth, category, state, tangents)
     return Batch(
@@ -218,19 +242,12 @@ def _halve(
     state: NDArray[np.uint8],
     tangents: NDArray[np.float32],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
-    """Shrink views and labels to about half their size, a size that the network takes."""
-    height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in images.shape[1:3])
-    rows, columns = (
-        (np.arange(new // STRIDE) * 2 + 1) * old // (2 * (new // STRIDE))
-        for new, old in zip((height, width), category.shape[1:], strict=True)
-    )
-    resized = [
-        np.stack([cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in array])
-        for array in (images, tangents)
-    ]
-    places = (slice(None), rows[:, None], columns)
-    smaller = np.stack([resize_depth(each, InputSize(height, width, 0.0)) for each in depth])
-    return resized[0], smaller, category[places], state[places], resized[1]
+    """Shrink views, depth, labels and directions to about half their size, a size that the network takes."""
+    height, width = (-(-side // (2 * MULTIPLE)) * MULTIPLE for side in category.shape[1:])
+    size = InputSize(height, width, 0.0)
+    shown = np.stack([resize_view(image, size) for image in images])
+    directions = np.stack([cv2.resize(each, (width, height), interpolation=cv2.INTER_AREA) for each in tangents])
+    return shown, sample_cells(depth, size), sample_cells(category, size), sample_cells(state, size), directions
 
 
 def degrade_view(
@@ -240,23 +257,23 @@ def degrade_view(
 
     Args:
         image: uint8 [h, w, 3].
-        labels: uint8 [h/2, w/2, C].
+        labels: uint8 [h / PIXELS, w / PIXELS, C].
         rng: what chance decides.
     """
     height, width = image.shape[:2]
-    field = rng.normal(0, rng.uniform(0, 4), (5, 6, 2)).astype(np.float32)
+    field = rng.normal(0, rng.uniform(0, 7), (5, 6, 2)).astype(np.float32)
     offset = cv2.resize(field, (width, height), interpolation=cv2.INTER_CUBIC)
     across, down = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     across_source, down_source = across + offset[..., 0], down + offset[..., 1]
     image = np.asarray(cv2.remap(image, across_source, down_source, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT))
-    middle = (slice(STRIDE // 2, None, STRIDE),) * 2
-    source = np.stack([across_source, down_source], axis=-1)[middle] / STRIDE
-    columns, rows = np.clip(source, 0, (width // STRIDE - 1, height // STRIDE - 1)).astype(np.intp).transpose(2, 0, 1)
+    middle = (slice(PIXELS // 2, None, PIXELS),) * 2
+    source = np.stack([across_source, down_source], axis=-1)[middle] / PIXELS
+    columns, rows = np.clip(source, 0, (width // PIXELS - 1, height // PIXELS - 1)).astype(np.intp).transpose(2, 0, 1)
     labels = labels[rows, columns]
     if rng.random() < 0.5:
-        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.3, 1.8)))
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.5, 3.2)))
     else:
-        coarse = 1 / rng.uniform(1.0, 2.6)
+        coarse = 1 / rng.uniform(1.0, 4.5)
         small = cv2.resize(image, None, fx=coarse, fy=coarse, interpolation=cv2.INTER_AREA)
         image = np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
     noise = rng.normal(0, rng.uniform(0, 10), image.shape)
@@ -318,8 +335,9 @@ def _measure(labeller: LearnedLabeller, views: LabelledViews) -> dict[str, Any]:
     for image, depth, truth, states, angle in zip(
         views.images, views.depth, views.category, views.state, views.hfov_deg, strict=True
     ):
-        found = labeller.label(image[None], float(angle), depth=depth[None].astype(np.float32))
-        predicted, predicted_state = (array[0, ::STRIDE, ::STRIDE] for array in (found.category, found.state))
+        pixel_depth = depth.astype(np.float32).repeat(PIXELS, axis=0).repeat(PIXELS, axis=1)
+        found = labeller.label(image[None], float(angle), depth=pixel_depth[None])
+        predicted, predicted_state = (array[0, ::PIXELS, ::PIXELS] for array in (found.category, found.state))
         pairs = truth.astype(np.int64) * len(CATEGORIES) + predicted
         confusion += np.bincount(pairs.ravel(), minlength=confusion.size).reshape(confusion.shape)
         for name, value, correct in _judge_states(truth, states, predicted, predicted_state):
@@ -348,13 +366,13 @@ def _judge_states(
     predicted: NDArray[np.uint8],
     predicted_state: NDArray[np.uint8],
 ) -> list[tuple[str, str, bool]]:
-    """Return category, true state and whether it was found, for what fills `LEAST_PIXELS` of a view."""
+    """Return category, true state and whether it was found, for what fills `LEAST_CELLS` of a view."""
     judged = []
     stateful = np.where(states > 0, truth.astype(np.int64) * len(STATES) + states, 0)
     for pair, count in zip(*np.unique(stateful, return_counts=True), strict=True):
         category, state = divmod(int(pair), len(STATES))
         votes = predicted_state[(stateful == pair) & (predicted == category)]
-        if pair and count >= LEAST_PIXELS and len(votes):
+        if pair and count >= LEAST_CELLS and len(votes):
             most = int(np.bincount(votes, minlength=len(STATES)).argmax())
             judged.append((CATEGORIES[category], STATES[state], most == state))
     return judged

@@ -16,6 +16,7 @@ from wiw import metrics, scenes
 from wiw._core import core
 from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
+from wiw.networks import has_bfloat16
 from wiw.reproject import pose, warp
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 from wiw.training.walks import Walks, find_straight_paths
@@ -48,7 +49,7 @@ class Recipe:
     paint: float = 0.02
     """Penalty on painted rather than warped pixels: paint is blurred."""
     bfloat16: bool = True
-    """Compute products in bfloat16: 1.5 times faster on CPUs with AVX512-BF16, slower on others."""
+    """Compute products in bfloat16 on CPUs that have instructions for it, where it is faster."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -92,7 +93,7 @@ class _Trainer:
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
         pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
             found = self.network.train()(pairs.source, pairs.ahead)
         loss = _compute_loss(found, pairs, self.recipe)
         self._optimiser.zero_grad(set_to_none=True)

@@ -95,15 +95,18 @@ def _candidate(figure: Figure, place: Any, decision: Decision, index: int, score
     label.barh([0.42, 0.42], [1, share], height=0.08, color=["#e4e2db", color])
     label.text(0, 0.08, f"{scores[index]:.3f}" + ("   chosen" if chosen else ""), color=color, fontsize=10)
     if rollout is not None:
-        _frames(figure, columns[0, 1], rollout, color if chosen else None)
+        unread = len(decision.proposals[index].actions) - len(rollout.frames)
+        _frames(figure, columns[0, 1], rollout, unread, color if chosen else None)
 
 
-def _frames(figure: Figure, place: Any, rollout: Rollout, border: str | None) -> None:
+def _frames(figure: Figure, place: Any, rollout: Rollout, unread: int, border: str | None) -> None:
+    """Draw a rollout, of which the first `unread` actions have no frames."""
     kept = select_frames(len(rollout.frames))
     cells = place.subgridspec(1, len(kept), wspace=0.02)
     for column, k in enumerate(kept):
         axes = figure.add_subplot(cells[0, column])
-        _picture(axes, _front(rollout.frames[k]), "real, turned" if rollout.real[k] else f"imagined {k + 1}", size=7)
+        title = "real, turned" if rollout.real[k] else f"imagined {unread + k + 1}"
+        _picture(axes, _front(rollout.frames[k]), title, size=7)
         if border is not None:
             axes.spines[:].set(visible=True, color=border, linewidth=2.5)
 

@@ -7,31 +7,30 @@ asks ("A-EQA High-Level Planner Additional Prompt").
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.action import TURN_LEFT
-from wiw.datasets.questions import ParsedQuestion, parse
+from wiw.datasets.questions import parse
 from wiw.errors import ArgumentError
-from wiw.mapping.alignment import find_wall_azimuth, turn_odometry
+from wiw.mapping.alignment import turn_odometry
 from wiw.mapping.object_map import ObjectMap
-from wiw.mapping.occupancy import OccupancyGrid
 from wiw.mapping.routes import STEP, find_refused
 from wiw.mapping.views import HFOV_DEG, Views, cut_images, cut_views, unproject
 from wiw.perception.colors import name_color
 from wiw.perception.scene_labels import STATES, Labeller, SceneLabels
 from wiw.policies.base import FrameSpec, Policy, Situation
-from wiw.policies.explorer.answering import Belief, answer, list_wanted
+from wiw.policies.explorer.answering import Belief, answer
 from wiw.policies.explorer.confidence import estimate_confidence
-from wiw.policies.explorer.destinations import Destination, Rate, choose_destinations, plan_route
+from wiw.policies.explorer.destinations import Destination, plan_route
 from wiw.policies.explorer.drawing import VIEW_SIZE, draw_beliefs
 from wiw.policies.explorer.home import Surface, believe_home, load_knowledge
+from wiw.policies.explorer.memory import Look, Memory
 from wiw.registry import LABELLERS
 from wiw.types import Decision, Goal, Key, Proposal, Rollout, TextAnswer
 
@@ -42,65 +41,10 @@ LOOK_ACTIONS = 3
 """Most primitives of a plan that only takes a second look."""
 MOST_GAIN = 12.0
 """Square metres of new floor that count at most: one room. More would draw an agent to and fro across a home."""
-PATIENCE = 6
-"""Decisions after which a place that could not be reached is given up; six lead up to 18 m."""
 LAST_ACTIONS = 18
 """Primitives left from which on an answer is final: those of one more decision, and of the look that confirms it."""
 CLEAR_SHARE = 0.01
 """Share of a view that a wanted thing must fill in an imagined view to count in full."""
-
-
-@dataclass(frozen=True)
-class Look:
-    """A real look around."""
-
-    panorama: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    """Distances along the ray in metres."""
-    odometry: NDArray[np.float64]
-    ids: NDArray[np.uint32] | None = None
-    """The simulator's instance of each pixel, for explorers that are given the truth."""
-
-
-@dataclass
-class Memory:
-    """The memory of one episode."""
-
-    question: ParsedQuestion | None
-    """None where the text is none of the generator's language: then only the blind answer is left."""
-    objects: ObjectMap
-    grid: OccupancyGrid = field(default_factory=OccupancyGrid)
-    surfaces: list[Surface] = field(default_factory=list)
-    belief: Belief = field(default_factory=lambda: Belief("", 0.0))
-    home: Any = None
-    azimuth: float | None = None
-    """Azimuth of the walls in the frame of the start; the map's x axis points along it."""
-    pose: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
-    """x, y, azimuth in the map at the last decision."""
-    executed: int = 0
-    """Primitives until then."""
-    destinations: list[Destination] = field(default_factory=list)
-    """Places worth going to from there, the most worth first."""
-    tries: Counter[tuple[int, int]] = field(default_factory=Counter)
-    """Decisions in which a place, in half metres, was the most worth going to."""
-
-    def choose_destinations(self, rate: Rate) -> None:
-        """Choose where to go from here; places that were the best for long, and never reached, are given up."""
-        found = choose_destinations(self.grid, self.pose, self.belief.things, rate)
-        cells = [(round(2 * place.position[0]), round(2 * place.position[1])) for place in found]
-        self.destinations = [place for place, cell in zip(found, cells, strict=True) if self.tries[cell] < PATIENCE]
-        self.tries.update(next(([cell] for cell in cells if self.tries[cell] < PATIENCE), []))
-
-    def align(self, look: Look) -> NDArray[np.float64]:
-        """Return x, y, azimuth of a look in the map."""
-        if self.azimuth is None:
-            self.azimuth = find_wall_azimuth(look.depth, look.odometry)
-        return turn_odometry(look.odometry, self.azimuth)
-
-    @cached_property
-    def wanted_categories(self) -> tuple[str, ...]:
-        """Categories to look for, the one that is asked about first."""
-        return list_wanted(self.question)
 
 
 class Explorer(Policy):
@@ -123,7 +67,7 @@ class Explorer(Policy):
     """
 
     needs = ("depth",)
-    frames = FrameSpec("panorama", (288, 512))
+    frames = FrameSpec("panorama", (288, 512), ends=True)
 
     def __init__(
         self,
@@ -173,12 +117,7 @@ class Explorer(Policy):
 
     def begin(self, goal: Goal, key: Key) -> Memory:
         """Return an empty map."""
-        return Memory(parse(goal.text or ""), ObjectMap(self.map_categories, STATES))
-
-    @property
-    def map_categories(self) -> tuple[str, ...]:
-        """Names of what the map can hold, index 0 is ""."""
-        return self.labeller.categories
+        return Memory(parse(goal.text or ""), ObjectMap(self.labeller.categories, STATES))
 
     # -- real views ----------------------------------------------------------------------------------------------------
 
@@ -199,7 +138,7 @@ class Explorer(Policy):
 
     def _look_at_surfaces(self, views: Views, labels: SceneLabels) -> list[Surface]:
         """Return looks at floors and walls: patches that are all of one surface, with their colour."""
-        looks, categories = [], self.map_categories
+        looks, categories = [], self.labeller.categories
         half = SURFACE_STRIDE // 2
         for name in SURFACES:
             if name not in categories:
@@ -211,7 +150,7 @@ class Explorer(Policy):
                     for column in range(half, width - half, SURFACE_STRIDE):
                         patch = np.s_[view, row - half // 2 : row + half // 2, column - half // 2 : column + half // 2]
                         if mask[patch].all():
-                            color, confidence = self.name_color(views.images[patch].reshape(-1, 3))
+                            color, confidence = self.name_color(views.images[patch].reshape(-1, 3), name)
                             point = unproject(views, *(np.array([i]) for i in (view, row, column)))[0]
                             looks.append(Surface(name, point[:2], color, confidence))
         return looks
@@ -232,9 +171,16 @@ class Explorer(Policy):
         yield Look(observation.panorama, observation.depth, observation.odometry)
 
     def perceive(self, situation: Situation, look: Look, pose: NDArray[np.float64]) -> tuple[Views, SceneLabels]:
-        """Return the four real views of a look around from a pose in the map, and their labels."""
-        views = cut_views(look.panorama, look.depth, pose, VIEW_SIZE)
-        return views, self.labeller.label(views.images, HFOV_DEG, depth=views.depth)
+        """Return the four real views of a look around from a pose in the map, and their labels.
+
+        They are labelled at twice the size of the map's views, so that small things are recognised.
+        """
+        fine = cut_views(look.panorama, look.depth, pose)
+        labels = self.labeller.label(fine.images, HFOV_DEG, depth=fine.depth)
+        middle = np.s_[:, 1::2, 1::2]
+        return cut_views(look.panorama, look.depth, pose, VIEW_SIZE), SceneLabels(
+            labels.category[middle], labels.confidence[middle], labels.state[middle]
+        )
 
     def _answer_from_map(self, memory: Memory, text: str) -> Belief:
         """Return the answer that the map gives to a text, and how sure it is."""
@@ -243,9 +189,9 @@ class Explorer(Policy):
             return found
         return replace(found, confidence=estimate_confidence(memory.question.answer_type, found.confidence))
 
-    def name_color(self, pixels: NDArray[np.uint8]) -> tuple[str, float]:
+    def name_color(self, pixels: NDArray[np.uint8], category: str) -> tuple[str, float]:
         """Return the colour word of pixels uint8 [n, 3] of one thing in such views, and its probability."""
-        return name_color(pixels)
+        return name_color(pixels, category)
 
     # -- plans ---------------------------------------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ SMOOTHING = 0.02
 """Added to each mean, so that nothing is impossible."""
 UNSEEN = 0.1
 """Weight of each thing that a room of a kind usually has and that was not observed."""
-LEAST_SIZE = 0.0004
+LEAST_SIZE = 0.0008
 """Share of a view that a thing must once have filled to be believed in."""
 LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""

@@ -72,7 +72,7 @@ class QuestionVLM(VLM):
         DependencyError: the learned labeller without torch.
     """
 
-    frames = FrameSpec("panorama", (432, 768))
+    frames = FrameSpec("panorama", (432, 768), ends=True)
     tasks = ("aeqa",)
 
     def __init__(
