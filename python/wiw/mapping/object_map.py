@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from wiw.errors import ArgumentError
 from wiw.mapping.fragments import VOXEL, Fragments, Labels, find_fragments, unpack_voxels
+from wiw.mapping.label_votes import LabelVotes
 from wiw.mapping.views import Views
 
 NEAR = 0.15
@@ -27,6 +28,8 @@ CONFUSABLE_OVERLAP = 0.5
 """The same, both ways, for two categories that are only confusable: a cup beside a vase remains a cup."""
 SAMPLE = 128
 """Voxels at most that an overlap is measured with."""
+SUPPORT_VOXELS = 256
+"""Voxels at most that a thing's support is measured with."""
 INSIDE = 0.8
 """Share of a small part in the box of a larger one of its category that makes both one, such as a chair's legs."""
 SCRAP = 0.1
@@ -156,6 +159,8 @@ class ObjectMap:
     background: tuple[str, ...] = BACKGROUND
     confusable: tuple[frozenset[str], ...] = CONFUSABLE
     least_confidence: float = LEAST_CONFIDENCE
+    votes: LabelVotes = field(default_factory=LabelVotes)
+    """What each voxel was labelled as, background included."""
     _objects: dict[int, MapObject] = field(default_factory=dict)
     _next_id: int = 1
     _decision: int = -1
@@ -190,6 +195,7 @@ class ObjectMap:
         """
         self._decision += 1
         fragments = find_fragments(views, labels, self._things, len(self.states), self.least_confidence)
+        self.votes.add(views, labels)
         colors = self._name_colors(views, fragments, name_color)
         owners = np.zeros(len(fragments) + 1, np.int32)
         order = np.lexsort((np.arange(1, len(owners)), -fragments.pixels[1:])) + 1  # the largest first
@@ -309,6 +315,16 @@ class ObjectMap:
         )  # fmt: skip
 
     # -- questions -----------------------------------------------------------------------------------------------------
+
+    def measure_support(self, thing: MapObject) -> float:
+        """Return the share of the votes of all views for what is where a thing is that say what the thing is, 0 to 1.
+
+        Views that show something else there, or nothing but a wall, count against it.
+        """
+        some = thing.voxels[:: -(-len(thing.voxels) // SUPPORT_VOXELS)]
+        votes = self.votes.count(some, len(self.categories))
+        total = votes.sum()
+        return float(votes[self.categories.index(thing.category)] / total) if total > 0 else 1.0
 
     def find(self, category: str, least_size: float = 0.0) -> tuple[MapObject, ...]:
         """Return the objects of a category, by id; spaces and underscores, upper and lower case are the same."""

@@ -46,7 +46,7 @@ class ColorNamer:
     """
 
     categories: tuple[str, ...]
-    """What things may be; index 0 is "", where that is not known."""
+    """Names of the things' categories; index 0 is "", where a category is not known."""
 
     shift: NDArray[np.float64]
     """[FEATURES]; features are normalised by (x - shift) * scale."""

@@ -30,8 +30,9 @@ MULTIPLE = 16
 """A view has a multiple of this many rows and columns of cells."""
 PIXELS = 2
 """Rows and columns of pixels in a cell."""
-FINE_CELLS = 4
-"""Cells that each output of the finest level stands for, 2 x 2."""
+FINE = 2
+"""Rows and columns of cells that each output of the finest level stands for."""
+FINE_CELLS = FINE**2
 COLOR_CHANNELS = 3 * PIXELS**2
 CHANNELS = COLOR_CHANNELS + 5
 """Channels of the input; see `to_network_input`."""
@@ -128,17 +129,17 @@ class Convolution(nn.Module):
 
 
 def group_cells(values: Tensor) -> Tensor:
-    """Return the values of cells [B, H, W, ...] in groups of 2 x 2, [B, H/2, W/2, FINE_CELLS, ...], row by row."""
+    """Return the values of cells [B, H, W, ...] in groups of FINE x FINE, [B, H/2, W/2, FINE_CELLS, ...], row by row."""
     count, height, width, *rest = values.shape
-    grouped = values.reshape(count, height // 2, 2, width // 2, 2, *rest).transpose(2, 3)
-    return grouped.reshape(count, height // 2, width // 2, FINE_CELLS, *rest)
+    grouped = values.reshape(count, height // FINE, FINE, width // FINE, FINE, *rest).transpose(2, 3)
+    return grouped.reshape(count, height // FINE, width // FINE, FINE_CELLS, *rest)
 
 
 def ungroup_cells(values: Tensor) -> Tensor:
     """Return the values of cells [B, H, W, ...] from those of groups; the inverse of `group_cells`."""
     count, height, width, _, *rest = values.shape
-    spread = values.reshape(count, height, width, 2, 2, *rest).transpose(2, 3)
-    return spread.reshape(count, 2 * height, 2 * width, *rest)
+    spread = values.reshape(count, height, width, FINE, FINE, *rest).transpose(2, 3)
+    return spread.reshape(count, FINE * height, FINE * width, *rest)
 
 
 def fuse(network: Network) -> Network:

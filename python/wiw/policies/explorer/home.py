@@ -27,7 +27,8 @@ LEAST_SIZE = 0.0008
 """Share of a view that a thing must once have filled to be believed in."""
 LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
-
+LEAST_SUPPORT = 0.1
+"""Share of the votes of all views for what is there, background included, that a thing's category must have."""
 
 WORKTOPS = frozenset({"kitchen counter", "kitchen cabinet"})
 """Categories that stand against walls and have no left and right."""
@@ -109,7 +110,13 @@ class Home:
 
 def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Surface], knowledge: Knowledge) -> Home:
     """Return the home that a map of it shows."""
-    known = [thing for thing in objects.objects if thing.size >= LEAST_SIZE and thing.category_share >= LEAST_SHARE]
+    known = [
+        thing
+        for thing in objects.objects
+        if thing.size >= LEAST_SIZE
+        and thing.category_share >= LEAST_SHARE
+        and objects.measure_support(thing) >= LEAST_SUPPORT
+    ]
     seen = _take_apart(known, knowledge)
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
     rooms, names, kinds = _name_rooms(seen, places, grid, knowledge)
