@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from wiw.datasets.ar import category_of
 from wiw.scenes import Scene
 
-STRUCTURE = frozenset({"floor", "ceiling", "wall", "passage", "door frame", "door", "window"})
+STRUCTURE = frozenset({"floor", "ceiling", "wall", "passage", "opening", "door frame", "door", "window"})
 """Categories that are the building's and not in it."""
 SMALL = frozenset(
     {
