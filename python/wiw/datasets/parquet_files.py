@@ -11,6 +11,8 @@ from typing import Any
 from wiw.errors import DependencyError, FileError
 from wiw.files import atomic_file
 
+MANIFEST = "manifest.json"
+"""Of a folder: what was asked for."""
 KEY = b"wiw"
 """Of the metadata, which are JSON."""
 

@@ -19,10 +19,9 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
+from wiw.datasets.parquet_files import MANIFEST
 from wiw.errors import ArgumentError, FileError, InfrastructureError
 from wiw.files import atomic_file, remove_abandoned_drafts
-
-MANIFEST = "manifest.json"
 
 Result = TypeVar("Result", covariant=True)
 
