@@ -139,7 +139,7 @@ class Clips(Sequence[NavigationSegment]):
 
 
 def part_of(scene: str, held_out: float) -> Literal["train", "held-out"]:
-    """Return the part that a scene belongs to: a hash of its name, so that more scenes move none from one to another."""
+    """Return the part that a scene belongs to, by a hash of its name, so that adding scenes moves no other."""
     number = int.from_bytes(blake2b(scene.encode(), digest_size=8).digest(), "little")
     return "held-out" if number < held_out * 2**64 else "train"
 

@@ -66,14 +66,14 @@ import datasets
 frames = datasets.load_dataset(".", split="train", streaming=True)
 ```
 
-`segments.parquet` says where each segment is, `meta.json` has camera, rules, the map of each scene and the SHA-256 of each
-file. `wiw data verify .` checks them.
+`segments.parquet` says where each segment is; `meta.json` has camera, rules, a map of each scene and the SHA-256 of
+each file. `wiw data verify .` checks them.
 """
 
 
 _ROLLS = """
-A turn on the spot only rolls a panorama, so that the first picture of each position is stored and `rgb` is null in frames
-after turns: `numpy.roll(rgb[source], roll, axis=1)` is their picture, exactly.
+A turn on the spot only rolls a panorama, so that the first picture of each position is stored and `rgb` is null in
+frames after turns: `numpy.roll(rgb[source], roll, axis=1)` is their picture, exactly.
 """
 
 

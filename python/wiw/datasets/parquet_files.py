@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parquet files of training data: whole or absent, with checksums, readable by Hugging Face's `datasets` as they are."""
+"""Parquet files of training data: whole or absent, with checksums, readable by Hugging Face's `datasets`."""
 
 from __future__ import annotations
 

@@ -154,8 +154,8 @@ def _check_train_split(spec: str) -> None:
     found = [name for name in HELD_OUT_SPLITS if name in (split, *folders)]
     if found:
         raise ArgumentError(
-            f"collect: expected scenes of a train split, got {spec}, which is of {found[0]}: evaluation runs there, and a "
-            "model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
+            f"collect: expected scenes of a train split, got {spec}, which is of {found[0]}: evaluation runs there; "
+            "a model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
         )
 
 

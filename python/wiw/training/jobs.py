@@ -23,13 +23,14 @@ from wiw.datasets.parquet_files import MANIFEST
 from wiw.errors import ArgumentError, FileError, InfrastructureError
 from wiw.files import atomic_file, remove_abandoned_drafts
 
-Result = TypeVar("Result", covariant=True)
+Result = TypeVar("Result")
+Made_co = TypeVar("Made_co", covariant=True)
 
 
-class Job(Protocol, Generic[Result]):
+class Job(Protocol, Generic[Made_co]):
     """A part of a collection that can be sent to another process."""
 
-    def run(self) -> Result:
+    def run(self) -> Made_co:
         """Write the job's files."""
 
 
@@ -71,7 +72,7 @@ def _start_worker(life: Connection, threads: int) -> None:
 
 def count_threads() -> int:
     """Return the number of threads that this process may use."""
-    return int(os.environ.get("WIW_NUM_THREADS", 0)) or len(os.sched_getaffinity(0))
+    return int(os.environ.get("WIW_NUM_THREADS", "0")) or len(os.sched_getaffinity(0))
 
 
 def open_folder(folder: Path, config: Mapping[str, Any], read: Callable[[Path], dict[str, Any]]) -> None:

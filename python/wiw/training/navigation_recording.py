@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal, TypeVar, get_args
+from functools import partial
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +26,6 @@ BATCH = 32
 HFOV_DEG = 90.0
 """Of perspective views, as the agent's front view."""
 PANORAMA, FRONT = (576, 1024), (480, 480)
-
-Item, Made = TypeVar("Item"), TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -65,8 +64,8 @@ class NavigationCollection:
             raise ArgumentError(f"collect: expected height and width from 16 to 8192 pixels, got {size}")
         if not self.perspective and size[1] % HEADINGS:
             raise ArgumentError(
-                f"collect: expected panoramas whose width is a multiple of {HEADINGS}, so that turns are whole columns, "
-                f"got {size[1]}"
+                f"collect: expected panoramas whose width is a multiple of {HEADINGS}, so that turns are whole "
+                f"columns, got {size[1]}"
             )
         if self.backend not in get_args(Backend):
             raise ArgumentError(f"collect: expected a backend among {', '.join(get_args(Backend))}, got {self.backend}")
@@ -155,7 +154,7 @@ def _picture(
     """
     outputs: tuple[Any, ...] = ("color", "depth") if options.depth else ("color",)
     size, width = options.image_size, options.image_size[1]
-    rolls = segment.headings * (width // HEADINGS)
+    rolls = segment.headings * (0 if options.perspective else width // HEADINGS)
     made: list[tuple[bytes, bytes]] = []
     for batch in (shown[at : at + BATCH] for at in range(0, len(shown), BATCH)):
         if options.perspective:
@@ -163,20 +162,20 @@ def _picture(
         else:
             north = np.stack([camera_pose(floor[frame], traversal.north, options.height) for frame in batch])
             seen = world.renderer.panorama(north, size, outputs)
-
-        def encode(place: int, batch: NDArray[np.int64] = batch, seen: Any = seen) -> tuple[bytes, bytes]:
-            roll = 0 if options.perspective else int(rolls[batch[place]])
-            color = np.roll(seen["color"][place], roll, axis=1)
-            depth = encode_millimetres(np.roll(seen["depth"][place], roll, axis=1)) if options.depth else b""
-            return encode_color(color, options.lossless), depth
-
-        made += map_threads(encode, range(len(batch)))
+        pictures = [{name: image[place] for name, image in seen.items()} for place in range(len(batch))]
+        made += _map_threads(partial(_encode, options), pictures, rolls[batch].tolist())
     return made
 
 
-def map_threads(function: Callable[[Item], Made], items: Sequence[Item]) -> Iterable[Made]:
+def _encode(options: NavigationCollection, picture: dict[str, NDArray[Any]], roll: int) -> tuple[bytes, bytes]:
+    rolled = {name: np.roll(image, roll, axis=1) for name, image in picture.items()}
+    depth = encode_millimetres(rolled["depth"]) if options.depth else b""
+    return encode_color(rolled["color"], options.lossless), depth
+
+
+def _map_threads(function: Callable[..., Any], *items: Sequence[Any]) -> list[Any]:
     """Call a function that releases the GIL for each item, on all threads of this process; return results in order."""
     if count_threads() == 1:
-        return list(map(function, items))
+        return list(map(function, *items))
     with ThreadPoolExecutor(count_threads()) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(function, *items))
