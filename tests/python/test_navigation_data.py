@@ -422,7 +422,7 @@ def test_what_cannot_be_collected_is_refused(tmp_path: Path, two_rooms: str, ask
 
 def test_another_collection_is_not_mixed_in(collected: Path, tmp_path: Path, two_rooms: str) -> None:
     copy(collected, tmp_path)
-    with pytest.raises(ArgumentError, match="holds another collection: .*seed 3 there and 4 asked"):
+    with pytest.raises(ArgumentError, match=r"holds another collection: .*seed 3 there and 4 asked"):
         collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **{**SMALL, "seed": 4})
     (tmp_path / "manifest.json").write_text('{"tasks": [], "episodes": 3}')
     with pytest.raises(FileError, match="manifest of `wiw collect navigation`"):
@@ -437,7 +437,7 @@ def test_a_scene_that_cannot_be_opened_stops_no_other(tmp_path: Path, two_rooms:
     bad.write_text("v 0 0 0\n")
     out = tmp_path / "out"
     few = {**SMALL, "rules": {**RULES, "max_scene_frames": 30}}
-    with pytest.raises(InfrastructureError, match="1 of 2 scenes cannot be recorded.*bad: "):
+    with pytest.raises(InfrastructureError, match=r"1 of 2 scenes cannot be recorded.*bad: "):
         collect_navigation(out, [bad, two_rooms], **few)
     with pytest.raises(FileError, match=r"meta.json is missing.*until it is finished"):
         NavigationData(out)
@@ -462,7 +462,7 @@ def test_a_damaged_picture_is_told() -> None:
     segment = made_up(np.random.default_rng(0), 2, 0, True, False)
     for data in (b"no picture", b"", None):
         broken = replace(segment, encoded_images=(data, segment.encoded_images[1]))
-        with pytest.raises(FileError, match="expected a picture in frame 0.*wiw data verify"):
+        with pytest.raises(FileError, match=r"expected a picture in frame 0.*wiw data verify"):
             _ = broken.images
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,15 @@ def write_row_groups(path: Path, schema: Any, tables: Iterable[Any], **options: 
     ):
         for table in tables:
             file.write_table(table, row_group_size=max(1, len(table)))
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    digest = sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 class RowGroupFile:

@@ -13,7 +13,6 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from wiw.datasets.navigation_files import (
     write_segment_list,
 )
 from wiw.datasets.navigation_segment import NavigationSegment
-from wiw.datasets.parquet_files import require_pyarrow
+from wiw.datasets.parquet_files import hash_file, require_pyarrow
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
@@ -280,15 +279,6 @@ def _describe_segment(segment: NavigationSegment) -> dict[str, Any]:
 
 def _describe_file(path: Path, frames: int) -> dict[str, Any]:
     return {"frames": frames, "bytes": path.stat().st_size, "sha256": hash_file(path)}
-
-
-def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file."""
-    digest = sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _describe_traversal(place: World, traversal: Traversal) -> dict[str, Any]:
