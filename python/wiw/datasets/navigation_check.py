@@ -189,6 +189,8 @@ def find_motion_errors(segment: NavigationSegment, camera: Mapping[str, Any]) ->
     frames = np.arange(len(segment))
     if (segment.sources > frames).any() or (segment.sources[segment.sources] != segment.sources).any():
         yield "expected each source to be an earlier frame with a picture"
+    elif [data is not None for data in segment.encoded_images] != (segment.sources == frames).tolist():
+        yield "expected a picture in each frame that is its own source, and in no other"
     elif camera["projection"] == "equirectangular":
         columns = _wrap(yaws - yaws[segment.sources]) / (2 * np.pi) * camera["size"][1]
         off = (columns - segment.rolls + camera["size"][1] / 2) % camera["size"][1] - camera["size"][1] / 2
@@ -206,16 +208,18 @@ def _check_pictures(
 ) -> None:
     """Decode the pictures of a segment, check their size, and remember them."""
     size = tuple(data.meta["camera"]["size"])
-    try:
-        shapes = {segment.images.shape[1:3]} | ({segment.depths.shape[1:3]} if segment.depths is not None else set())
-        if shapes != {size}:
-            found.add("picture", f"{where}: expected pictures of {size}, got {sorted(shapes)}")
-    except FileError as error:
-        found.add("picture", f"{where}: {error}")
     for frame, encoded in enumerate(segment.encoded_images):
-        if encoded is not None:
-            found.pictures += 1
-            seen.add(encoded, str(data.folder), segment.scene, segment.poses[frame])
+        if encoded is None:
+            continue
+        found.pictures += 1
+        seen.add(encoded, str(data.folder), segment.scene, segment.poses[frame])
+        try:
+            shapes = {image.shape[:2] for image in segment.decode(frame) if image is not None}
+        except FileError as error:
+            found.add("picture", f"{where}: {error}")
+            continue
+        if shapes != {size}:
+            found.add("picture", f"{where}, frame {frame}: expected pictures of {size}, got {sorted(shapes)}")
 
 
 class _Pictures:

@@ -112,6 +112,17 @@ class NavigationSegment:
             encoded_depths=None if self.encoded_depths is None else cut(self.encoded_depths),
         )
 
+    def decode(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:
+        """Return what is stored in a frame with a picture: uint8 [H, W, 3], and depth uint16 [H, W] in millimetres.
+
+        Raises:
+            FileError: the frame has no picture, or a damaged one.
+        """
+        color = self._decode(self.encoded_images, frame, cv2.IMREAD_COLOR)[..., ::-1]
+        if self.encoded_depths is None:
+            return color, None
+        return color, self._decode(self.encoded_depths, frame, cv2.IMREAD_UNCHANGED)
+
     def _show(self, pictures: Sequence[bytes | None], how: int) -> NDArray[Any]:
         decoded = {int(source): self._decode(pictures, int(source), how) for source in np.unique(self.sources)}
         if len({image.shape for image in decoded.values()}) > 1:

@@ -36,6 +36,9 @@ class NavigationRules:
     """The waypoint to go to: the nearest as in the paper, or the one whose distance is closest to 2 m."""
     lookahead: float = 0.5
     """Distance along the shortest path of the point that the agent heads for."""
+    turn_threshold_deg: float = 11.25
+    """The agent turns where its heading is further than this from the point ahead. Half a turn is the least there is;
+    with more, it turns less often back and forth along paths between two headings."""
     goal_radius: float = 0.25
     """A waypoint is reached within this distance."""
     min_island_area: float = 10.0
@@ -51,6 +54,10 @@ class NavigationRules:
                 raise ArgumentError(f"collect: expected {name} above 0, got {getattr(self, name)}")
         if self.mean_weight < 0 or self.min_island_area < 0:
             raise ArgumentError(f"collect: expected mean_weight and min_island_area of 0 or more, got {self}")
+        if not 11.25 <= self.turn_threshold_deg <= 45:
+            raise ArgumentError(
+                f"collect: expected a turn_threshold_deg from 11.25 to 45, got {self.turn_threshold_deg}"
+            )
         if self.visited_radius <= self.goal_radius:
             raise ArgumentError(
                 f"collect: expected a visited_radius above goal_radius ({self.goal_radius} m), or a reached waypoint "

@@ -147,8 +147,8 @@ def measure_coverage(navmesh: NavMesh, samples: NDArray[np.float32], segments: S
 class Follower:
     """An agent that walks shortest paths with forward steps and turns.
 
-    It heads for the point of the path `lookahead` metres ahead: it turns where its heading is over half a turn off,
-    else it steps forward. Where the step is blocked, it tries headings up to `MAX_DETOUR` turns off.
+    It heads for the point of the path `lookahead` metres ahead: it turns where its heading is off by more than the
+    threshold, else it steps forward. Where the step is blocked, it tries headings up to `MAX_DETOUR` turns off.
 
     Args:
         navmesh: that it walks on.
@@ -199,18 +199,26 @@ class Follower:
             yield int(TURN_LEFT if turns > 0 else TURN_RIGHT)
 
     def _find_step(self, waypoint: NDArray[np.float32]) -> tuple[int, NDArray[np.float32]] | None:
-        """Return the heading nearest to the path in which a step is free, and the step's end."""
+        """Return a heading in which a step is free, and the step's end: the present heading where it is close enough to
+        the path, else the one nearest to the path.
+        """
         ahead = find_point_ahead(self._navmesh.shortest_path(self.position, waypoint), self._rules.lookahead)
         away = ahead - self.position
-        bearing = (np.arctan2(-away[0], -away[2]) - self.north) / TURN_RAD
-        nearest = round(float(bearing))
-        side = 1 if bearing >= nearest else -1
-        offsets = [0, *(sign * side * turns for turns in range(1, MAX_DETOUR + 1) for sign in (1, -1))]
-        for heading in ((nearest + offset) % HEADINGS for offset in offsets):
+        bearing = float(np.arctan2(-away[0], -away[2]) - self.north) / TURN_RAD
+        for heading in self._rank_headings(bearing):
             end = self._step_end(heading)
             if end is not None:
                 return heading, end
         return None
+
+    def _rank_headings(self, bearing: float) -> list[int]:
+        """Return the headings to try for a bearing, in turns from north; the best first."""
+        nearest = round(bearing)
+        side = 1 if bearing >= nearest else -1
+        offsets = [0, *(sign * side * turns for turns in range(1, MAX_DETOUR + 1) for sign in (1, -1))]
+        off = abs((self.heading - bearing + HEADINGS / 2) % HEADINGS - HEADINGS / 2) * np.degrees(TURN_RAD)
+        kept = [self.heading] if off <= self._rules.turn_threshold_deg else []
+        return [*kept, *((nearest + offset) % HEADINGS for offset in offsets)]
 
     def _step_end(self, heading: int) -> NDArray[np.float32] | None:
         """Return where a step forward leads, by the rule of environments: None where its end is off the mesh."""

@@ -73,15 +73,15 @@ def _draw_frames(segment: NavigationSegment, count: int) -> list[Image.Image]:
     """Return pictures of `count` frames one after another from the middle of a segment, each with its action."""
     first = max(0, (len(segment) - count) // 2)
     drawn = []
-    for frame in range(first, min(first + count, len(segment))):
-        color = segment.images[frame]
-        parts = [color] if segment.depths is None else [color, color_depth(segment.depths[frame])]
+    clip = segment.clip(first, min(count, len(segment)))
+    for place, color in enumerate(clip.images):
+        parts = [color] if clip.depths is None else [color, color_depth(clip.depths[place])]
         height = (HEIGHT - CAPTION) // len(parts)
         scaled = [_fit(part, (height, 10**4)) for part in parts]
         picture = Image.new("RGB", (scaled[0].width, HEIGHT), PAPER)
-        for place, part in enumerate(scaled):
-            picture.paste(part, (0, place * height))
-        text = f"frame {frame}: {ACTIONS[segment.actions[frame]]}"
+        for number, part in enumerate(scaled):
+            picture.paste(part, (0, number * height))
+        text = f"frame {first + place}: {ACTIONS[segment.actions[first + place]]}"
         ImageDraw.Draw(picture).text((0, HEIGHT - CAPTION + 2), text, INK, ImageFont.load_default(14))
         drawn.append(picture)
     return drawn
