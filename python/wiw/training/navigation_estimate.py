@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
 
 from wiw.datasets.worlds import world
 from wiw.render import resolve_backend
@@ -15,7 +18,7 @@ from wiw.training.navigation_recording import NavigationCollection, find_sources
 from wiw.training.navigation_rules import make_rules
 from wiw.training.traversal import Traversal, plan_scene
 
-SAMPLE_SCENES = 8
+SAMPLE_SCENES = 16
 """Scenes that are planned, spread evenly over all; the rest are taken to be like them."""
 CLIP = 14
 """Frames of the windows that are counted: the paper's clips of SVD."""
@@ -28,6 +31,8 @@ class Estimate:
     scenes: int
     planned_scenes: int
     frames: int
+    frames_error: int
+    """Standard error of `frames`, as scenes differ; 0 where all are planned."""
     pictures: int
     """Frames that are not after a turn, each with a picture."""
     segments: int
@@ -42,8 +47,9 @@ class Estimate:
 
     def __str__(self) -> str:
         planned = "" if self.planned_scenes == self.scenes else f" (estimated from {self.planned_scenes} of them)"
+        error = f" (standard error {self.frames_error:,})" if self.frames_error else ""
         return (
-            f"{self.scenes} scenes{planned}: {self.frames:,} frames in {self.segments:,} segments, "
+            f"{self.scenes} scenes{planned}: {self.frames:,} frames{error} in {self.segments:,} segments, "
             f"{self.windows:,} windows of {CLIP} frames\n"
             f"coverage {self.coverage:.0%} of the floor within 1 m; {self.dropped} waypoints dropped\n"
             f"{self.pictures:,} pictures, {self.gigabytes:.1f} GB, {self.core_hours:.1f} core hours on this machine"
@@ -113,10 +119,14 @@ def _extrapolate(samples: Sequence[_Sample], scenes: int, passes: int) -> Estima
     traversals = [each for sample in samples for each in sample.traversals]
     lengths = [len(segment) for each in traversals for segment in each.segments]
     area = sum(each.area for each in traversals)
+    by_scene = np.array([sum(each.frames for each in sample.traversals) for sample in samples], np.float64)
+    spread = float(by_scene.std(ddof=1)) if len(samples) > 1 else 0.0
+    unplanned = max(0.0, 1 - len(samples) / scenes)
     return Estimate(
         scenes=scenes,
         planned_scenes=len(samples),
         frames=round(factor * sum(lengths)),
+        frames_error=round(scenes * passes * spread * math.sqrt(unplanned / len(samples))),
         pictures=round(factor * sum(sample.pictures for sample in samples)),
         segments=round(factor * len(lengths)),
         windows=round(factor * sum(max(0, length - CLIP + 1) for length in lengths)),
