@@ -130,7 +130,7 @@ def other_pictures(segment: NavigationSegment) -> Any:
         (change_first(encoded_images=other_pictures), r"picture: .*expected pictures of \(36, 64\)"),
         (lambda segments, rows: segments.pop(), "file: .*expected .* row groups"),
         (recount, "frame: .*expected forward .* as in segments.parquet"),
-        (rename_scene, "split: .*apartments:val/3 is not of the train split"),
+        (rename_scene, "split: .*apartments:val/3 is of split val"),
         (split_scene, "leak: .*pictures are in two_rooms .* and in twin"),
     ],
 )

@@ -389,6 +389,12 @@ def test_files_below_a_folder_of_evaluation_are_refused(tmp_path: Path, two_room
         file.write_text(Path(two_rooms).read_text())
         with pytest.raises(ArgumentError, match=f"which is of {split.lower()}"):
             resolve_train_scenes(file)
+    for scene, split in (("2azQ1b91cZZ", "val"), ("YVUC4YcDtcY", "test")):
+        file = tmp_path / "mp3d" / scene / f"{scene}.glb"
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"")
+        with pytest.raises(ArgumentError, match=f"which is of {split}"):
+            resolve_train_scenes(file)
     with pytest.raises(ArgumentError, match="two_rooms twice"):
         resolve_train_scenes([two_rooms, two_rooms])
     with pytest.raises(ArgumentError, match="got none"):
@@ -443,6 +449,30 @@ def test_a_scene_that_cannot_be_opened_stops_no_other(tmp_path: Path, two_rooms:
         NavigationData(out)
     data = collect_navigation(out, [bad, two_rooms], skip_errors=True, **few)
     assert {row["scene"] for row in data.segments} == {"two_rooms"} and list(data.meta["left_out"]) == ["bad"]
+
+
+def test_a_full_disk_is_told_and_loses_nothing(
+    collected: Path, tmp_path: Path, two_rooms: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is full at the fourth segment; with room again, the same call goes on."""
+    write, written = collecting.write_frames, []
+
+    def run_out(path: Path, *given: Any) -> None:
+        written.append(path)
+        if len(written) == 4:
+            monkeypatch.setattr("wiw.files.os.fsync", fail)
+        write(path, *given)
+
+    def fail(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(collecting, "write_frames", run_out)
+    with pytest.raises(FileError, match=r"cannot be written.*No space left"):
+        collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    monkeypatch.undo()
+    assert len(list(tmp_path.rglob("parts/*/*.parquet"))) == 3 and not list(tmp_path.rglob("*.part"))
+    collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
+    assert contents(tmp_path) == contents(collected)
 
 
 def test_a_damaged_dataset_is_told(collected: Path, tmp_path: Path) -> None:

@@ -34,11 +34,12 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import hash_file, require_pyarrow
+from wiw.datasets.scene_splits import find_evaluation_split, name_scene
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
 from wiw.files import atomic_file
 from wiw.render import resolve_backend
-from wiw.scenes import is_generated, resolve
+from wiw.scenes import resolve
 from wiw.training.jobs import open_folder, run_jobs
 from wiw.training.navigation_recording import HFOV_DEG, NavigationCollection, record_segment
 from wiw.training.navigation_rules import make_rules
@@ -51,7 +52,6 @@ MAX_FILE_BYTES = 500 * 10**6
 """Of a Parquet file, as the Hub and its viewer like it; a single segment may have more."""
 RECORDS, PARTS, DATA = "scenes", "parts", "data"
 """Folders: what is known about each finished pass, segments of unfinished ones, frames."""
-HELD_OUT_SPLITS = ("val", "test", "minival", "validation")
 
 
 def collect_navigation(
@@ -135,7 +135,7 @@ def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[s
     names: dict[str, str] = {}
     for spec in (single for each in given for single in resolve(each)):
         _check_train_split(spec)
-        name = spec if is_generated(spec) else Path(spec).stem
+        name = name_scene(spec)
         if name in names:
             raise ArgumentError(
                 f"collect: expected scenes of different names, got {name} twice ({names[name]}, {spec})"
@@ -147,14 +147,11 @@ def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[s
 
 
 def _check_train_split(spec: str) -> None:
-    """Refuse scenes on which world models are evaluated: those of a split, and files below a folder named so."""
-    split = spec.split(":")[1].partition("/")[0] if is_generated(spec) else ""
-    folders = [] if split else [part.lower() for part in Path(spec).expanduser().absolute().parent.parts]
-    found = [name for name in HELD_OUT_SPLITS if name in (split, *folders)]
-    if found:
+    """Refuse scenes on which world models are evaluated."""
+    if (split := find_evaluation_split(spec)) is not None:
         raise ArgumentError(
-            f"collect: expected scenes of a train split, got {spec}, which is of {found[0]}: evaluation runs there; "
-            "a model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
+            f"collect: expected scenes of a train split, got {spec}, which is of {split}: evaluation runs there; a "
+            "model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
         )
 
 
