@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 
 from wiw.datasets.worlds import world
+from wiw.nav import NavMesh
 from wiw.render import resolve_backend
+from wiw.scenes import is_generated, open_outline
 from wiw.training.collect_navigation import resolve_train_scenes
 from wiw.training.navigation_recording import NavigationCollection, find_sources, record_segment
 from wiw.training.navigation_rules import make_rules
 from wiw.training.traversal import Traversal, plan_scene
 
-SAMPLE_SCENES = 16
-"""Scenes that are planned, spread evenly over all; the rest are taken to be like them."""
+PLANNED_SCENES, RECORDED_SCENES = 32, 4
+"""Scenes of which all paths are planned, and of which one segment is recorded; spread evenly over all."""
 CLIP = 14
 """Frames of the windows that are counted: the paper's clips of SVD."""
 
@@ -64,7 +66,7 @@ def estimate_collection(
     progress: Callable[[str, int, int], None] | None = None,
     **asked: Any,
 ) -> Estimate:
-    """Plan a sample of the scenes, record one segment of each, and extrapolate.
+    """Plan a sample of the scenes, record a segment of a few of them, and extrapolate.
 
     Args:
         scenes: as in `wiw.collect_navigation`.
@@ -79,59 +81,79 @@ def estimate_collection(
     options = NavigationCollection(rules=make_rules(preset, rules), **asked)
     options = replace(options, backend=resolve_backend(options.backend))
     specs = list(resolve_train_scenes(scenes).items())
-    step = max(1.0, len(specs) / SAMPLE_SCENES)
-    chosen = [specs[int(number * step)] for number in range(min(SAMPLE_SCENES, len(specs)))]
-    samples = []
+    chosen = _spread(specs, PLANNED_SCENES)
+    recorded = _spread(chosen, RECORDED_SCENES)
+    plans = []
     for done, (name, spec) in enumerate(chosen, 1):
-        samples.append(_sample_scene(name, spec, options))
+        plans.append(plan_scene(_open_navmesh(spec, options), name, options.seed, 0, options.rules))
         if progress is not None:
             progress(name, done, len(chosen))
-    return _extrapolate(samples, len(specs), options.passes)
+    cost = _record_samples(
+        [
+            (spec, traversals)
+            for (name, spec), traversals in zip(chosen, plans, strict=True)
+            if (name, spec) in recorded
+        ],
+        options,
+    )
+    return _extrapolate(plans, cost, len(specs), options)
+
+
+def _spread(specs: Sequence[tuple[str, str]], count: int) -> list[tuple[str, str]]:
+    """Return so many of the scenes, or all if there are fewer, evenly spread."""
+    step = max(1.0, len(specs) / count)
+    return [specs[int(number * step)] for number in range(min(count, len(specs)))]
+
+
+def _open_navmesh(spec: str, options: NavigationCollection) -> NavMesh:
+    """Return a scene's navigation mesh; an apartment's without its textures and light, in a fraction of the time."""
+    return NavMesh.build(open_outline(spec)) if is_generated(spec) else world(spec, options.backend).navmesh
 
 
 @dataclass(frozen=True)
-class _Sample:
-    traversals: list[Traversal]
-    pictures: int
-    bytes_per_picture: float
-    seconds_per_picture: float
+class _Cost:
+    """Of a picture, on average."""
+
+    bytes: float = 0.0
+    seconds: float = 0.0
 
 
-def _sample_scene(name: str, spec: str, options: NavigationCollection) -> _Sample:
-    place = world(spec, options.backend)
-    traversals = plan_scene(place.navmesh, name, options.seed, 0, options.rules)
-    pictures = sum(_count_pictures(each, options) for each in traversals)
-    if not pictures:
-        return _Sample(traversals, 0, 0.0, 0.0)
-    began = time.process_time()
-    segment = record_segment(place, name, 0, 0, traversals[0], 0, options)
-    seconds, count = time.process_time() - began, sum(each is not None for each in segment.encoded_images)
-    size = sum(len(data or b"") for data in (*segment.encoded_images, *(segment.encoded_depths or ())))
-    return _Sample(traversals, pictures, size / count, seconds / count)
+def _record_samples(scenes: Sequence[tuple[str, Sequence[Traversal]]], options: NavigationCollection) -> _Cost:
+    """Record the first segment of each scene, and return what a picture takes."""
+    size = count = 0
+    seconds = 0.0
+    for spec, traversals in scenes:
+        for traversal in [each for each in traversals if each.segments][:1]:
+            place = world(spec, options.backend)
+            began = time.process_time()
+            segment = record_segment(place, spec, 0, 0, traversal, 0, options)
+            seconds += time.process_time() - began
+            count += sum(each is not None for each in segment.encoded_images)
+            size += sum(len(data or b"") for data in (*segment.encoded_images, *(segment.encoded_depths or ())))
+    return _Cost(size / count, seconds / count) if count else _Cost()
 
 
-def _count_pictures(traversal: Traversal, options: NavigationCollection) -> int:
-    return sum(len(set(find_sources(segment, options).tolist())) for segment in traversal.segments)
-
-
-def _extrapolate(samples: Sequence[_Sample], scenes: int, passes: int) -> Estimate:
-    factor = scenes / len(samples) * passes
-    traversals = [each for sample in samples for each in sample.traversals]
-    lengths = [len(segment) for each in traversals for segment in each.segments]
+def _extrapolate(
+    plans: Sequence[Sequence[Traversal]], cost: _Cost, scenes: int, options: NavigationCollection
+) -> Estimate:
+    factor = scenes / len(plans) * options.passes
+    traversals = [each for plan in plans for each in plan]
+    segments = [segment for each in traversals for segment in each.segments]
     area = sum(each.area for each in traversals)
-    by_scene = np.array([sum(each.frames for each in sample.traversals) for sample in samples], np.float64)
-    spread = float(by_scene.std(ddof=1)) if len(samples) > 1 else 0.0
-    unplanned = max(0.0, 1 - len(samples) / scenes)
+    by_scene = np.array([sum(each.frames for each in plan) for plan in plans], np.float64)
+    spread = float(by_scene.std(ddof=1)) if len(plans) > 1 else 0.0
+    unplanned = max(0.0, 1 - len(plans) / scenes)
+    pictures = factor * sum(len(np.unique(find_sources(segment, options))) for segment in segments)
     return Estimate(
         scenes=scenes,
-        planned_scenes=len(samples),
-        frames=round(factor * sum(lengths)),
-        frames_error=round(scenes * passes * spread * math.sqrt(unplanned / len(samples))),
-        pictures=round(factor * sum(sample.pictures for sample in samples)),
-        segments=round(factor * len(lengths)),
-        windows=round(factor * sum(max(0, length - CLIP + 1) for length in lengths)),
+        planned_scenes=len(plans),
+        frames=round(factor * sum(map(len, segments))),
+        frames_error=round(scenes * options.passes * spread * math.sqrt(unplanned / len(plans))),
+        pictures=round(pictures),
+        segments=round(factor * len(segments)),
+        windows=round(factor * sum(max(0, len(segment) - CLIP + 1) for segment in segments)),
         coverage=sum(each.coverage * each.area for each in traversals) / area,
         dropped=round(factor * sum(each.dropped for each in traversals)),
-        gigabytes=factor * sum(sample.pictures * sample.bytes_per_picture for sample in samples) / 1e9,
-        core_hours=factor * sum(sample.pictures * sample.seconds_per_picture for sample in samples) / 3600,
+        gigabytes=pictures * cost.bytes / 1e9,
+        core_hours=pictures * cost.seconds / 3600,
     )
