@@ -19,11 +19,12 @@ from wiw.datasets.imagenav import camera_pose
 from wiw.errors import ArgumentError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
-from wiw.scenes import Scene
+from wiw.scenes import Scene, apartment_table
 from wiw.training.navigation_rules import PRESETS, NavigationRules, make_rules
 from wiw.training.traversal import (
     HEADINGS,
     TURN_RAD,
+    Follower,
     Segment,
     Traversal,
     choose_islands,
@@ -32,7 +33,7 @@ from wiw.training.traversal import (
     plan_scene,
     plan_traversal,
 )
-from wiw.training.waypoints import Waypoints
+from wiw.training.waypoints import Waypoints, find_connected
 
 SMALL = NavigationRules(min_samples=80, density=2, spacing=1.5, leaf_ratio=0.5)
 pillars = st.tuples(st.floats(0.5, 6), st.floats(0.5, 4), st.floats(0.2, 2), st.floats(0.2, 2), st.floats(0, 1.5))
@@ -182,6 +183,18 @@ def leaf_score(distances: Any, index: int, among: Any) -> float:
     return max(metres) + 1.7 * sum(metres) / (len(metres) - 1)
 
 
+def test_a_sample_that_no_path_leads_to_is_left_out() -> None:
+    """One of these 1400 samples lies on the edge of a wall, and is at an infinite distance from all others."""
+    navmesh = NavMesh.build(apartment_table(496, "train"))
+    samples = navmesh.sample(1400, 1, 0)
+    distances = navmesh.distance_matrix(samples)
+    alone = np.flatnonzero(np.isfinite(distances).sum(axis=1) == 1)
+    assert len(alone) == 1
+    waypoints = Waypoints(navmesh, 0, 1, NavigationRules())
+    np.testing.assert_array_equal(waypoints.samples, np.delete(samples, alone, axis=0))
+    assert find_connected(np.array([[0, np.inf, 1], [np.inf, 0, np.inf], [1, np.inf, 0]])).tolist() == [0, 2]
+
+
 def test_candidates_are_the_most_peripheral_waypoints() -> None:
     navmesh = NavMesh.build(room([]))
     few = Waypoints(navmesh, 0, 5, replace(SMALL, leaf_ratio=0.02))
@@ -217,12 +230,30 @@ def test_frames_are_capped() -> None:
     assert max(map(len, short.segments)) == 6 and short.dropped == 0
 
 
+def test_a_start_that_no_step_leads_out_of_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first two starts are nooks: the third is taken, and the two are counted."""
+    navmesh = NavMesh.build(room([]))
+    tried: list[Any] = []
+    can_step = Follower.can_step
+
+    def refuse_twice(self: Follower) -> bool:
+        tried.append(self.position)
+        return len(tried) > 2 and can_step(self)
+
+    monkeypatch.setattr(Follower, "can_step", refuse_twice)
+    traversal = plan_traversal(navmesh, 0, 1, SMALL)
+    assert traversal.dropped == 2 and traversal.frames > 50
+    np.testing.assert_array_equal(traversal.segments[0].positions[0], tried[2])
+    for start in tried[:2]:
+        assert not any((segment.waypoint == start).all() for segment in traversal.segments)
+
+
 def test_a_waypoint_that_cannot_be_reached_is_dropped_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No step is free: nothing is recorded, nothing moves, and every waypoint but the start is counted."""
+    """No step is free: nothing is recorded, nothing moves, and every waypoint is counted."""
     navmesh = NavMesh.build(room([]))
     monkeypatch.setattr("wiw.training.traversal.Follower._step_end", lambda self, heading: None)
     traversal = plan_traversal(navmesh, 0, 1, SMALL)
-    assert traversal.segments == () and traversal.dropped == len(traversal.waypoints) - 1 > 3
+    assert traversal.segments == () and traversal.dropped == len(traversal.waypoints) > 3
     assert traversal.coverage == 0
 
 

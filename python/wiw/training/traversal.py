@@ -116,12 +116,13 @@ def plan_traversal(
         max_frames: at most so many frames, if that is less than the rules allow.
     """
     waypoints = Waypoints(navmesh, island, core.fold_key([key, 0]), rules)
-    chance, turn = core.uniform(core.fold_key([key, 1]), 2)
-    current = int(waypoints.unvisited[int(chance * len(waypoints.unvisited))])
-    follower = Follower(navmesh, waypoints.samples[current], 2 * np.pi * float(turn), rules)
+    north = 2 * np.pi * float(core.uniform(core.fold_key([key, 1]), 1)[0])
+    follower, current, dropped = _start(navmesh, waypoints, core.fold_key([key, 2]), north, rules)
     segments: list[Segment] = []
-    left, dropped = min(max_frames or rules.max_scene_frames, rules.max_scene_frames), 0
-    while left >= 2 and (following := waypoints.find_next(follower.position, current)) is not None:
+    left = min(max_frames or rules.max_scene_frames, rules.max_scene_frames)
+    while (
+        left >= 2 and follower.can_step() and (following := waypoints.find_next(follower.position, current)) is not None
+    ):
         segment = follower.follow(waypoints.samples[following], min(left, rules.max_segment_frames))
         waypoints.mark_visited(segment.positions)
         if segment.ending != "reached":
@@ -134,6 +135,24 @@ def plan_traversal(
     coverage = measure_coverage(navmesh, waypoints.samples, segments)
     area = float(navmesh.islands[island].area)
     return Traversal(island, follower.north, tuple(segments), waypoints.points, dropped, area, coverage)
+
+
+def _start(
+    navmesh: NavMesh, waypoints: Waypoints, key: int, north: float, rules: NavigationRules
+) -> tuple[Follower, int, int]:
+    """Place the agent on a random waypoint; return it with the waypoint's index and the number of waypoints dropped.
+
+    Waypoints lie at the periphery, some in nooks shorter than a step, out of which no heading leads.
+    """
+    starts = waypoints.unvisited
+    dropped = 0
+    for index in starts[np.argsort(core.uniform(key, len(starts)))]:
+        follower = Follower(navmesh, waypoints.samples[index], north, rules)
+        if follower.can_step():
+            break
+        waypoints.drop(int(index))
+        dropped += 1
+    return follower, int(index), dropped
 
 
 def measure_coverage(navmesh: NavMesh, samples: NDArray[np.float32], segments: Sequence[Segment]) -> float:
@@ -160,6 +179,10 @@ class Follower:
     def __init__(self, navmesh: NavMesh, position: NDArray[np.float32], north: float, rules: NavigationRules) -> None:
         self._navmesh, self._rules = navmesh, rules
         self.position, self.heading, self.north = np.asarray(position, np.float32), 0, north
+
+    def can_step(self) -> bool:
+        """Return whether a step is free in any heading."""
+        return any(self._step_end(heading) is not None for heading in range(HEADINGS))
 
     def follow(self, waypoint: NDArray[np.float32], max_frames: int) -> Segment:
         """Walk to a waypoint [3]; end there, where the agent is stuck, or after `max_frames` frames."""
