@@ -242,6 +242,31 @@ def test_frames_are_capped() -> None:
     assert max(map(len, short.segments)) == 6 and short.dropped == 0
 
 
+def test_a_way_is_searched_for_where_no_heading_near_the_path_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The agent finds every waypoint by searching alone, and comes closer each time."""
+    navmesh = NavMesh.build(room([(3, 2.5, 2, 1, 0.4)]))
+    monkeypatch.setattr(Follower, "_find_step", lambda self, waypoint: None)
+    traversal = plan_traversal(navmesh, 0, 1, SMALL)
+    assert traversal.dropped == 0 and len(traversal.segments) > 3
+    for segment in traversal.segments:
+        check_motion(segment)
+        assert segment.ending == "reached"
+        path = navmesh.geodesic_distance(segment.positions[0], segment.waypoint)
+        assert 0.2 * (segment.actions == FORWARD).sum() < 2 * path + 0.4, "turns cost, too"
+
+
+def test_a_search_that_finds_nothing_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The way back is free, but after so many steps the waypoint is dropped; what was recorded is kept."""
+    navmesh = NavMesh.build(room([]))
+    monkeypatch.setattr("wiw.training.traversal.SEARCH_STEPS", 30)
+    monkeypatch.setattr("wiw.training.traversal.SEARCH_GAIN", 2.0)
+    find = Follower._find_step
+    monkeypatch.setattr(Follower, "_find_step", lambda self, at: find(self, at) if at[0] < 3 else None)
+    traversal = plan_traversal(navmesh, 0, 1, SMALL)
+    assert traversal.dropped > 0 and traversal.frames > 20
+    assert all(segment.waypoint[0] < 3 for segment in traversal.segments)
+
+
 def test_a_start_that_no_step_leads_out_of_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first two starts are nooks: the third is taken, and the two are counted."""
     navmesh = NavMesh.build(room([]))

@@ -7,6 +7,7 @@ agent is never moved in any other way: a segment begins with the pose in which t
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import blake2b
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.action import FORWARD, NULL, TURN_LEFT, TURN_RIGHT, ActionSpace
-from wiw.nav import NavMesh
+from wiw.nav import DistanceField, NavMesh
 from wiw.training.navigation_rules import NavigationRules
 from wiw.training.waypoints import Waypoints
 
@@ -30,7 +31,13 @@ COVERAGE_RADIUS = 1.0
 MAX_DETOUR = 3
 """Turns away from the path that the agent tries where the step ahead is blocked."""
 PATIENCE = 20
-"""Forward steps without coming closer to the waypoint, after which the agent is stuck."""
+"""Forward steps without coming closer to the waypoint, after which a way is searched for."""
+SEARCH_GAIN = 0.2
+"""Metres that a searched way must bring the agent closer than it has been."""
+SEARCH_STEPS = 4000
+"""Steps that a search tries before the agent counts as stuck."""
+SEARCH_CELL = 0.05
+"""Metres: a search takes positions within one cell as one."""
 
 Ending = Literal["reached", "stuck", "cap"]
 
@@ -167,7 +174,8 @@ class Follower:
     """An agent that walks shortest paths with forward steps and turns.
 
     It heads for the point of the path `lookahead` metres ahead: it turns where its heading is off by more than the
-    threshold, else it steps forward. Where the step is blocked, it tries headings up to `MAX_DETOUR` turns off.
+    threshold, else it steps forward. Where the step is blocked, it tries headings up to `MAX_DETOUR` turns off. Where
+    none is free, as in nooks hardly wider than a step, it searches for the fewest actions that bring it closer.
 
     Args:
         navmesh: that it walks on.
@@ -205,18 +213,41 @@ class Follower:
         best, waited = float("inf"), 0
         while (metres := float(remaining(self.position))) > self._rules.goal_radius:
             best, waited = (metres, 0) if metres < best - 1e-3 else (best, waited + 1)
-            step = self._find_step(waypoint)
-            if waited > PATIENCE or step is None:
+            step = self._find_step(waypoint) if waited <= PATIENCE else None
+            steps = self._search_steps(remaining, best - SEARCH_GAIN) if step is None else [step]
+            if not steps:
                 yield "stuck"
                 return
-            heading, end = step
-            yield from self._turn_to(heading)
-            self.position = end
-            yield int(FORWARD)
+            for heading, end in steps:
+                yield from self._turn_to(heading)
+                self.position = end
+                yield int(FORWARD)
         yield "reached"
 
+    def _search_steps(self, remaining: DistanceField, metres: float) -> list[tuple[int, NDArray[np.float32]]]:
+        """Return the headings and ends of steps to within a distance of the waypoint, by few actions; or none.
+
+        A* over positions: what is left of the path in steps never overestimates the actions to come.
+        """
+        start = _cell(self.position)
+        came: dict[_Cell, _Reached | None] = {start: None}
+        queue = [(0.0, 0, 0, self.heading, start, self.position)]
+        while queue and len(came) < SEARCH_STEPS:
+            _, _, actions, facing, cell, position = heapq.heappop(queue)
+            if remaining(position) <= metres:
+                return _trace_steps(came, cell)
+            for heading in range(HEADINGS):
+                end = self._step_end(heading, position)
+                if end is None or (following := _cell(end)) in came:
+                    continue
+                came[following] = cell, heading, end
+                cost = actions + 1 + abs(_count_turns(facing, heading))
+                ahead = cost + float(remaining(end)) / STEP_M
+                heapq.heappush(queue, (ahead, len(came), cost, heading, following, end))  # the number breaks ties
+        return []
+
     def _turn_to(self, heading: int) -> Iterator[int]:
-        turns = (heading - self.heading + HEADINGS // 2) % HEADINGS - HEADINGS // 2
+        turns = _count_turns(self.heading, heading)
         for _ in range(abs(turns)):
             self.heading = (self.heading + (1 if turns > 0 else -1)) % HEADINGS
             yield int(TURN_LEFT if turns > 0 else TURN_RIGHT)
@@ -243,11 +274,35 @@ class Follower:
         kept = [self.heading] if off <= self._rules.turn_threshold_deg else []
         return [*kept, *((nearest + offset) % HEADINGS for offset in offsets)]
 
-    def _step_end(self, heading: int) -> NDArray[np.float32] | None:
+    def _step_end(self, heading: int, start: NDArray[np.float32] | None = None) -> NDArray[np.float32] | None:
         """Return where a step forward leads, by the rule of environments: None where its end is off the mesh."""
         yaw = self.north + heading * TURN_RAD
-        end = (self.position.astype(np.float64) + STEP_M * np.array([-np.sin(yaw), 0, -np.cos(yaw)])).astype(np.float32)
+        position = self.position if start is None else start
+        end = (position.astype(np.float64) + STEP_M * np.array([-np.sin(yaw), 0, -np.cos(yaw)])).astype(np.float32)
         return np.asarray(self._navmesh.snap(end), np.float32) if self._navmesh.is_navigable(end) else None
+
+
+_Cell = tuple[int, ...]
+_Reached = tuple[_Cell, int, NDArray[np.float32]]
+"""The cell that a step began in, its heading, and its end."""
+
+
+def _cell(position: NDArray[np.float32]) -> _Cell:
+    return tuple(np.rint(position / SEARCH_CELL).astype(int).tolist())
+
+
+def _trace_steps(came: dict[_Cell, _Reached | None], cell: _Cell) -> list[tuple[int, NDArray[np.float32]]]:
+    """Return the steps that a search took to a cell, in order."""
+    steps = []
+    while (step := came[cell]) is not None:
+        cell, heading, end = step
+        steps.append((heading, end))
+    return steps[::-1]
+
+
+def _count_turns(heading: int, other: int) -> int:
+    """Return the turns from one heading to another, left ones positive, -8 to 7."""
+    return (other - heading + HEADINGS // 2) % HEADINGS - HEADINGS // 2
 
 
 def find_point_ahead(path: NDArray[np.float32], distance: float) -> NDArray[np.float64]:
