@@ -100,28 +100,34 @@ def collect_navigation(
         for number, (name, spec) in enumerate(specs.items())
         for index in range(options.passes)
     ]
-    records = {job.number: record for job in jobs if (record := job.read_record()) is not None}
-    tally = _Tally(len(jobs), progress)
-    for job in jobs:
-        if job.number in records:
-            tally.add(job.scene, records[job.number])
-    pending = [job for job in jobs if job.number not in records]
-    errors: dict[str, str] = {}
-    for job, record in run_jobs(pending, workers):
-        if "error" in record:
-            errors[job.scene] = record["error"]
-        else:
-            records[job.number] = record
-            tally.add(job.scene, record)
+    finished = {job.number: record for job in jobs if (record := job.read_record()) is not None}
+    records, errors = _record_passes(jobs, finished, workers, progress)
     if errors and not skip_errors:
         raise InfrastructureError(
             f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
             + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
             + ". Mend them and repeat the command, or leave them out with --skip-errors"
         )
-    if pending or not (folder / META).exists():
+    if len(finished) < len(jobs) or not (folder / META).exists():
         _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
     return NavigationData(folder)
+
+
+def _record_passes(
+    jobs: Sequence[SceneJob], finished: Mapping[int, dict[str, Any]], workers: int, progress: Progress | None
+) -> tuple[dict[int, dict[str, Any]], dict[str, str]]:
+    """Record the passes that are not finished; return the records of all by number, and errors by scene."""
+    records, errors, tally = dict(finished), dict[str, str](), _Tally(len(jobs), progress)
+    for job in jobs:
+        if job.number in finished:
+            tally.add(job.scene, finished[job.number])
+    for job, record in run_jobs([job for job in jobs if job.number not in finished], workers):
+        if "error" in record:
+            errors[job.scene] = record["error"]
+        else:
+            records[job.number] = record
+            tally.add(job.scene, record)
+    return records, errors
 
 
 def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[str]]) -> dict[str, str]:
