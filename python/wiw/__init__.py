@@ -32,6 +32,7 @@ __all__ = [
     "blame",
     "check_model",
     "collect",
+    "collect_navigation",
     "compare",
     "envs",
     "errors",
@@ -69,6 +70,7 @@ _HOME = {
     "blame": "wiw.studies.blame",
     "check_model": "wiw.studies.model_check",
     "collect": "wiw.training.collect",
+    "collect_navigation": "wiw.training.collect_navigation",
     "compare": "wiw.studies.compare",
     "evaluate": "wiw.studies.evaluate",
     "judge": "wiw.studies.judge",
@@ -141,6 +143,7 @@ if TYPE_CHECKING:
     from wiw.studies.scale import scale
     from wiw.tasks.base import Task
     from wiw.training.collect import collect
+    from wiw.training.collect_navigation import collect_navigation
     from wiw.viz.show import show
     from wiw.world_models.base import Accepts, WorldModel, accepts
 

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NoReturn
 
 import tyro
@@ -12,8 +13,10 @@ import tyro
 import wiw
 from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
-from wiw.cli.collect import collect
+from wiw.cli.collect_manipulation import collect_manipulation
+from wiw.cli.collect_navigation import collect_navigation
 from wiw.cli.compare import compare
+from wiw.cli.data import show_data, stats_data, verify_data
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
@@ -74,9 +77,51 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (scenes, "scenes", "Draw scenes and print their sizes."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
-    (collect, "collect", "Collect demonstrations of manipulation tasks as training data."),
     (train, "train", "Train a network: recogniser, warpnet, perception, armnet or diffuser."),
 )
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands of two words."""
+
+    line: str
+    """What they do, in the list of commands."""
+    description: str
+    commands: tuple[tuple[Callable[..., int], str, str], ...]
+    default: str | None = None
+    """The second word where none is given."""
+
+
+GROUPS: Mapping[str, Group] = {
+    "collect": Group(
+        "Collect training data: navigation in scenes, or demonstrations of manipulation tasks.",
+        """Collect training data. To resume an interrupted collection, repeat the command.
+
+  $ wiw collect navigation --scenes apartments:train:80 --out data --workers 4
+  $ wiw collect manipulation --out demos --workers 4
+
+`wiw collect WHAT --help` explains each with examples.""",
+        (
+            (collect_navigation, "navigation", "Panoramas with depth, poses and actions along paths through scenes."),
+            (collect_manipulation, "manipulation", "Demonstrations of manipulation tasks by scripted experts."),
+        ),
+        default="manipulation",
+    ),
+    "data": Group(
+        "Check, summarise or draw a navigation dataset.",
+        """Check, summarise or draw a dataset of `wiw collect navigation`.
+
+  $ wiw data verify data
+  $ wiw data stats data
+  $ wiw data show data --out data.png""",
+        (
+            (verify_data, "verify", "Check every file, frame and split."),
+            (stats_data, "stats", "Print frames, actions, lengths, coverage and sizes."),
+            (show_data, "show", "Draw maps of what is covered, and a contact sheet of clips."),
+        ),
+    ),
+}
 
 EXIT_CRASH, EXIT_ERROR, EXIT_INTERRUPTED = 1, 2, 130
 
@@ -130,10 +175,36 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _dispatch(arguments: Sequence[str]) -> Any:
+    name, *rest = arguments or ["--help"]
+    if name in GROUPS:
+        return _dispatch_group(name, rest)
     app = tyro.extras.SubcommandApp()
-    named = any(argument in [name for _, name, _ in COMMANDS] for argument in arguments[:1])
-    for function, name, line in COMMANDS:
-        app.command(name=name, help=None if named else line)(function)  # None: the function's own docstring
+    named = any(name == known for _, known, _ in COMMANDS)
+    for function, known, line in COMMANDS:
+        app.command(name=known, help=None if named else line)(function)  # None: the function's own docstring
+    for known, group in GROUPS.items():
+        app.command(name=known, help=group.line)(_name_group)
+    return _run_app(app, "wiw", DESCRIPTION, [name, *rest])
+
+
+def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
+    group = GROUPS[name]
+    known = [each for _, each, _ in group.commands]
+    given = list(arguments) or ["--help"]
+    if group.default and given[0] not in (*known, "-h", "--help") and given[0].startswith("-"):
+        given = [group.default, *given]
+    app = tyro.extras.SubcommandApp()
+    for function, each, line in group.commands:
+        app.command(name=each, help=None if given[0] in known else line)(function)
+    return _run_app(app, f"wiw {name}", group.description, given)
+
+
+def _name_group() -> int:
+    """Stand for a group in the list of commands."""
+    raise AssertionError("commands of two words are dispatched before")
+
+
+def _run_app(app: tyro.extras.SubcommandApp, prog: str, description: str, arguments: Sequence[str]) -> Any:
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.HelptextFromCommentsOff)
     with make_registry():
-        return app.cli(prog="wiw", description=DESCRIPTION, args=arguments or ["--help"], config=config)
+        return app.cli(prog=prog, description=description, args=arguments, config=config)

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration
+from wiw.datasets.parquet_files import MANIFEST
 from wiw.datasets.shards import Shard, require_pyarrow
 from wiw.errors import ArgumentError, FileError
 
-MANIFEST = "manifest.json"
 SHARD = 10
 """Demonstrations a file."""
 QUALITY = 95

@@ -10,13 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from wiw.datasets import parquet_files
 from wiw.datasets.demonstration import Demonstration
-from wiw.errors import DependencyError, FileError
-from wiw.files import atomic_file
+from wiw.datasets.parquet_files import RowGroupFile, build_schema, image_type, image_values, write_row_groups
 
 FORMAT = 1
-KEY = b"wiw"
-"""Of the metadata, which are JSON."""
 COLUMNS: Mapping[str, str] = {
     "task": "which kind of manipulation it is",
     "variation": "number of the combination of colours, counts and targets",
@@ -44,10 +42,7 @@ def require_pyarrow() -> None:
     Raises:
         DependencyError: pyarrow is not installed.
     """
-    from importlib.util import find_spec
-
-    if find_spec("pyarrow") is None:
-        raise DependencyError("demonstrations are Parquet files, which need pyarrow: pip install 'wiw[export]'")
+    parquet_files.require_pyarrow("demonstrations")
 
 
 def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[str, Any]) -> None:
@@ -61,17 +56,13 @@ def write(path: Path, demonstrations: Sequence[Demonstration], facts: Mapping[st
     Raises:
         FileError: it cannot be written, for instance because the disk is full.
     """
-    from pyarrow import parquet
-
     depth = demonstrations[0].encoded_depths is not None
     schema = _schema(depth, facts)
-    how = {"use_dictionary": list(REPEATED), "compression": _packing(depth), "write_page_checksum": True}
-    with atomic_file(path) as draft, parquet.ParquetWriter(draft, schema, **how) as file:
-        for each in demonstrations:
-            file.write_table(_table(each, schema), row_group_size=len(each))
+    tables = (_table(each, schema) for each in demonstrations)
+    write_row_groups(path, schema, tables, use_dictionary=list(REPEATED), compression=_packing(depth))
 
 
-class Shard:
+class Shard(RowGroupFile):
     """A file that is read demonstration by demonstration.
 
     Raises:
@@ -79,21 +70,7 @@ class Shard:
     """
 
     def __init__(self, path: Path) -> None:
-        from pyarrow import ArrowException, parquet
-
-        self.path = path
-        try:
-            self._metadata = parquet.read_metadata(path)
-            self.facts: dict[str, Any] = json.loads(self._metadata.metadata[KEY])
-        except FileNotFoundError as error:
-            raise FileError(f"{path} is missing; make it with `wiw collect`, asked for the same again") from error
-        except (OSError, ArrowException, KeyError, TypeError, ValueError) as error:
-            raise _build_damage_error(path, error) from error
-        if self.facts.get("format") != FORMAT:
-            raise FileError(f"{path}: expected demonstrations of format {FORMAT}, got {self.facts.get('format')}")
-
-    def __len__(self) -> int:
-        return int(self._metadata.num_row_groups)
+        super().__init__(path, FORMAT, "demonstrations")
 
     def __getitem__(self, index: int) -> Demonstration:
         """Return a demonstration, whose pictures are not yet decoded.
@@ -101,26 +78,17 @@ class Shard:
         Raises:
             FileError: the file is damaged.
         """
-        from pyarrow import ArrowException, parquet
-
+        rows = self.read(index).to_pydict()
         try:
-            with parquet.ParquetFile(self.path, metadata=self._metadata, page_checksum_verification=True) as file:
-                return _demonstration(file.read_row_group(index).to_pydict())
-        except (OSError, ArrowException, LookupError, TypeError, ValueError) as error:
-            raise _build_damage_error(self.path, error) from error
-
-
-def _build_damage_error(path: Path, error: Exception) -> FileError:
-    return FileError(
-        f"{path}: expected a whole file of demonstrations, got a damaged one ({error}); delete it, then `wiw collect`, "
-        "asked for the same again, makes it anew"
-    )
+            return _demonstration(rows)
+        except (LookupError, TypeError, ValueError) as error:
+            raise self.build_damage_error(error) from error
 
 
 def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
     import pyarrow as pa
 
-    picture = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    picture = image_type()
     pose = pa.list_(pa.float64(), 7)
     types = {
         "task": pa.string(),
@@ -141,23 +109,7 @@ def _schema(depth: bool, facts: Mapping[str, Any]) -> Any:
     }
     if not depth:
         del types["depth"]
-    about = {"format": FORMAT, **facts, "columns": {name: COLUMNS[name] for name in types}}
-    metadata = {KEY: json.dumps(about).encode(), b"huggingface": json.dumps(_features(types)).encode()}
-    return pa.schema(list(types.items()), metadata=metadata)
-
-
-def _features(types: Mapping[str, Any]) -> dict[str, Any]:
-    """Return column metadata for the library `datasets`, so that it decodes pictures by itself."""
-    import pyarrow as pa
-
-    def feature(kind: Any) -> dict[str, Any]:
-        if pa.types.is_struct(kind):
-            return {"_type": "Image"}
-        if pa.types.is_fixed_size_list(kind):
-            return {"feature": {"dtype": "float64", "_type": "Value"}, "length": 7, "_type": "Sequence"}
-        return {"dtype": {"double": "float64"}.get(str(kind), str(kind)), "_type": "Value"}
-
-    return {"info": {"features": {name: feature(kind) for name, kind in types.items()}}}
+    return build_schema(types, {"format": FORMAT, **facts, "columns": {name: COLUMNS[name] for name in types}})
 
 
 def _packing(depth: bool) -> dict[str, str]:
@@ -172,7 +124,6 @@ def _table(demonstration: Demonstration, schema: Any) -> Any:
     import pyarrow as pa
 
     each, count = demonstration, len(demonstration)
-    pictures = [{"bytes": data, "path": None} for data in each.encoded_images]
     columns: dict[str, Any] = {
         "task": [each.task] * count,
         "variation": [each.variation] * count,
@@ -187,10 +138,10 @@ def _table(demonstration: Demonstration, schema: Any) -> Any:
         "ended": each.ended,
         "success": [each.success] * count,
         "places": [json.dumps({name: pose.tolist() for name, pose in each.places.items()})] * count,
-        "image": pictures,
+        "image": image_values(each.encoded_images),
     }
     if each.encoded_depths is not None:
-        columns["depth"] = [{"bytes": data, "path": None} for data in each.encoded_depths]
+        columns["depth"] = image_values(each.encoded_depths)
     return pa.table([pa.array(columns[name], schema.field(name).type) for name in schema.names], schema=schema)
 
 

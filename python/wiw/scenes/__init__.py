@@ -30,6 +30,7 @@ __all__ = [
     "apartment_table",
     "is_generated",
     "load",
+    "open_outline",
     "open_scene",
     "possible_edits",
     "resolve",
@@ -248,4 +249,12 @@ def open_scene(name: str) -> Scene:
     if is_generated(name):
         seed, split, edits = _parse_single(name)
         return apartment(seed, split, edits=edits)
+    return load(name)
+
+
+def open_outline(name: str) -> Scene:
+    """Load one scene of `resolve`, an apartment without its textures and light (`apartment_table`)."""
+    if is_generated(name):
+        seed, split, edits = _parse_single(name)
+        return apartment_table(seed, split, edits=edits)
     return load(name)

@@ -7,16 +7,8 @@ complete. An interrupted collection therefore resumes, and ends with the same fi
 
 from __future__ import annotations
 
-import json
-import os
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +16,12 @@ import numpy as np
 
 import wiw
 from wiw.datasets import shards
-from wiw.datasets.demonstrations import MANIFEST, Demonstrations, read_manifest, shard_paths, shard_range
-from wiw.errors import ArgumentError, FileError, InfrastructureError
-from wiw.files import atomic_file, remove_abandoned_drafts
+from wiw.datasets.demonstrations import Demonstrations, read_manifest, shard_paths, shard_range
+from wiw.errors import ArgumentError, FileError
 from wiw.render import resolve_backend
 from wiw.tabletop.tasks import TABLETOP_TASKS
 from wiw.tabletop.workbench import CAMERAS
+from wiw.training.jobs import open_folder, run_jobs
 from wiw.training.recording import Collection, record_demonstration
 
 Progress = Callable[[str, int, int, int], None]
@@ -67,7 +59,7 @@ def collect(
     if workers < 1:
         raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
     config = {"wiw": wiw.__version__, "tasks": names, **asdict(collection)}
-    _open_folder(folder, config)
+    open_folder(folder, config, read_manifest)
     paths = zip(*(shard_paths(folder, config, task) for task in names), strict=True)
     jobs = [  # in turn, so that what a stopped collection has is of all tasks alike
         _Job(task, shard_range(number, collection.episodes), path, collection)
@@ -79,7 +71,7 @@ def collect(
     for job, failed in before.items():
         if failed is not None:
             tally.add(job, failed)
-    for job, failed in _run_jobs([job for job in jobs if before[job] is None], workers):
+    for job, failed in run_jobs([job for job in jobs if before[job] is None], workers):
         tally.add(job, failed)
     return Demonstrations(folder)
 
@@ -100,7 +92,7 @@ class _Job:
         except FileError:
             return None
 
-    def write_file(self) -> int:
+    def run(self) -> int:
         """Write the file; return the number of tables failed at."""
         made = [record_demonstration(TABLETOP_TASKS[self.task], episode, self.collection) for episode in self.episodes]
         failed = sum(failed for _, failed in made)
@@ -147,57 +139,3 @@ def _describe_camera(size: int) -> dict[str, Any]:
         "T_world_camera": camera.pose.tolist(),
         "axes": "looks along -z, +x right, +y up; world z up; metres; centres of pixels at + 0.5",
     }
-
-
-# -- the folder --------------------------------------------------------------------------------------------------------
-
-
-def _open_folder(folder: Path, config: Mapping[str, Any]) -> None:
-    """Create the folder with its manifest, or check that the manifest there describes the same collection."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_abandoned_drafts(folder)
-        if not any(folder.iterdir()):
-            with atomic_file(folder / MANIFEST) as draft:
-                draft.write_text(json.dumps(config, indent=2) + "\n")
-    except OSError as error:
-        raise FileError(f"{folder}: cannot be written ({error.strerror}); name another folder with --out") from error
-    before = read_manifest(folder)
-    if differing := [name for name in {**config, **before} if before.get(name) != config.get(name)]:
-        said = ", ".join(f"{name} {before.get(name)} there and {config.get(name)} asked" for name in differing)
-        raise ArgumentError(f"{folder} holds another collection: {said}; ask for the same, or name another with --out")
-
-
-# -- workers -----------------------------------------------------------------------------------------------------------
-
-
-def _run_jobs(jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, int]]:
-    """Yield jobs as they finish, with the number of tables failed at."""
-    if workers == 1 or len(jobs) <= 1:
-        for job in jobs:
-            yield job, job.write_file()
-        return
-    context, count = get_context("spawn"), min(workers, len(jobs))
-    life, ours = context.Pipe(duplex=False)
-    threads = max(1, len(os.sched_getaffinity(0)) // count)
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker, initargs=(life, threads))
-    try:
-        running = {pool.submit(job.write_file): job for job in jobs}
-        for each in as_completed(running):
-            yield running[each], each.result()
-    except BrokenProcessPool as error:
-        raise InfrastructureError(
-            "collect: a worker process died, perhaps for lack of memory; run the same again, with fewer workers"
-        ) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        ours.close()
-
-
-def _start_worker(life: Connection, threads: int) -> None:
-    """Initialise a worker process; it exits as soon as the other end of `life` is closed, even if its owner was
-    killed.
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
-    os.environ.setdefault("WIW_NUM_THREADS", str(threads))
-    threading.Thread(target=lambda: (wait([life]), os._exit(1)), daemon=True).start()

@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw collect`."""
+"""`wiw collect manipulation`."""
 
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import arg
 
+from wiw.cli.bars import Bars
 from wiw.cli.stop import announce_resume
 
 
-def collect(
-    what: Positional[Annotated[Literal["manipulation"], arg(metavar="WHAT")]] = "manipulation",
-    /,
+def collect_manipulation(
     *,
     out: Annotated[Path, arg(metavar="DIR")] = Path("demonstrations"),
     tasks: Annotated[str, arg(metavar="NAMES")] = "all",
@@ -39,7 +39,6 @@ def collect(
     interrupted collection, repeat the command.
 
     Args:
-        what: manipulation.
         out: New folder, or one that the same command began.
         tasks: all, or push_buttons, slide_block, insert_peg, stack_cups with commas between them.
         episodes: Demonstrations per task.
@@ -57,8 +56,8 @@ def collect(
     began = time.monotonic()
     what_of_it = {"episodes": episodes, "seed": seed, "keep_failed": keep_failed}
     how_seen = {"size": size, "frames": frames, "format": format, "depth": depth, "backend": backend}
-    with announce_resume(), _Bars() as bars:
-        made = collect(out, tasks, workers=workers, progress=bars, **what_of_it, **how_seen)
+    with announce_resume(), Bars() as bars:
+        made = collect(out, tasks, workers=workers, progress=partial(_show, bars), **what_of_it, **how_seen)
     megabytes = sum(path.stat().st_size for path in out.glob("*.parquet")) / 2**20
     failed = sum(made.failed.values())
     print(
@@ -69,30 +68,5 @@ def collect(
     return 0
 
 
-class _Bars:
-    """A bar for each task; plain lines at quarter marks where the output is no terminal."""
-
-    def __enter__(self) -> _Bars:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        self._console = Console(stderr=True)
-        name, text = TextColumn("[bold]{task.description:<12}"), TextColumn("{task.fields[text]}")
-        times = TimeElapsedColumn(), TextColumn("<"), TimeRemainingColumn()
-        columns = name, BarColumn(bar_width=32), text, *times
-        self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
-        self._tasks: dict[str, Any] = {}
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bars.stop()
-
-    def __call__(self, task: str, done: int, episodes: int, failed: int) -> None:
-        text = f"{done}/{episodes} demonstrations" + (f", {failed} failed" if failed else "")
-        if task not in self._tasks:
-            self._tasks[task] = self._bars.add_task(task, total=episodes, text=text)
-        before = self._bars.tasks[self._tasks[task]].completed
-        self._bars.update(self._tasks[task], completed=done, text=text)
-        if not self._console.is_terminal and 4 * done // episodes > 4 * before // episodes:
-            self._console.print(f"{task}: {text}", highlight=False)
+def _show(bars: Bars, task: str, done: int, episodes: int, failed: int) -> None:
+    bars.show(task, done, episodes, f"{done}/{episodes} demonstrations" + (f", {failed} failed" if failed else ""))

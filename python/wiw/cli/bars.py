@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bars of a collection's progress; plain lines at quarter marks where the output is no terminal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class Bars:
+    """Named bars on the standard error, which appear when they are first shown."""
+
+    def __enter__(self) -> Bars:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        self._console = Console(stderr=True)
+        name, text = TextColumn("[bold]{task.description:<12}"), TextColumn("{task.fields[text]}")
+        times = TimeElapsedColumn(), TextColumn("<"), TimeRemainingColumn()
+        columns = name, BarColumn(bar_width=32), text, *times
+        self._bars = Progress(*columns, console=self._console, disable=not self._console.is_terminal)
+        self._tasks: dict[str, Any] = {}
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def show(self, name: str, done: int, total: int, text: str) -> None:
+        """Move a bar to `done` of `total`, with a text beside it."""
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(name, total=total, text=text)
+        before = self._bars.tasks[self._tasks[name]].completed
+        self._bars.update(self._tasks[name], completed=done, text=text)
+        if not self._console.is_terminal and 4 * done // total > 4 * before // total:
+            self._console.print(f"{name}: {text}", highlight=False)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw data`."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from tyro.conf import Positional, arg
+
+if TYPE_CHECKING:
+    from wiw.datasets.navigation_statistics import NavigationStatistics
+
+Folder = Positional[Annotated[Path, arg(metavar="DIR")]]
+
+
+def verify_data(
+    folders: Positional[Annotated[tuple[Path, ...], arg(metavar="DIR...")]],
+    /,
+    *,
+    quick: bool = False,
+) -> int:
+    """Check every file and frame of a navigation dataset; with several, also that they share no scene.
+
+    $ wiw data verify data
+    $ wiw data verify data --quick
+    $ wiw data verify train held-out
+
+    Files are compared with their SHA-256; frames with the list of segments; poses with the actions that led to them;
+    pictures are decoded, and compared with all others: equal ones of two scenes or datasets are a leak. Exit code 0 if
+    all is sound, 1 otherwise.
+
+    Args:
+        folders: Finished datasets of `wiw collect navigation`.
+        quick: Whether to leave the pictures out, which take most of the time.
+    """
+    from wiw.cli.bars import Bars
+    from wiw.datasets.navigation_check import verify_datasets
+    from wiw.errors import ArgumentError
+
+    if not folders:
+        raise ArgumentError("wiw data verify: expected a dataset's folder, such as `wiw data verify data`, got none")
+    with Bars() as bars:
+        found = verify_datasets(
+            folders, not quick, lambda name, done, total: bars.show("files", done, total, f"{done}/{total}")
+        )
+    print(found)
+    return 0 if found.sound else 1
+
+
+def stats_data(folder: Folder, /, *, clip: Annotated[int, arg(metavar="N")] = 14) -> int:
+    """Print frames, actions, segment lengths, coverage and sizes of a navigation dataset.
+
+    $ wiw data stats data
+    $ wiw data stats data --clip 25
+
+    Args:
+        folder: Finished dataset of `wiw collect navigation`.
+        clip: Frames of the windows to count.
+    """
+    from wiw.datasets.navigation import NavigationData
+    from wiw.datasets.navigation_statistics import compute_statistics
+
+    data = NavigationData(folder)
+    _print_totals(compute_statistics(data), clip)
+    camera = data.meta["camera"]
+    height, width = camera["size"]
+    print(
+        f"\n{camera['projection']} {height} x {width}, {camera['height_m']:g} m above the floor; {data.meta['color']}"
+    )
+    return 0
+
+
+LISTED_SCENES = 10
+"""Those with the least coverage."""
+LENGTHS = (2, 10, 20, 30, 40, 60, 80, 120)
+"""Frames: where the ranges of the histogram of lengths begin."""
+BAR = 40
+"""Characters of the longest bar of a histogram."""
+
+
+def _print_totals(figures: NavigationStatistics, clip: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    totals = figures.totals
+    print(
+        f"{totals['frames']:,} frames ({totals['pictures']:,} pictures, the others after turns) in "
+        f"{totals['segments']:,} segments of {totals['scenes']:,} scenes, {totals['bytes'] / 1e9:.2f} GB\n"
+        f"{figures.count_windows(clip):,} windows of {clip} frames, one frame apart\n"
+    )
+    names = ("forward", "turn_left", "turn_right")
+    _print_bars("actions", [(name, totals.get(name, 0)) for name in names])
+    _print_bars("frames of a segment", _count_lengths(figures))
+    _print_bars("segments that", [(f"ended {name}", count) for name, count in figures.endings.items()])
+    print(f"coverage  {figures.coverage:.1%} of the floor within 1 m; {totals['dropped']} waypoints dropped")
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column in ("least covered scenes", "m2", "frames", "segments", "covered", "dropped"):
+        table.add_column(column, justify="left" if column.startswith("least") else "right")
+    for each in figures.scenes[:LISTED_SCENES]:
+        numbers = f"{each.area:.0f}", str(each.frames), str(each.segments), f"{each.coverage:.0%}", str(each.dropped)
+        table.add_row(each.scene, *numbers)
+    Console().print(table)
+
+
+def _count_lengths(figures: NavigationStatistics) -> list[tuple[str, int]]:
+    """Return the number of segments in each range of lengths."""
+    counts, _ = np.histogram(figures.lengths, [*LENGTHS, np.inf])
+    labels = [f"{low} to {high - 1}" for low, high in pairwise(LENGTHS)] + [f"{LENGTHS[-1]} and more"]
+    return list(zip(labels, counts.tolist(), strict=True))
+
+
+def _print_bars(title: str, counts: list[tuple[str, int]]) -> None:
+    total, largest = sum(count for _, count in counts), max(count for _, count in counts)
+    print(title)
+    for name, count in counts:
+        print(
+            f"  {name:<14} {'#' * round(BAR * count / max(1, largest)):<{BAR}} {count:>9,} {count / max(1, total):6.1%}"
+        )
+    print()
+
+
+def show_data(
+    folder: Folder,
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="FILE")] = Path("data.png"),
+    scenes: Annotated[int, arg(metavar="N")] = 6,
+    frames: Annotated[int, arg(metavar="N")] = 4,
+) -> int:
+    """Draw maps of what a navigation dataset covers, and frames with their actions and depth.
+
+    $ wiw data show data --out data.png
+    $ wiw data show data --scenes 12 --frames 2
+
+    On a map, floor within 1 m of a frame is green, other floor red; the path goes from blue to orange; red dots are the
+    waypoints, the circle is the start.
+
+    Args:
+        folder: Finished dataset of `wiw collect navigation`.
+        out: Where to write the sheet, a PNG.
+        scenes: Number of maps, spread evenly over the dataset.
+        frames: Frames beside each map.
+    """
+    from wiw.datasets.navigation import NavigationData
+    from wiw.errors import ArgumentError
+    from wiw.files import atomic_file
+    from wiw.viz.navigation_sheet import draw_sheet
+
+    data = NavigationData(folder)
+    if scenes < 1 or frames < 1 or not len(data):
+        raise ArgumentError(
+            f"wiw data show: expected 1 scene and 1 frame or more, of a dataset that has some, got {scenes}, {frames} "
+            f"and {len(data)} segments"
+        )
+    sheet = draw_sheet(data, scenes, frames)
+    with atomic_file(out) as draft:
+        sheet.save(draft, format="PNG")
+    print(f"sheet  {out}")
+    return 0

@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The navigation dataset, as `wiw collect navigation` writes it.
+
+    data = NavigationData("data")
+    for segment in data:
+        segment.images, segment.depths, segment.actions, segment.poses
+    clips = data.clips(14)                      # every window of 14 frames; clips[i] reads one row group
+    train, held_out = NavigationData("data", part="train"), NavigationData("data", part="held-out")
+
+`docs/collecting-navigation.md` describes the files.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections.abc import Iterator, Mapping, Sequence
+from hashlib import blake2b
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from wiw.datasets.navigation_files import FORMAT, SEGMENTS, FrameFile, read_segment_list
+from wiw.datasets.navigation_segment import NavigationSegment
+from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
+from wiw.errors import ArgumentError, FileError
+
+META = "meta.json"
+Part = Literal["all", "train", "held-out"]
+
+
+class NavigationData(Sequence[NavigationSegment]):
+    """A folder that `wiw collect navigation` has finished: its segments, scene by scene.
+
+    Args:
+        folder: with `meta.json`.
+        part: "all"; or "train" or "held-out", two parts without a scene in common.
+        held_out: share of the scenes that are held out, chosen by a hash of their names.
+
+    Raises:
+        DependencyError: pyarrow is not installed.
+        FileError: there is no such dataset, it is not finished, or a file of it is missing or damaged.
+        ArgumentError: no such part, or a share that is not one.
+    """
+
+    def __init__(self, folder: str | Path, part: Part = "all", held_out: float = 0.05) -> None:
+        require_pyarrow("navigation datasets")
+        if part not in get_args(Part) or not 0 <= held_out <= 1:
+            raise ArgumentError(
+                f"expected a part among {', '.join(get_args(Part))} and a held_out from 0 to 1, got {part}, {held_out}"
+            )
+        self.folder = Path(folder)
+        self.meta = read_meta(self.folder)
+        """Camera, encoding, rules, scenes and checksums."""
+        rows = read_segment_list(self.folder / SEGMENTS)
+        self.segments = [row for row in rows if part == "all" or part == part_of(row["scene"], held_out)]
+        """What `segments.parquet` says about each segment: scene, file, row group, frames, numbers of actions."""
+        self._files: dict[str, FrameFile] = {}
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return one segment, or a list of those of a slice; only their row groups are read.
+
+        Raises:
+            FileError: a file is missing or damaged.
+        """
+        if isinstance(index, slice):
+            return [self[each] for each in range(*index.indices(len(self)))]
+        return self.read(index)
+
+    def __iter__(self) -> Iterator[NavigationSegment]:
+        return (self.read(index) for index in range(len(self)))
+
+    def read(self, index: int, pictures: bool = True) -> NavigationSegment:
+        """Return a segment, without its pictures where they are not wanted.
+
+        Raises:
+            FileError: a file is missing or damaged.
+        """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"expected one of {len(self)} segments, got {index}")
+        row = self.segments[index]
+        if row["file"] not in self._files:
+            self._files[row["file"]] = FrameFile(self.folder / row["file"])
+        return self._files[row["file"]].read_segment(row["row_group"], pictures)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of all segments."""
+        return sum(row["frames"] for row in self.segments)
+
+    def clips(self, length: int, stride: int = 1) -> Clips:
+        """Return all windows of `length` frames that begin `stride` frames apart within a segment.
+
+        Raises:
+            ArgumentError: a length or stride below 1, or no segment is that long.
+        """
+        return Clips(self, length, stride)
+
+
+class Clips(Sequence[NavigationSegment]):
+    """Windows of one length, in order; each is read when it is asked for."""
+
+    def __init__(self, data: NavigationData, length: int, stride: int = 1) -> None:
+        if length < 1 or stride < 1:
+            raise ArgumentError(f"expected clips of 1 frame or more and a stride of 1 or more, got {length}, {stride}")
+        self._data, self._length, self._stride = data, length, stride
+        counts = [max(0, row["frames"] - length + stride) // stride for row in data.segments]
+        self._ends = list(accumulate(counts))
+        if not len(self):
+            longest = max((row["frames"] for row in data.segments), default=0)
+            raise ArgumentError(
+                f"{data.folder}: no segment has {length} frames, the longest has {longest}; ask for shorter clips"
+            )
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return one clip, or a list of those of a slice; only the row groups of their segments are read.
+
+        Raises:
+            FileError: a file is missing or damaged.
+        """
+        if isinstance(index, slice):
+            return [self[each] for each in range(*index.indices(len(self)))]
+        segment, start = self.locate(index)
+        return self._data.read(segment).clip(start, self._length)
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Return the segment of a clip, and the frame of it that the clip begins with."""
+        at = index + len(self) if index < 0 else index
+        if not 0 <= at < len(self):
+            raise IndexError(f"expected one of {len(self)} clips, got {index}")
+        segment = bisect_right(self._ends, at)
+        return segment, (at - (self._ends[segment - 1] if segment else 0)) * self._stride
+
+
+def part_of(scene: str, held_out: float) -> Literal["train", "held-out"]:
+    """Return the part that a scene belongs to, by a hash of its name, so that adding scenes moves no other."""
+    number = int.from_bytes(blake2b(scene.encode(), digest_size=8).digest(), "little")
+    return "held-out" if number < held_out * 2**64 else "train"
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """Return what `meta.json` says about a finished dataset.
+
+    Raises:
+        FileError: there is none, it is of another format, or the dataset is not finished.
+    """
+    path = folder / META
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
+            raise ValueError("no list of files")
+    except FileNotFoundError as error:
+        begun = (folder / MANIFEST).exists()
+        hint = "repeat `wiw collect navigation` until it is finished" if begun else "expected a folder of that command"
+        raise FileError(f"{path} is missing; `wiw collect navigation` writes it at its end: {hint}") from error
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: expected the description of a navigation dataset, got {error}") from error
+    if found.get("format") != FORMAT:
+        raise FileError(f"{path}: expected a navigation dataset of format {FORMAT}, got {found.get('format')}")
+    return found
+
+
+def read_navigation_manifest(folder: Path) -> dict[str, Any]:
+    """Return the settings with which a folder was begun.
+
+    Raises:
+        FileError: there is no manifest, or it is not one of a navigation dataset.
+    """
+    path = folder / MANIFEST
+    try:
+        found = json.loads(path.read_text())
+        if not isinstance(found, Mapping) or found.get("what") != "navigation":
+            raise ValueError("not of a navigation dataset")
+        return dict(found)
+    except FileNotFoundError as error:
+        raise FileError(
+            f"{path} is missing; expected a new folder, or one that `wiw collect navigation` has begun"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise FileError(
+            f"{path}: expected a manifest of `wiw collect navigation`, got something else ({error})"
+        ) from error

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Collect a navigation dataset: posed panoramas with depth and actions along traversals of scenes, for post-training.
+
+Follows Algorithm 1 and the appendix on post-training data of the World-in-World paper. A scene's segments are
+functions of (scene, seed, pass, options); each is kept as it is recorded, and a file gets its name once it is complete,
+so that a collection killed at any moment resumes and ends with the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import wiw
+from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.datasets.navigation import META, NavigationData, read_navigation_manifest
+from wiw.datasets.navigation_card import build_card
+from wiw.datasets.navigation_files import (
+    FORMAT,
+    SEGMENTS,
+    FrameFile,
+    build_table,
+    navigation_schema,
+    write_frames,
+    write_segment_list,
+)
+from wiw.datasets.navigation_segment import NavigationSegment
+from wiw.datasets.parquet_files import hash_file, require_pyarrow
+from wiw.datasets.scene_splits import find_evaluation_split, name_scene
+from wiw.datasets.worlds import World, world
+from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
+from wiw.files import atomic_file
+from wiw.render import resolve_backend
+from wiw.scenes import resolve
+from wiw.training.jobs import open_folder, run_jobs
+from wiw.training.navigation_recording import HFOV_DEG, NavigationCollection, record_segment
+from wiw.training.navigation_rules import make_rules
+from wiw.training.traversal import Traversal, plan_scene
+
+Progress = Callable[[str, int, int, int], None]
+"""Called with a scene that is finished, the number of passes over scenes that are, of how many, and their frames."""
+
+MAX_FILE_BYTES = 500 * 10**6
+"""Of a Parquet file, as the Hub and its viewer like it; a single segment may have more."""
+RECORDS, PARTS, DATA = "scenes", "parts", "data"
+"""Folders: what is known about each finished pass, segments of unfinished ones, frames."""
+
+
+def collect_navigation(
+    out: str | Path,
+    scenes: str | PathLike[str] | Sequence[str | PathLike[str]] = "apartments:train:80",
+    *,
+    preset: str = "default",
+    rules: Mapping[str, object] | None = None,
+    workers: int = 1,
+    skip_errors: bool = False,
+    progress: Progress | None = None,
+    **asked: Any,
+) -> NavigationData:
+    """Record what an agent sees on traversals of scenes; resume where it was interrupted.
+
+    Args:
+        out: a new folder, or one that the same call began.
+        scenes: scene specs of train splits: "apartments:train:80", or files of meshes and worlds.
+        preset: "default", or "paper" (waypoints within 3 m count as visited).
+        rules: fields of `wiw.training.navigation_rules.NavigationRules` to replace.
+        workers: number of processes; the files do not depend on it.
+        skip_errors: whether scenes that cannot be opened are left out; otherwise they are an error, once all others
+            are recorded.
+        progress: called whenever a pass over a scene is finished.
+        **asked: passes, seed, perspective, size, height, depth, lossless, backend, as in
+            `wiw.training.navigation_recording.NavigationCollection`.
+
+    Raises:
+        BackendError: the requested renderer does not work here.
+        DependencyError: pyarrow is not installed.
+        ArgumentError: an option is out of range, a scene is of a val or test split, or the folder holds another
+            collection.
+        FileError: a scene is missing, or the folder cannot be written.
+        InfrastructureError: scenes cannot be opened, or a worker process has died.
+    """
+    require_pyarrow("navigation datasets")
+    options = NavigationCollection(rules=make_rules(preset, rules), **asked)
+    options = replace(options, backend=resolve_backend(options.backend))
+    if workers < 1:
+        raise ArgumentError(f"collect: expected 1 worker or more, got {workers}")
+    folder, specs = Path(out), resolve_train_scenes(scenes)
+    config = {"what": "navigation", "wiw": wiw.__version__, "scenes": list(specs), **options.describe()}
+    open_folder(folder, config, read_navigation_manifest)
+    jobs = [
+        SceneJob(number * options.passes + index, name, spec, index, folder, options)
+        for number, (name, spec) in enumerate(specs.items())
+        for index in range(options.passes)
+    ]
+    finished = {job.number: record for job in jobs if (record := job.read_record()) is not None}
+    records, errors = _record_passes(jobs, finished, workers, progress)
+    if errors and not skip_errors:
+        raise InfrastructureError(
+            f"collect: {len(errors)} of {len(specs)} scenes cannot be recorded, the others are: "
+            + "; ".join(f"{scene}: {error}" for scene, error in errors.items())
+            + ". Mend them and repeat the command, or leave them out with --skip-errors"
+        )
+    if len(finished) < len(jobs) or not (folder / META).exists():
+        _finish(folder, config, options, [records[number] for number in sorted(records)], errors)
+    return NavigationData(folder)
+
+
+def _record_passes(
+    jobs: Sequence[SceneJob], finished: Mapping[int, dict[str, Any]], workers: int, progress: Progress | None
+) -> tuple[dict[int, dict[str, Any]], dict[str, str]]:
+    """Record the passes that are not finished; return the records of all by number, and errors by scene."""
+    records, errors, tally = dict(finished), dict[str, str](), _Tally(len(jobs), progress)
+    for job in jobs:
+        if job.number in finished:
+            tally.add(job.scene, finished[job.number])
+    for job, record in run_jobs([job for job in jobs if job.number not in finished], workers):
+        if "error" in record:
+            errors[job.scene] = record["error"]
+        else:
+            records[job.number] = record
+            tally.add(job.scene, record)
+    return records, errors
+
+
+def resolve_train_scenes(scenes: str | PathLike[str] | Sequence[str | PathLike[str]]) -> dict[str, str]:
+    """Return the single scenes of some specs, by the names that they have in a dataset.
+
+    Raises:
+        ArgumentError: a scene is of a split that is for evaluation, or two scenes have one name.
+        FileError: there is no such file.
+    """
+    given = [scenes] if isinstance(scenes, str | PathLike) else list(scenes)
+    names: dict[str, str] = {}
+    for spec in (single for each in given for single in resolve(each)):
+        _check_train_split(spec)
+        name = name_scene(spec)
+        if name in names:
+            raise ArgumentError(
+                f"collect: expected scenes of different names, got {name} twice ({names[name]}, {spec})"
+            )
+        names[name] = spec
+    if not names:
+        raise ArgumentError("collect: expected scenes (--scenes apartments:train:80), got none")
+    return names
+
+
+def _check_train_split(spec: str) -> None:
+    """Refuse scenes on which world models are evaluated."""
+    if (split := find_evaluation_split(spec)) is not None:
+        raise ArgumentError(
+            f"collect: expected scenes of a train split, got {spec}, which is of {split}: evaluation runs there; a "
+            "model trained on it would be tested on what it has seen. Name train scenes, such as apartments:train:80"
+        )
+
+
+# -- one pass over one scene -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """A pass over a scene, to be recorded."""
+
+    number: int
+    scene: str
+    """Its name in the dataset."""
+    spec: str
+    pass_index: int
+    folder: Path
+    options: NavigationCollection
+
+    def read_record(self) -> dict[str, Any] | None:
+        """Return what is known about the finished pass; None where it is not finished or its files are not whole."""
+        try:
+            record: dict[str, Any] = json.loads(self._record_path.read_text())
+            sizes = [(self.folder / name).stat().st_size == file["bytes"] for name, file in record["files"].items()]
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return record if all(sizes) else None
+
+    def run(self) -> dict[str, Any]:
+        """Record the pass; return what is known about it, or an "error" where the scene cannot be opened."""
+        try:
+            place = world(self.spec, self.options.backend)
+            traversals = plan_scene(place.navmesh, self.scene, self.options.seed, self.pass_index, self.options.rules)
+        except BackendError:
+            raise
+        except Error as error:
+            return {"error": str(error)}
+        schema = navigation_schema(self.options.depth, describe_data(self.options))
+        jobs = [(traversal, index) for traversal in traversals for index in range(len(traversal.segments))]
+        for number, (traversal, index) in enumerate(jobs):
+            if not self._holds(number, traversal, index):
+                made = record_segment(place, self.scene, self.pass_index, number, traversal, index, self.options)
+                write_frames(self._part(number), schema, [build_table(made, schema)])
+        files, segments = self._merge_parts(jobs, schema)
+        record = {
+            "scene": self.scene,
+            "pass": self.pass_index,
+            "files": files,
+            "segments": segments,
+            "traversals": [_describe_traversal(place, each) for each in traversals],
+        }
+        with atomic_file(self._record_path) as draft:
+            draft.write_text(json.dumps(record) + "\n")
+        shutil.rmtree(self._part(0).parent, ignore_errors=True)
+        return record
+
+    @property
+    def _record_path(self) -> Path:
+        return self.folder / RECORDS / f"{self.number:05d}.json"
+
+    def _part(self, number: int) -> Path:
+        return self.folder / PARTS / f"{self.number:05d}" / f"{number:05d}.parquet"
+
+    def _holds(self, number: int, traversal: Traversal, index: int) -> bool:
+        """Return whether a segment has been recorded already, as planned."""
+        planned = traversal.segments[index]
+        try:
+            found = FrameFile(self._part(number)).read_segment(0)
+        except FileError:
+            return False
+        return np.array_equal(found.actions, planned.actions) and found.island == traversal.island
+
+    def _merge_parts(
+        self, jobs: Sequence[tuple[Traversal, int]], schema: Any
+    ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """Write the frames of all segments into files; return what is in each file and each segment."""
+        files: dict[str, Any] = {}
+        segments: list[dict[str, Any]] = []
+        for index, numbers in enumerate(self._group_parts(len(jobs))):
+            name = f"{DATA}/train-{self.number:05d}-{index:02d}.parquet"
+            found: list[dict[str, Any]] = []
+
+            def tables(numbers: Sequence[int] = numbers, name: str = name, found: Any = found) -> Iterator[Any]:
+                for row_group, number in enumerate(numbers):
+                    part = FrameFile(self._part(number))
+                    traversal, at = jobs[number]
+                    where = {"file": name, "row_group": row_group, "ending": traversal.segments[at].ending}
+                    found.append({**_describe_segment(part.read_segment(0)), **where})
+                    yield part.read(0).replace_schema_metadata(schema.metadata)
+
+            write_frames(self.folder / name, schema, tables())
+            segments += found
+            files[name] = _describe_file(self.folder / name, sum(row["frames"] for row in found))
+        return files, segments
+
+    def _group_parts(self, count: int) -> list[list[int]]:
+        """Return the numbers of the segments in each file, in order, as many as fit."""
+        groups: list[list[int]] = []
+        room = 0
+        for number in range(count):
+            size = self._part(number).stat().st_size
+            if not groups or size > room:
+                groups.append([])
+                room = MAX_FILE_BYTES
+            groups[-1].append(number)
+            room -= size
+        return groups
+
+
+def _describe_segment(segment: NavigationSegment) -> dict[str, Any]:
+    return {
+        "scene": segment.scene,
+        "pass": segment.pass_index,
+        "island": segment.island,
+        "segment": segment.segment,
+        "frames": len(segment),
+        "pictures": len(np.unique(segment.sources)),
+        "forward": int((segment.actions == FORWARD).sum()),
+        "turn_left": int((segment.actions == TURN_LEFT).sum()),
+        "turn_right": int((segment.actions == TURN_RIGHT).sum()),
+    }
+
+
+def _describe_file(path: Path, frames: int) -> dict[str, Any]:
+    return {"frames": frames, "bytes": path.stat().st_size, "sha256": hash_file(path)}
+
+
+def _describe_traversal(place: World, traversal: Traversal) -> dict[str, Any]:
+    """Return JSON values: the figures of a traversal, and what a map of it needs, x and z in metres."""
+    outline, owner = place.navmesh.outline()
+    walls = outline[owner == traversal.island][:, :, [0, 2]].reshape(-1, 4)
+    return {
+        "island": traversal.island,
+        "north": traversal.north,
+        "area": round(traversal.area, 2),
+        "coverage": round(traversal.coverage, 4),
+        "frames": traversal.frames,
+        "waypoints": traversal.waypoints[:, [0, 2]].astype(np.float64).round(3).tolist(),
+        "dropped": traversal.dropped,
+        "walls": walls.astype(np.float64).round(3).tolist(),
+    }
+
+
+class _Tally:
+    """Counts finished passes and their frames."""
+
+    def __init__(self, total: int, progress: Progress | None) -> None:
+        self._total, self._progress = total, progress
+        self._done = self._frames = 0
+
+    def add(self, scene: str, record: Mapping[str, Any]) -> None:
+        self._done += 1
+        self._frames += sum(row["frames"] for row in record["segments"])
+        if self._progress is not None:
+            self._progress(scene, self._done, self._total, self._frames)
+
+
+# -- the whole dataset -------------------------------------------------------------------------------------------------
+
+
+def describe_data(options: NavigationCollection) -> dict[str, Any]:
+    """Return what holds for all frames, as JSON values."""
+    panorama = not options.perspective
+    camera = {
+        "projection": "equirectangular" if panorama else "perspective",
+        "size": list(options.image_size),
+        "height_m": options.height,
+        "axes": "T_world_camera maps camera to world; the camera looks along -Z, +X right, +Y up; metres",
+    }
+    depth = {
+        "unit": "millimetre",
+        "measure": "distance along the ray" if panorama else "planar",
+        "nothing": 0,
+        "largest": 65535,
+    }
+    return {
+        "wiw": wiw.__version__,
+        "split": "train",
+        "camera": camera if panorama else {**camera, "hfov_deg": HFOV_DEG},
+        "color": "WebP, lossless" if options.lossless else "JPEG, quality 95, 4:4:4",
+        "depth": depth if options.depth else None,
+        "actions": {"0": "null", "1": "forward 0.2 m", "2": "turn left 22.5 deg", "3": "turn right 22.5 deg"},
+    }
+
+
+def _finish(
+    folder: Path,
+    config: Mapping[str, Any],
+    options: NavigationCollection,
+    records: Sequence[dict[str, Any]],
+    errors: Mapping[str, str],
+) -> None:
+    """Write the list of segments, the card and, last of all, the description of the dataset."""
+    rows = [row for record in records for row in record["segments"]]
+    write_segment_list(folder / SEGMENTS, rows)
+    files = {name: file for record in records for name, file in record["files"].items()}
+    files[SEGMENTS] = _describe_file(folder / SEGMENTS, 0)
+    totals = Counter({"segments": len(rows), "bytes": sum(file["bytes"] for file in files.values())})
+    for row in rows:
+        totals.update({name: row[name] for name in ("frames", "pictures", "forward", "turn_left", "turn_right")})
+    totals["dropped"] = sum(each["dropped"] for record in records for each in record["traversals"])
+    meta = {
+        "format": FORMAT,
+        **describe_data(options),
+        "config": config,
+        "totals": {"scenes": len({record["scene"] for record in records}), **totals},
+        "left_out": dict(sorted(errors.items())),
+        "files": files,
+        "passes": [
+            {"scene": record["scene"], "pass": record["pass"], "traversals": record["traversals"]} for record in records
+        ],
+    }
+    with atomic_file(folder / "README.md") as draft:
+        draft.write_text(build_card(meta))
+    with atomic_file(folder / META) as draft:
+        draft.write_text(json.dumps(meta) + "\n")
+    shutil.rmtree(folder / PARTS, ignore_errors=True)
