@@ -15,6 +15,7 @@ from tyro.conf import Positional, arg
 from wiw.cli.stop import announce_resume
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
+PERCEPTION_SCENES = "apartments:train:160"
 ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "scenes": (ON_SCENES, "does not train on scenes"),
@@ -69,27 +70,28 @@ def train(
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
-    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes an hour, diffuser takes a night;
-    less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint beside
+    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, diffuser takes
+    a night; less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint beside
     FILE.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
     beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
     val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
-    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults.
+    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults; those of
+    perception for four epochs of a schedule that was first laid out for six (docs/perception.md).
 
     Args:
         what: recogniser, warpnet, perception, armnet or diffuser.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
-            Default: apartments:train:80.
+            Default: apartments:train:80; 160 of them for perception.
         val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single
             one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 3 for perception,
-            4 for armnet, 400 for diffuser.
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 4 for perception
+            and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
         places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 12), or walks
             recorded in each scene, for warpnet (default: 24).
@@ -113,7 +115,7 @@ def train(
     _require_torch(what)
     _check_out(out)
     data = _DataOptions(
-        scenes=DEFAULT_SCENES if scenes is None else scenes,
+        scenes=scenes or (PERCEPTION_SCENES if what == "perception" else DEFAULT_SCENES),
         val=DEFAULT_VAL if val is None else val,
         seed=seed,
         cache=cache or folder().parent / "looks",

@@ -44,7 +44,7 @@ LEAST_CELLS = 40
 class Recipe:
     """Hyper-parameters of the training."""
 
-    epochs: int = 3
+    epochs: int = 4
     """How often each view is used, on average."""
     batch: int = 4
     widths: tuple[int, int, int, int] = (32, 64, 128, 192)
