@@ -71,8 +71,8 @@ def train(
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
     it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, diffuser takes
-    a night; less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint beside
-    FILE.
+    a night; less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint
+    beside FILE.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
