@@ -26,10 +26,15 @@ PAPER_QUALITY = "q"
 CONTROL_BY_LPIPS, CONTROL_BY_SSIM = "1 - LPIPS", "SSIM"
 CONTROL = (CONTROL_BY_LPIPS, CONTROL_BY_SSIM)
 """Measures of controllability, the paper's first."""
-BOUNDS = {CONTROL_BY_LPIPS: (-math.inf, 1.0), CONTROL_BY_SSIM: (-1.0, 1.0), PAPER_QUALITY: (5.0, 100.0)}
-"""Ends that intervals keep to, besides the ranges that scorers announce."""
 PLAIN = ("sharpness", "colourfulness")
 """Measures by formula; any other score of a single frame is a better measure of quality."""
+BOUNDS = {
+    CONTROL_BY_LPIPS: (-math.inf, 1.0),
+    CONTROL_BY_SSIM: (-1.0, 1.0),
+    PAPER_QUALITY: (5.0, 100.0),
+    **dict.fromkeys(PLAIN, (0.0, math.inf)),
+}
+"""Ends that intervals keep to, besides the ranges that scorers announce."""
 FEW_ARMS = 8
 """Arms below which a page says how little an order proves."""
 

@@ -10,7 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 
 def quality(
-    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN")]],
+    runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]],
     /,
     *,
     scorer: Annotated[tuple[str, ...], UseAppendAction, arg(metavar="COMMAND|laion")] = (),
@@ -22,22 +22,22 @@ def quality(
 ) -> int:
     """Does looking better help more? Visual quality and controllability of imagined frames, against success.
 
-      $ wiw run imagenav --arms copy,warp,warpnet,oracle --keep-images all --out runs/four
-      $ wiw quality runs/four                                    # sharpness, colourfulness, SSIM to the true frames
-      $ wiw quality runs/four --lpips auto                       # controllability as in the paper: 1 - LPIPS
-      $ wiw quality runs/four --scorer "python my_scorer.py"     # any scorer, in a process of its own
-      $ wiw quality runs/four runs/more --arms four/warp,svd     # arms of several runs on the same episodes
+    $ wiw run imagenav --arms copy,warp,warpnet,oracle --keep-images all --out runs/four
+    $ wiw quality runs/four                                    # sharpness, colourfulness, SSIM to the true frames
+    $ wiw quality runs/four --lpips auto                       # controllability as in the paper: 1 - LPIPS
+    $ wiw quality runs/four --scorer "python my_scorer.py"     # any scorer, in a process of its own
+    $ wiw quality runs/four runs/more --arms four/warp,svd     # arms of several runs on the same episodes
 
     Quality is what a frame looks like by itself; controllability is how near it is to what would really have been seen,
-    known of runs with --fidelity or with an arm oracle. Frames are scored as the run keeps them (views of 160 pixels,
-    JPEG), the same places and plans of every arm, so pictures must have been kept (`wiw run --keep-images`). Writes
+    known of runs with --fidelity or with an arm oracle. Frames are scored as the run keeps them (what the reviser saw,
+    160 pixels high), the same places and plans of every arm, so pictures must be kept (`wiw run --keep-images`). Writes
     quality.html, .svg, .png and .json: a table, rank correlations over the arms, and the paper's two figures.
 
     A scorer is any command. It is started once. Its first line on the standard output says who it is; then it reads
     paths of PNG files, one a line, from the standard input, and answers each by a line, in any order:
 
-      {"scorer": "my-musiq", "version": "1.0", "licence": "MIT", "scores": {"musiq": [0, 100]}}
-      {"path": "/tmp/wiw-quality-x/5f3a.png", "scores": {"musiq": 61.5}}
+    {"scorer": "my-musiq", "version": "1.0", "licence": "MIT", "scores": {"musiq": [0, 100]}}
+    {"path": "/tmp/wiw-quality-x/5f3a.png", "scores": {"musiq": 61.5}}
 
     Flush each line, print anything else to the standard error, end with exit code 0. Where "aesthetic" [1, 10] and
     "musiq" [0, 100] are both given, the paper's q = (10 aesthetic + MUSIQ) / 2 is computed as well. Scores are stored

@@ -60,8 +60,8 @@ def explain(table: QualityTable) -> list[str]:
     pictured, episodes = _count(table.pictured, "episode"), _count(table.episodes, "episode")
     pictured, episodes = _count(table.pictured, "episode"), _count(table.episodes, "episode")
     sizes = (
-        f"{table.frames} frames of each arm, the same ones, of {pictured} with pictures; {table.outcome} over {episodes} "
-        f"of {_count(table.scenes, 'scene')}, scored in every arm."
+        f"{table.frames} frames of each arm, the same ones, of {pictured} with pictures; {table.outcome} over "
+        f"{episodes} of {_count(table.scenes, 'scene')}, scored in every arm."
     )
     return [sizes, *table.notes, *(_describe(card) for card in table.scorers)]
 

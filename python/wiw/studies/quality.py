@@ -33,6 +33,7 @@ from wiw.analysis.utility import CEILING
 from wiw.errors import ArgumentError
 from wiw.metrics import Lpips, ssim
 from wiw.metrics.metric import ANSWER_SCORE, SUCCESS, Metric
+from wiw.panorama import to_perspective
 from wiw.runs.frame_scores import FrameScores
 from wiw.runs.imagined_frames import (
     FrameKey,
@@ -54,6 +55,8 @@ FRAMES = 200
 """Of each arm, where the caller does not say how many."""
 ALWAYS = "pixels"
 """The scorer that needs nothing and takes no time."""
+VIEW = (128, 128)
+"""Height and width of the views of a panorama that LPIPS is taken of."""
 SHOWN = 6
 """Frames of each arm that the page shows."""
 
@@ -151,6 +154,8 @@ def quality(
             require_comparable(logs[0], log)
         chosen, notes = _choose_arms(logs, arms)
         keys = _choose_frames(chosen, frames)
+        if len(keys) < frames:
+            notes.append(f"{frames} frames were asked for; all arms have imagined the same future in {len(keys)} only.")
         for arm in chosen:
             arm.frames = dict(read_frames(arm.log.store, arm.places, keys))
         _find_truth(logs, chosen, keys)
@@ -291,9 +296,9 @@ def _compare_with_truth(
     arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], lpips: Lpips | None, watch: Watch | None
 ) -> None:
     """Add controllability: SSIM, and 1 - LPIPS where its weights are, of each frame against the true one."""
-    measures = {CONTROL_BY_SSIM: lambda a, b: float(np.asarray(ssim(a, b)))}
+    measures: dict[str, Callable[[Image, Image], float]] = {CONTROL_BY_SSIM: _similarity}
     if lpips is not None:
-        measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - float(np.asarray(lpips(a, b))), **measures}
+        measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - _distance(lpips, a, b), **measures}
     for name, measure in measures.items():
         card = ScorerCard("truth", "1", "Apache-2.0", {name: None})
         total = sum(key in arm.true for arm in arms for key in arm.frames)
@@ -302,6 +307,27 @@ def _compare_with_truth(
             if watch is not None and total:
                 done = sum(len(each.scores.get(name, ())) for each in arms)
                 watch(name, done, total, f"{done}/{total} frames")
+
+
+def _is_panorama(frame: Image) -> bool:
+    return frame.shape[1] == 2 * frame.shape[0]
+
+
+def _similarity(frame: Image, true: Image) -> float:
+    """Return SSIM, of panoramas weighted by latitude."""
+    found = ssim(frame, true, weights="latitude" if _is_panorama(frame) else "uniform")
+    return min(1.0, float(np.asarray(found)))  # rounding of the weights
+
+
+def _distance(lpips: Lpips, frame: Image, true: Image) -> float:
+    """Return LPIPS; it knows no sphere, so of panoramas the mean over front, left, right and back."""
+    if not _is_panorama(frame):
+        return float(np.asarray(lpips(frame, true)))
+    views = [
+        np.stack([np.asarray(to_perspective(image, 90.0, VIEW, yaw_deg=yaw)) for yaw in (0.0, 90.0, -90.0, 180.0)])
+        for image in (frame, true)
+    ]
+    return float(np.mean(lpips(*views)))
 
 
 def _compare_arm(
