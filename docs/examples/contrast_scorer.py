@@ -25,8 +25,9 @@ def contrast(path: str) -> float:
 
 
 def answer(line: object) -> None:
-    """Print an object as one line of JSON, at once: what is printed is kept, whatever happens next."""
-    print(json.dumps(line), flush=True)
+    """Write an object as one line of JSON, at once: what is answered is kept, whatever happens next."""
+    sys.stdout.write(json.dumps(line) + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

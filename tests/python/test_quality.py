@@ -86,7 +86,7 @@ def test_colourfulness_of_single_colours_is_known() -> None:
     assert colourfulness(halves) == pytest.approx(255 + 0.3 * 127.5)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_quality_of_pixels_does_not_depend_on_mirroring_and_grey_has_no_colour(seed: int) -> None:
     image = np.random.default_rng(seed).integers(0, 256, (7, 8, 3), np.uint8)
@@ -192,6 +192,14 @@ def test_a_command_scores_in_any_order_and_says_who_it_is(tmp_path: Path, paths:
         found = list(scorer.score(paths))
     assert [path for path, _ in found] == paths[::-1]
     assert all(scores == {"aesthetic": 5, "musiq": 50} for _, scores in found)
+
+
+def test_the_example_scores_contrast(tmp_path: Path) -> None:
+    file = tmp_path / "grey.png"
+    cv2.imwrite(str(file), np.repeat(np.array([[100, 200]], np.uint8), 8, 0)[..., None].repeat(3, -1))
+    example = Path(__file__).parents[2] / "docs/examples/contrast_scorer.py"
+    with make_scorer(f"'{sys.executable}' '{example}'", 60) as scorer:
+        assert list(scorer.score([file])) == [(file, {"contrast": pytest.approx(50 / 150)})]
 
 
 BAD = {
@@ -328,7 +336,8 @@ def test_the_same_frames_of_all_arms_are_scored(run: Path, tmp_path: Path) -> No
     lines = {line.arm: line for line in found.table.arms}
     assert list(lines) == ["copy", "warp", "oracle"] and {line.frames for line in found.table.arms} == {12}
     assert any("'none'" in note for note in found.table.notes)
-    assert lines["oracle"].scores["SSIM"].value == 1 > lines["warp"].scores["SSIM"].value
+    assert lines["oracle"].scores["SSIM"].value == pytest.approx(1)
+    assert lines["warp"].scores["SSIM"].value < 0.999
     assert lines["warp"].scores["SSIM"].value > lines["copy"].scores["SSIM"].value
     assert moves[-1][0] == "SSIM" and any(done == total for name, done, total in moves if name == "pixels")
 
