@@ -159,6 +159,8 @@ def test_no_order_no_coefficient() -> None:
     flat = correlate("m", np.ones((3, 4)), np.arange(12.0).reshape(3, 4), list("abcd"))
     assert math.isnan(flat.rho) and math.isnan(flat.p) and math.isnan(flat.low)
     assert math.isnan(correlate("m", np.eye(2), np.eye(2), ["a", "a"]).rho)
+    few = correlate("m", np.eye(4), np.eye(4) + np.arange(4.0)[:, None], list("abcd"))
+    assert math.isnan(few.low) and math.isnan(few.high)  # four scenes have no interval
     with pytest.raises(ArgumentError, match="without NaN"):
         correlate("m", np.full((3, 2), np.nan), np.ones((3, 2)), ["a", "b"])
 
@@ -265,8 +267,17 @@ def test_a_hung_scorer_and_its_children_are_ended(tmp_path: Path, paths: list[Pa
     with pytest.raises(ScorerError, match="no line"), ProcessScorer(command, 1.5) as scorer:
         list(scorer.score(paths))
     pid = int((tmp_path / "pid").read_text())
-    stat = Path(f"/proc/{pid}/stat")
-    assert not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] == "Z"
+    end = time.monotonic() + 10
+    while alive(pid) and time.monotonic() < end:  # it has the signal, and dies when it is scheduled
+        time.sleep(0.05)
+    assert not alive(pid)
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
 
 
 def test_laions_predictor_on_the_real_classes(tmp_path: Path, paths: list[Path]) -> None:
@@ -491,6 +502,8 @@ def test_what_cannot_be_compared_is_refused(
     with pytest.raises(ArgumentError, match="a name that is taken"):
         card = CARD.replace("aesthetic", "sharpness")
         wiw.quality(run, [write_scorer(tmp_path, card=card)], frames=4)
+    with pytest.raises(ArgumentError, match="expected different runs"):
+        wiw.quality([run, run])
     with pytest.raises(ArgumentError, match="at least one run"):
         wiw.quality([])
     other = wiw.evaluate(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.analysis.rank_correlation import LEAST, Correlation, correlate
+from wiw.analysis.rank_correlation import FEW, LEAST, Correlation, correlate
 from wiw.analysis.statistics import Estimate, estimate_mean
 from wiw.metrics.image_quality import paper_quality
 from wiw.metrics.metric import Metric
@@ -218,7 +218,9 @@ def _caveats(found: Sequence[Correlation]) -> list[str]:
 def _explain_draws(found: Sequence[Correlation]) -> str:
     """Return what the intervals of the coefficients speak of."""
     one = max(found, key=lambda each: each.arms)
-    left = [each.defined for each in found if not math.isnan(each.rho) and each.units > 1]
+    if one.units < FEW:
+        return f"No intervals of rank correlations: {one.units} {one.unit} are too few, they take at least {FEW}."
+    left = [each.defined for each in found if not math.isnan(each.rho)]
     equal = 100 * (1 - min(left, default=1.0))
     out = (
         f" In up to {equal:.0f} % of the draws the arms cannot be ordered; these are left out." if equal >= 0.5 else ""

@@ -19,6 +19,8 @@ EXACT = 8
 """Arms up to which all orders are tried for p."""
 SHUFFLES = 20_000
 """Random orders beyond."""
+FEW = 5
+"""Scenes below which there is no interval: a few draws in all, which look surer the fewer they are."""
 RESAMPLES = 4999
 DIGITS = 9
 """Decimals of a mean that count: sums of the same numbers in another order are ties."""
@@ -141,7 +143,7 @@ def _weigh(sums: _Sums, weights: NDArray[np.float64]) -> NDArray[np.float64]:
 def _bootstrap(means: tuple[_Sums, _Sums], skip: bool, seed: int) -> tuple[float, float, float]:
     """Return both ends of the percentile interval, and the share of draws that have a coefficient."""
     clusters = means[0][0].shape[1]
-    if skip or clusters < 2:
+    if skip or clusters < FEW:
         return math.nan, math.nan, 0.0
     rng = np.random.Generator(np.random.Philox(key=seed))
     weights = rng.multinomial(clusters, np.full(clusters, 1 / clusters), RESAMPLES).astype(np.float64)

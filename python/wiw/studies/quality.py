@@ -30,7 +30,7 @@ from wiw.analysis.quality import (
 )
 from wiw.analysis.summary import split_outcomes
 from wiw.analysis.utility import CEILING
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.metrics import Lpips, ssim
 from wiw.metrics.metric import ANSWER_SCORE, SUCCESS, Metric
 from wiw.panorama import to_perspective
@@ -183,8 +183,8 @@ def _choose_arms(logs: Sequence[RunLog], wanted: Sequence[str] | None) -> tuple[
     """Return the arms with imagined frames, and notes on those without."""
     names = [name for log in logs for name in log.arms]
     labels = [
-        (name if names.count(name) == 1 else f"{log.path.resolve().name}/{name}", log, name)
-        for log in logs
+        (name if names.count(name) == 1 else f"{run}/{name}", log, name)
+        for run, log in zip(_name_runs(logs), logs, strict=True)
         for name in log.arms
     ]
     if unknown := sorted(set(wanted or ()) - {label for label, _, _ in labels}):
@@ -203,6 +203,15 @@ def _choose_arms(logs: Sequence[RunLog], wanted: Sequence[str] | None) -> tuple[
         )
     notes = [f"Left out, for no imagined frames of them are kept: {', '.join(map(repr, without))}."] if without else []
     return [arm for arm in found if arm.places], notes
+
+
+def _name_runs(logs: Sequence[RunLog]) -> list[str]:
+    """Return the names of the runs' folders, or their whole paths where two have one name."""
+    paths = [log.path.resolve() for log in logs]
+    if len(set(paths)) < len(paths):
+        raise ArgumentError(f"quality: expected different runs, got {', '.join(map(str, paths))}; name each once")
+    names = [path.name for path in paths]
+    return names if len(set(names)) == len(names) else [str(path) for path in paths]
 
 
 def _choose_frames(arms: Sequence[_Arm], count: int) -> list[FrameKey]:
@@ -284,7 +293,11 @@ def _ask(
     with tempfile.TemporaryDirectory(prefix="wiw-quality-") as folder:
         paths = {Path(folder) / f"{digest[:32]}.png": digest for digest in images}
         for path, digest in paths.items():
-            cv2.imwrite(str(path), cv2.cvtColor(images[digest], cv2.COLOR_RGB2BGR))
+            if not cv2.imwrite(str(path), cv2.cvtColor(images[digest], cv2.COLOR_RGB2BGR)):
+                raise FileError(
+                    f"{path}: cannot be written; expected free space for {len(paths)} frames among temporary "
+                    "files: make room, or name another folder by the environment variable TMPDIR"
+                )
         for path, scores in scorer.score(list(paths)):
             yield paths[path], scores
             done += 1
