@@ -47,6 +47,7 @@ __all__ = [
     "physics",
     "policy",
     "power",
+    "quality",
     "registry",
     "render",
     "reproject",
@@ -79,6 +80,7 @@ _HOME = {
     "make_vec": "wiw.registry",
     "policy": "wiw.registry",
     "power": "wiw.analysis.power",
+    "quality": "wiw.studies.quality",
     "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
     "verify": "wiw.runs.verify",
@@ -139,6 +141,7 @@ if TYPE_CHECKING:
     from wiw.studies.evaluate import evaluate
     from wiw.studies.judge import judge
     from wiw.studies.model_check import check_model
+    from wiw.studies.quality import quality
     from wiw.studies.run_log import load_run
     from wiw.studies.scale import scale
     from wiw.tasks.base import Task

@@ -19,6 +19,7 @@ __all__ = [
     "RegistryError",
     "RemoteError",
     "RolloutError",
+    "ScorerError",
     "StoreError",
     "VlmError",
     "WeightsError",
@@ -130,6 +131,19 @@ class JudgeError(InfrastructureError):
 
     `kind` names what the language model replied: "empty", "refusal", "truncated", "huge", "malformed" (no mark is all
     that it says) or "range" (a mark that is not from 1 to 5); or "no_rule", where no judge knows the answer's type.
+    """
+
+    def __init__(self, message: str = "", kind: str = "malformed") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class ScorerError(InfrastructureError):
+    """A scorer of images gave no valid scores.
+
+    `kind` is "missing" (the command cannot be run), "card" (it does not say who it is), "hung", "crashed", "partial"
+    (it ended before all was answered), "malformed" (no answer), "unknown" (a path that was not asked about),
+    "repeated", "names" (other scores than announced), "number" (none, or NaN) or "range" (beyond the announced one).
     """
 
     def __init__(self, message: str = "", kind: str = "malformed") -> None:

@@ -44,7 +44,7 @@ PYTHON_ROWS = [
     {"_core"},
     FACES,
     {"datasets", "mapping", "metrics", "perception", "tabletop", "vlm", "wire"},
-    {"envs", "judging", "policies", "world_models"},
+    {"envs", "judging", "policies", "scorers", "world_models"},
     {"tasks", "loop", "training"},
     {"experiments"},
     {"runs"},

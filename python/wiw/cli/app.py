@@ -25,6 +25,7 @@ from wiw.cli.judge import judge
 from wiw.cli.names import list_names
 from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
+from wiw.cli.quality import quality
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scale import scale
@@ -66,6 +67,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),
     (power, "power", "Compute how many episodes a run needs to show a difference."),
+    (quality, "quality", "Visual quality and controllability of imagined frames, against success."),
     (scale, "scale", "Success against the number of imagined futures."),
     (report, "report", "Print the tables of a run and write its HTML report."),
     (export, "export", "Export a run as CSV or Parquet tables, or as a Rerun recording."),

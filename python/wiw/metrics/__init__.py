@@ -2,6 +2,7 @@
 """What is measured: task scores in percent, distances between images, and distances between poses."""
 
 from wiw.metrics.answers import aeqa_score, aeqa_spl
+from wiw.metrics.image_quality import colourfulness, paper_quality, sharpness
 from wiw.metrics.images import psnr, ssim
 from wiw.metrics.lpips import Lpips
 from wiw.metrics.navigation import mean_trajectory, path_efficiency, spl, success_rate
@@ -11,10 +12,13 @@ __all__ = [
     "Lpips",
     "aeqa_score",
     "aeqa_spl",
+    "colourfulness",
     "mean_trajectory",
+    "paper_quality",
     "path_efficiency",
     "pose_error",
     "psnr",
+    "sharpness",
     "spl",
     "ssim",
     "success_rate",

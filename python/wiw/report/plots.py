@@ -22,6 +22,7 @@ from wiw.analysis.breakdowns import Breakdown
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
+from wiw.analysis.quality import QualityTable
 from wiw.analysis.summary import Summary
 from wiw.types import Wording
 
@@ -109,6 +110,52 @@ def success_by_rank(truths: Sequence[ArmFidelity], summary: Summary) -> Markup:
     axes.set_ylabel("success rate, %")
     _legend(axes)
     return _svg(figure, "success-by-rank")
+
+
+def success_by_measure(found: QualityTable, measure: str, label: str) -> Markup:
+    """Plot success rates against a measure of imagined frames, a point per arm, with the intervals of both."""
+    figure, axes = _figure()
+    _draw_success_by_measure(axes, found, measure, label)
+    _legend(axes)
+    return _svg(figure, f"success-by-{measure}")
+
+
+def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], form: str) -> bytes:
+    """Return one picture of success against several measures side by side, on white.
+
+    Args:
+        found: the numbers.
+        measures: label of each measure.
+        form: "svg" or "png".
+    """
+    figure = Figure(figsize=(4.7 * len(measures), 3.5), layout="constrained")
+    for axes, (measure, label) in zip(np.atleast_1d(figure.subplots(1, len(measures))), measures.items(), strict=True):
+        _style(axes)
+        _draw_success_by_measure(axes, found, measure, label)
+    handles, texts = figure.axes[0].get_legend_handles_labels()
+    columns = min(6, len(texts))
+    figure.legend(handles, texts, frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="outside upper left")
+    buffer = io.BytesIO()
+    metadata: dict[str, Any] = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "quality", "font.family": "sans-serif"}):
+        figure.savefig(buffer, format=form, dpi=160, facecolor="white", metadata=metadata)
+    return buffer.getvalue()
+
+
+def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, label: str) -> None:
+    colors = arm_colors([line.arm for line in found.arms])
+    for line in found.arms:
+        success, color, value = line.success, colors[line.arm], line.scores.get(measure)
+        if value is None:
+            continue
+        axes.plot([value.value] * 2, [success.low, success.high], color=color, lw=4, alpha=0.35, solid_capstyle="round")
+        if not math.isnan(value.low):
+            axes.plot([value.low, value.high], [success.value] * 2, color=color, lw=1.2, alpha=0.6)
+        axes.plot(value.value, success.value, "o", color=color, ms=9, label=line.arm)
+    axes.set_ylim(-3, 103)
+    axes.xaxis.set_major_locator(MaxNLocator(TICKS))
+    axes.set_xlabel(label)
+    axes.set_ylabel("success rate, %" if found.outcome == "SR" else f"{found.outcome.lower()}, %")
 
 
 def blame_by_arm(found: Blame) -> Markup:
@@ -276,6 +323,11 @@ def _fold(arm: str) -> str:
 def _figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(4.7, 3.1), layout="constrained")
     axes = figure.add_subplot()
+    _style(axes)
+    return figure, axes
+
+
+def _style(axes: Axes) -> None:
     axes.spines[["top", "right", "left"]].set_visible(False)
     axes.spines["bottom"].set_color(INK)
     axes.spines["bottom"].set_alpha(0.3)
@@ -284,7 +336,6 @@ def _figure() -> tuple[Figure, Axes]:
     axes.yaxis.label.set_color(INK)
     axes.grid(axis="y", color=INK, alpha=0.08)
     axes.set_axisbelow(True)
-    return figure, axes
 
 
 def _legend(axes: Axes) -> None:
