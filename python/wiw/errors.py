@@ -20,6 +20,7 @@ __all__ = [
     "RemoteError",
     "RolloutError",
     "StoreError",
+    "TrainingError",
     "VlmError",
     "WeightsError",
     "is_stop_request",
@@ -139,3 +140,7 @@ class JudgeError(InfrastructureError):
 
 class StoreError(Error):
     """A run store is damaged, of another version, or does not fit what is asked of it."""
+
+
+class TrainingError(Error):
+    """A training cannot go on: its loss or its gradient is not finite. The message names the batch."""

@@ -1,0 +1,372 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Post-training of action-conditioned models, on diffusers' real classes with tiny random weights."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw import action
+from wiw.datasets.navigation import NavigationData
+from wiw.errors import ArgumentError, TrainingError
+from wiw.types import Conditioning, Control
+
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
+pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+
+import tiny_pipelines
+import torch
+from post_training_parts import save_dataset, tiny_recipe
+
+from wiw.training.post_training.clip_order import ClipOrder
+from wiw.training.post_training.families import FAMILIES, find_family, load_generator
+from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
+from wiw.training.post_training.recipe import load_recipe
+from wiw.training.post_training.train import build_config, post_train
+from wiw.training.post_training.trainer import PostTrainer, add_lora
+
+NAMES = sorted(FAMILIES)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_dataset(tmp_path_factory.mktemp("post") / "data")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("stock")
+
+    def get(name: str) -> Path:
+        base = name.removesuffix("-action")
+        if not (folder / base).exists():
+            tiny_pipelines.save(base, folder / base)
+        return folder / base
+
+    return get
+
+
+def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
+    model, objective = find_family(name)
+    recipe = tiny_recipe(name, **changes)
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    generator = load_generator(model, recipe, str(weights), options)
+    config = build_config(model.base, model.denoisers[0], generator)
+    clips = NavigationData(data).clips(recipe.frames)
+    return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# -- every recipe ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
+    """Measured on the same noise before and after."""
+    trainer = make_trainer(name, data, weights(name), rate=3e-3, schedule="constant", warmup=0.0, epochs=20, drop=0.0)
+
+    def measure(place: str) -> float:
+        clips = [trainer._clips[int(row)] for row in trainer.order.select(0)]
+        with torch.no_grad():
+            return float(trainer._compute_losses(place, clips * 4, torch.Generator().manual_seed(9)).mean())
+
+    before = {place: measure(place) for place in trainer.places}
+    for _ in range(20 * trainer.steps_per_epoch):
+        trainer.train_step(3e-3)
+    for place in trainer.places:
+        assert measure(place) < 0.95 * before[place], (place, before[place], measure(place))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_reach_what_is_trained_and_nothing_else(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), drop=0.0)
+    pipeline, lora = trainer.objective.pipeline, trainer.recipe.lora
+    before = {
+        f"{place}.{key}": value.detach().clone()
+        for place, network in pipeline.components.items()
+        if isinstance(network, torch.nn.Module)
+        for key, value in network.named_parameters()
+    }
+    for _ in range(2 * trainer.steps_per_epoch):
+        trainer.train_step(1e-2)
+    moved = set()
+    for place, network in pipeline.components.items():
+        if isinstance(network, torch.nn.Module):
+            for key, value in network.named_parameters():
+                if not torch.equal(value, before[f"{place}.{key}"]):
+                    moved.add(f"{place}.{key}")
+    expected = {key for key in trainer.trained if not key.startswith("encoder.")}
+    assert moved <= expected and expected
+    assert all((".actions." in key) == bool(lora) for key in expected)
+    still = {key for key in expected - moved if not key.endswith(".bias")}  # a key's bias has no effect on attention
+    assert len(still) <= 0.1 * len(expected), sorted(still)
+    for place in trainer.places:
+        encoder = trainer.encoders[place]
+        assert all(torch.isfinite(value).all() for value in encoder.parameters())
+        assert encoder.mlp[-1].weight.abs().sum() > 0 and encoder.mlp[0].weight.grad is not None or lora
+        assert encoder.mlp[-1].weight.abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_denoisers_are_called_as_world_models_call_them(
+    name: str, data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Same arguments but for noise and time, and the same first frame: trained on what inference gives."""
+    from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution as Gaussian
+
+    stock = Gaussian.__init__
+    monkeypatch.setattr(
+        Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
+    )
+    trainer = make_trainer(name, data, weights(name), checkpointing=False, rows=1, drop=0.0)
+    clip = trainer._clips[0]
+    trained = _record(
+        trainer, lambda: trainer._compute_losses(trainer.places[0], [clip], torch.Generator().manual_seed(0))
+    )
+    generator = trainer.objective.generator
+    control = Control(clip.actions[1:], action.to_trajectory(clip.actions[1:]), action.to_viewpoints(clip.actions[1:]))
+    generator.guidance = 1.0
+    with torch.no_grad():
+        inferred = _record(trainer, lambda: generator.make_clips(clip.images[:1], [control], np.zeros(1, np.uint64)))
+    assert trained.keys() | {"attention_kwargs"} == inferred.keys() | {"attention_kwargs"}
+    for key in trained.keys() - {"hidden_states", "timestep", "sample"}:
+        if isinstance(trained[key], torch.Tensor):
+            torch.testing.assert_close(trained[key].expand_as(inferred[key]), inferred[key], msg=key)
+        else:
+            assert trained[key] == inferred[key], key
+    _compare_first_frames(name, trainer, trained, inferred)
+
+
+def _record(trainer: PostTrainer, call: Any) -> dict[str, Any]:
+    """The arguments of the first call of a denoiser."""
+    calls: list[dict[str, Any]] = []
+    denoiser = getattr(trainer.objective.pipeline, trainer.places[0])
+
+    def note(_: Any, args: Any, kwargs: Any) -> None:
+        positional = dict(zip(("sample", "timestep"), args, strict=False))
+        calls.append({**positional, **kwargs})
+
+    handle = denoiser.register_forward_pre_hook(note, with_kwargs=True, prepend=True)
+    call()
+    handle.remove()
+    return calls[0]
+
+
+def _compare_first_frames(name: str, trainer: PostTrainer, trained: dict[str, Any], inferred: dict[str, Any]) -> None:
+    if name == "ltx-action":
+        first = 2 * 4  # tokens of the first frame
+        torch.testing.assert_close(trained["hidden_states"][:, :first], inferred["hidden_states"][:, :first])
+        assert not trained["timestep"][:, :first].any() and not inferred["timestep"][:, :first].any()
+        assert trained["timestep"][:, first:].min() > 0
+        assert trained["timestep"].shape == inferred["timestep"].shape
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    card = post_train(name, data, out, weights=weights(name), device="cpu", recipe=tiny_recipe(name), part="all")
+    assert card["steps"] == 2 * len(find_family(name)[0].denoisers) and np.isfinite(card["loss"])
+    assert not (tmp_path / "out.checkpoint").exists()
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    recipe = tiny_recipe(name)
+    model = wiw.world_model(
+        name, checkpoint=str(out), device="cpu", size=recipe.size, frames=recipe.frames, steps=2, **options
+    )
+    plan = action.pad([action.TURN_LEFT], recipe.frames - 1)
+    views = action.to_trajectory(plan), action.to_viewpoints(plan)
+    control = Control(plan, *views, ids=action.with_null(plan), length=1)
+    image = np.full((1, *recipe.size, 3), 90, np.uint8)
+    frames = model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64))
+    assert frames.shape == (1, recipe.frames, *recipe.size, 3)
+    np.testing.assert_array_equal(frames[:, 0], image)
+    assert json.loads((out / "training.json").read_text())["model"] == name
+
+
+# -- resuming ----------------------------------------------------------------------------------------------------------
+
+VICTIM = """
+import sys, os, signal, torch
+sys.path[:0] = {path!r}
+torch.set_num_threads(1)
+from post_training_parts import tiny_recipe
+from wiw.training.post_training.train import post_train
+stop, number = {stop}, {number}
+def on_step(step, steps, loss):
+    print(step, flush=True)
+    if step == stop:
+        os.kill(os.getpid(), number)
+recipe = tiny_recipe({name!r}, epochs=20)
+post_train({name!r}, {data!r}, {out!r}, weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
+"""
+
+
+def _run(name: str, data: Path, weights: Path, out: Path, stop: int, number: int) -> subprocess.CompletedProcess[str]:
+    path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    script = VICTIM.format(
+        path=path, name=name, data=str(data), out=str(out), weights=str(weights), stop=stop, number=int(number)
+    )
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tmp_path: Path) -> None:
+    name = "ltx-action"
+    options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe(name, epochs=20)
+    post_train(name, data, tmp_path / "whole", recipe=recipe, **options)
+    killed = _run(name, data, weights(name), tmp_path / "killed", 11, signal.SIGKILL)
+    assert killed.returncode == -signal.SIGKILL and killed.stdout.split()[-1] == "11", killed.stderr
+    steps: list[int] = []
+    post_train(name, data, tmp_path / "killed", recipe=recipe, on_step=lambda step, *_: steps.append(step), **options)
+    assert steps == list(range(11, 21))  # the state after step 10 was the last on disk
+    assert contents(tmp_path / "whole") == contents(tmp_path / "killed")
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_sigterm_writes_the_state_and_ends_the_process(data: Path, weights: Any, tmp_path: Path) -> None:
+    ended = _run("ltx-action", data, weights("ltx-action"), tmp_path / "out", 3, signal.SIGTERM)
+    assert ended.returncode == -signal.SIGTERM and ended.stdout.split()[-1] == "3", ended.stderr
+    assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3
+
+
+def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path: Path) -> None:
+    found: list[int] = []
+    state = tmp_path / "out.checkpoint"
+
+    def on_step(step: int, steps: int, loss: float) -> None:
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        if step > 2 and state.exists():
+            found.append(torch.load(state, weights_only=True)["step"])
+
+    before = signal.getsignal(signal.SIGUSR1)
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action", epochs=4)
+    post_train("ltx-action", data, tmp_path / "out", recipe=recipe, on_step=on_step, **options)
+    assert found == [2, 2] and signal.getsignal(signal.SIGUSR1) == before
+
+
+def test_other_data_or_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
+    _run("ltx-action", data, weights("ltx-action"), tmp_path / "out", 3, signal.SIGTERM)
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    with pytest.raises(ArgumentError, match="other data or options"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=tiny_recipe("ltx-action", epochs=20, seed=1), **options)
+
+
+def test_a_loss_that_is_not_finite_names_the_batch_and_keeps_the_state(
+    data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stock = PostTrainer._compute_losses
+
+    def spoil(self: PostTrainer, *args: Any) -> torch.Tensor:
+        return stock(self, *args) * (torch.nan if self.step_count == 3 else 1)
+
+    monkeypatch.setattr(PostTrainer, "_compute_losses", spoil)
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action", epochs=6)
+    with pytest.raises(TrainingError, match=r"step 4: the loss is not finite on a batch of clip \d+ \(scene "):
+        post_train("ltx-action", data, tmp_path / "out", recipe=recipe, **options)
+    content = torch.load(tmp_path / "out.checkpoint", weights_only=True)
+    assert content["step"] == 3
+    assert all(torch.isfinite(value).all() for value in content["state"]["weights"].values())
+    monkeypatch.undo()
+    assert post_train("ltx-action", data, tmp_path / "out", recipe=recipe, **options)["steps"] == 6
+
+
+# -- order, noise, recipes ---------------------------------------------------------------------------------------------
+
+
+def test_the_order_covers_the_clips_and_subsets_are_nested() -> None:
+    order = ClipOrder(total=50, count=12, batch=4, seed=3)
+    assert order.steps_per_epoch == 3
+    epochs = [np.concatenate([order.select(3 * epoch + step) for step in range(3)]) for epoch in range(2)]
+    assert len(set(epochs[0])) == 12 and set(epochs[0]) == set(epochs[1]) and list(epochs[0]) != list(epochs[1])
+    more = replace(order, count=24)
+    assert set(epochs[0]) < set(np.concatenate([more.select(step) for step in range(6)]))
+    np.testing.assert_array_equal(order.select(4), ClipOrder(50, 12, 4, 3).select(4))
+
+
+def test_levels_of_a_shifted_schedule_stay_on_their_side() -> None:
+    random = torch.Generator().manual_seed(0)
+    high = draw_shifted_uniform(20000, 5.0, random, 0.9, 1.0)
+    assert 0.9 <= high.min() and high.max() <= 1
+    both = draw_shifted_uniform(20000, 5.0, random)
+    assert abs(float((both >= 0.9).float().mean()) - 0.357) < 0.02  # the noisy expert's share of the schedule
+    weights = weigh_by_bell(both, 5.0)
+    assert abs(float(weights.mean()) - 1) < 0.02 and weights.min() >= 0
+    assert weigh_by_bell(torch.tensor([0.5]), 5.0) > weigh_by_bell(torch.tensor([0.95]), 5.0)
+
+
+def test_shipped_recipes_are_those_of_the_world_models() -> None:
+    for name in NAMES:
+        recipe, (model, _) = load_recipe(name), find_family(name)
+        assert recipe.frames == model.accepts.frames and recipe.size == (576, 1024)
+        assert recipe.drop == 0.1 and recipe.epochs == 1 and recipe.clips == 40_000
+
+
+def test_rates_follow_the_schedule() -> None:
+    recipe = load_recipe("ltx-action", options={"schedule": "cosine", "warmup": 0.2})
+    assert recipe.scale_rate(0.1) == pytest.approx(0.5) and recipe.scale_rate(0.2) == pytest.approx(1)
+    assert recipe.scale_rate(0.6) == pytest.approx(0.5) and recipe.scale_rate(1.0) == pytest.approx(0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"lr": 1}, "no recipe has 'lr'"),
+        ({"rate": "fast"}, "rate: expected a number, got 'fast'"),
+        ({"rate": -1.0}, "rate: expected a finite number above 0"),
+        ({"batch": 3, "rows": 2}, "rows: expected a divisor of batch"),
+        ({"schedule": "step"}, "one of constant, linear, cosine"),
+        ({"frames": 1}, "frames: expected 2 or more"),
+        ({"drop": 1.0}, "drop: expected a share"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        load_recipe("ltx-action", options=options)
+
+
+def test_what_cannot_be_trained_is_refused(data: Path, weights: Any, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="'nwm-action' is not trained here; expected one of"):
+        post_train("nwm-action", data, tmp_path / "out")
+    front = save_dataset(tmp_path / "front", projection="perspective")
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action")
+    with pytest.raises(ArgumentError, match="see panoramas"):
+        post_train("ltx-action", front, tmp_path / "out", recipe=recipe, **options)
+    with pytest.raises(ArgumentError, match="no segment has 33 frames"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=replace(recipe, frames=33), **options)
+    with pytest.raises(ArgumentError, match="expected at least 400 clips"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=replace(recipe, batch=400), **options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note").touch()
+    with pytest.raises(ArgumentError, match="holds something already"):
+        post_train("ltx-action", data, tmp_path / "full", recipe=recipe, **options)
+
+
+def test_a_lora_that_covers_nothing_is_refused() -> None:
+    pipeline = tiny_pipelines.ltx()
+    with pytest.raises(ArgumentError, match=r"has no layers ffn.net.0.proj, ffn.net.2"):
+        add_lora(pipeline, "transformer", 4)
