@@ -34,7 +34,8 @@ from wiw.training.post_training.families import FAMILIES, find_family, load_gene
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
 from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import build_config, post_train
-from wiw.training.post_training.trainer import PostTrainer, add_lora
+from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
+from wiw.training.post_training.wan import to_image
 
 NAMES = sorted(FAMILIES)
 
@@ -125,7 +126,6 @@ def test_gradients_reach_what_is_trained_and_nothing_else(name: str, data: Path,
     for place in trainer.places:
         encoder = trainer.encoders[place]
         assert all(torch.isfinite(value).all() for value in encoder.parameters())
-        assert encoder.mlp[-1].weight.abs().sum() > 0 and encoder.mlp[0].weight.grad is not None or lora
         assert encoder.mlp[-1].weight.abs().max() > 1e-3
 
 
@@ -148,9 +148,13 @@ def test_denoisers_are_called_as_world_models_call_them(
     generator = trainer.objective.generator
     control = Control(clip.actions[1:], action.to_trajectory(clip.actions[1:]), action.to_viewpoints(clip.actions[1:]))
     generator.guidance = 1.0
+    observed = load_clips([clip], generator.size, np.arange(5)).frames[0, :, 0]
+    image = np.asarray(to_image(observed))[None]
     with torch.no_grad():
-        inferred = _record(trainer, lambda: generator.make_clips(clip.images[:1], [control], np.zeros(1, np.uint64)))
+        inferred = _record(trainer, lambda: generator.make_clips(image, [control], np.zeros(1, np.uint64)))
     assert trained.keys() | {"attention_kwargs"} == inferred.keys() | {"attention_kwargs"}
+    if name == "svd-action":  # what it says of the observation's noise is drawn anew for each clip
+        assert trained.pop("added_time_ids")[0, :2].tolist() == inferred.pop("added_time_ids")[0, :2].tolist()
     for key in trained.keys() - {"hidden_states", "timestep", "sample"}:
         if isinstance(trained[key], torch.Tensor):
             torch.testing.assert_close(trained[key].expand_as(inferred[key]), inferred[key], msg=key)
@@ -180,7 +184,24 @@ def _compare_first_frames(name: str, trainer: PostTrainer, trained: dict[str, An
         torch.testing.assert_close(trained["hidden_states"][:, :first], inferred["hidden_states"][:, :first])
         assert not trained["timestep"][:, :first].any() and not inferred["timestep"][:, :first].any()
         assert trained["timestep"][:, first:].min() > 0
+    elif name == "wan2.2-5b-action":
+        first = 1 * 2  # of 2 x 4 latents, patches of 2 x 2
+        torch.testing.assert_close(trained["hidden_states"][:, :, 0], inferred["hidden_states"][:, :, 0])
+        assert not trained["timestep"][:, :first].any() and trained["timestep"][:, first:].min() > 0
+    elif name.startswith("wan"):  # mask and observation in channels of their own
+        torch.testing.assert_close(trained["hidden_states"][:, 16:], inferred["hidden_states"][:, 16:])
+        assert trained["hidden_states"][:, 16:20, 0].all() and not trained["hidden_states"][:, 16:20, 1:].any()
+    elif name == "cosmos-predict2-action":
+        torch.testing.assert_close(trained["hidden_states"][:, :, 0], inferred["hidden_states"][:, :, 0])
+        torch.testing.assert_close(trained["timestep"][:, :, 0], inferred["timestep"][:, :, 0])
+    if name == "svd-action":
+        assert trained["sample"].shape == inferred["sample"].shape
+        seen, shown = (each["sample"][0, :, 4:].flatten(1) for each in (trained, inferred))
+        assert torch.equal(seen[0], seen[-1]) and float(torch.corrcoef(torch.stack([seen[0], shown[0]]))[0, 1]) > 0.9
+        assert float(inferred["timestep"]) == pytest.approx(0.25 * np.log(700), rel=1e-3)  # a quarter of ln sigma
+    else:
         assert trained["timestep"].shape == inferred["timestep"].shape
+        assert trained["hidden_states"].shape == inferred["hidden_states"].shape
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -218,7 +239,8 @@ def on_step(step, steps, loss):
     if step == stop:
         os.kill(os.getpid(), number)
 recipe = tiny_recipe({name!r}, epochs=20)
-post_train({name!r}, {data!r}, {out!r}, weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
+options = dict(weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
+post_train({name!r}, {data!r}, {out!r}, **options)
 """
 
 
@@ -310,7 +332,7 @@ def test_the_order_covers_the_clips_and_subsets_are_nested() -> None:
 def test_levels_of_a_shifted_schedule_stay_on_their_side() -> None:
     random = torch.Generator().manual_seed(0)
     high = draw_shifted_uniform(20000, 5.0, random, 0.9, 1.0)
-    assert 0.9 <= high.min() and high.max() <= 1
+    assert high.min() >= 0.9 and high.max() <= 1
     both = draw_shifted_uniform(20000, 5.0, random)
     assert abs(float((both >= 0.9).float().mean()) - 0.357) < 0.02  # the noisy expert's share of the schedule
     weights = weigh_by_bell(both, 5.0)

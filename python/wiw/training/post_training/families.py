@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action-conditioned models that are trained here, each with its loss; and the generator that training begins with."""
+"""The action-conditioned models that are trained here, each with its loss, and the generators they begin with."""
 
 from __future__ import annotations
 
@@ -8,15 +8,23 @@ from typing import Any
 
 from wiw.errors import ArgumentError
 from wiw.suggestions import did_you_mean
+from wiw.training.post_training.cosmos import CosmosObjective
 from wiw.training.post_training.ltx import LTXObjective
 from wiw.training.post_training.objective import Objective
 from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.svd import SVDObjective
+from wiw.training.post_training.wan import WanObjective
 from wiw.world_models.video.actions import variants
 from wiw.world_models.video.actions.model import ActionConditioned
 from wiw.world_models.video.model import VideoModel
 
 FAMILIES: Mapping[str, tuple[type[ActionConditioned], type[Objective]]] = {
+    "svd-action": (variants.SVDAction, SVDObjective),
     "ltx-action": (variants.LTXAction, LTXObjective),
+    "wan2.1-action": (variants.Wan21Action, WanObjective),
+    "wan2.2-5b-action": (variants.Wan22SmallAction, WanObjective),
+    "wan2.2-a14b-action": (variants.Wan22Action, WanObjective),
+    "cosmos-predict2-action": (variants.CosmosPredict2Action, CosmosObjective),
 }
 """World model and loss, by the model's name."""
 
