@@ -17,6 +17,8 @@ import pytest
 
 import wiw
 from wiw import action
+from wiw.cli.app import main
+from wiw.cli.train_video import VIDEO
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, TrainingError
 from wiw.types import Conditioning, Control
@@ -25,19 +27,20 @@ pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffuser
 pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
-import tiny_pipelines
 import torch
 from post_training_parts import save_dataset, tiny_recipe
 
+import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.families import FAMILIES, find_family, load_generator
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
+from wiw.training.post_training.objective import to_image
 from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import build_config, post_train
 from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
-from wiw.training.post_training.wan import to_image
 
 NAMES = sorted(FAMILIES)
+STEPS = {name: 10 if name == "svd-action" else 20 for name in NAMES}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,7 +89,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
     """Measured on the same noise before and after."""
-    trainer = make_trainer(name, data, weights(name), rate=3e-3, schedule="constant", warmup=0.0, epochs=20, drop=0.0)
+    trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0)
 
     def measure(place: str) -> float:
         clips = [trainer._clips[int(row)] for row in trainer.order.select(0)]
@@ -94,10 +97,24 @@ def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, wei
             return float(trainer._compute_losses(place, clips * 4, torch.Generator().manual_seed(9)).mean())
 
     before = {place: measure(place) for place in trainer.places}
-    for _ in range(20 * trainer.steps_per_epoch):
+    for _ in range(STEPS[name] * trainer.steps_per_epoch):
         trainer.train_step(3e-3)
     for place in trainer.places:
         assert measure(place) < 0.95 * before[place], (place, before[place], measure(place))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_half_precision_trains_weights_in_float32(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), precision="bfloat16")
+    assert np.isfinite(trainer.train_step(1e-3)) and np.isfinite(trainer.train_step(1e-3))
+    assert {value.dtype for value in trainer.trained.values()} == {torch.float32}
+    frozen = {
+        value.dtype
+        for place in trainer.places
+        for value in getattr(trainer.objective.pipeline, place).parameters()
+        if not value.requires_grad
+    }
+    assert not trainer.recipe.lora or torch.bfloat16 in frozen
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -392,3 +409,39 @@ def test_a_lora_that_covers_nothing_is_refused() -> None:
     pipeline = tiny_pipelines.ltx()
     with pytest.raises(ArgumentError, match=r"has no layers ffn.net.0.proj, ffn.net.2"):
         add_lora(pipeline, "transformer", 4)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text("{frames: 9, size: [64, 128], batch: 2, clips: 4}")
+    command = ["train", "ltx-action", "--data", str(data), "--weights", str(weights("ltx-action")), "--part", "all"]
+    out = tmp_path / "out"
+    assert main([*command, "--recipe", str(recipe), "--option", "rate=1e-3", "--epochs", "2", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "4 steps of 2 clips, loss " in said.out and f"checkpoint={out}" in said.out
+    assert "training: step 4/4" in said.err and "clips/s" in said.err and "GB" in said.err
+    card = json.loads((out / "training.json").read_text())
+    assert card["recipe"]["rate"] == 1e-3 and card["recipe"]["batch"] == 2 and card["steps"] == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ltx-action"], "ltx-action trains on a navigation dataset"),
+        (["ltx-action", "--minutes", "3"], "--minutes: ltx-action has no time limit"),
+        (["ltx-action", "--scenes", "house.glb"], "--scenes: ltx-action does not train on scenes"),
+        (["warpnet", "--data", "data"], "--data: warpnet does not train on navigation datasets"),
+        (["ltx-action", "--data", "nowhere"], "meta.json is missing"),
+        (["ltx-action", "--data", "nowhere", "--option", "lr=1"], "no recipe has 'lr'"),
+    ],
+)
+def test_the_command_refuses(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *arguments]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_names_all_that_is_trained() -> None:
+    assert set(VIDEO) == set(FAMILIES)

@@ -34,6 +34,7 @@ class CosmosObjective(FlowObjective):
             self._words, _ = self.pipeline.encode_prompt(
                 prompt=[""], do_classifier_free_guidance=False, max_sequence_length=MAX_WORDS, device=self.device
             )
+        self.release_text_encoder()
         self._fps = self.read_arguments(1)["fps"]
 
     @torch.no_grad()

@@ -34,6 +34,7 @@ class LTXObjective(FlowObjective):
                 device=self.device,
             )
         self._words, self._mask = words[0], words[1]
+        self.release_text_encoder()
 
     @torch.no_grad()
     def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:

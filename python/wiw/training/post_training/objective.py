@@ -12,7 +12,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
+from PIL import Image
 from torch import Tensor
 
 from wiw.errors import ArgumentError
@@ -55,14 +57,16 @@ class Objective(ABC):
         with torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled):
             yield
 
+    def release_text_encoder(self) -> None:
+        """Move the text encoder off the device, once the empty prompt is encoded."""
+        self.pipeline.text_encoder.to("cpu")
+
     def draw_normal(self, like: Tensor, random: torch.Generator) -> Tensor:
         """Return standard normal noise, float32, of the shape and on the device of `like`."""
         return torch.randn(like.shape, generator=random).to(like.device)
 
     def read_arguments(self, images: int) -> dict[str, Any]:
         """Return what the world model hands its pipeline for so many rows without words."""
-        import numpy as np
-
         empty = Control(np.zeros(0, np.int8), np.zeros((0, 3)), np.zeros((0, 4, 4)))
         return self.generator.arguments([None] * images, [empty] * images)
 
@@ -109,3 +113,9 @@ def require(condition: bool, expected: str, found: object) -> None:
     """Raise ArgumentError unless a network is of the kind that is expected."""
     if not condition:
         raise ArgumentError(f"weights: expected {expected}, got {found}")
+
+
+def to_image(pixels: Tensor) -> Image.Image:
+    """Return an observation, [3, H, W] from -1 to 1, as the picture it was."""
+    levels = ((pixels + 1) * 127.5).round().clamp(0, 255).permute(1, 2, 0).cpu().numpy()
+    return Image.fromarray(levels.astype(np.uint8))

@@ -122,12 +122,25 @@ def _read(path: Path) -> dict[str, Any]:
 def _check(values: Mapping[str, Any], where: str) -> dict[str, Any]:
     known = [field.name for field in fields(PostTrainingRecipe)]
     kinds = get_type_hints(PostTrainingRecipe)
-    for name, value in values.items():
+    found: dict[str, Any] = {}
+    for name, given in values.items():
         if name not in known:
             raise ArgumentError(f"{where}: no recipe has '{name}'; expected {', '.join(known)}")
+        value = _parse_float(given) if kinds[name] is float else given
         if not _fits(value, kinds[name]):
-            raise ArgumentError(f"{where}: {name}: expected {_describe(kinds[name])}, got {value!r}")
-    return {name: float(value) if kinds[name] is float else value for name, value in values.items()}
+            raise ArgumentError(f"{where}: {name}: expected {_describe(kinds[name])}, got {given!r}")
+        found[name] = value
+    return found
+
+
+def _parse_float(value: Any) -> Any:
+    """Return a number as a float, also one that YAML takes for text, such as 1e-5; anything else as it is."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return value
 
 
 def _fits(value: Any, kind: Any) -> bool:

@@ -6,9 +6,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from wiw.training.post_training.objective import Encoded, Objective
+from wiw.training.post_training.objective import Encoded, Objective, to_image
 from wiw.training.post_training.recipe import PostTrainingRecipe
-from wiw.training.post_training.wan import to_image
 from wiw.world_models.video.model import VideoModel
 
 LOG_SIGMA = (0.7, 1.6)

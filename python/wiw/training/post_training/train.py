@@ -79,7 +79,7 @@ def post_train(
     model, objective_class = find_family(name)
     devices.require(Requirements(("peft",), "diffusers"))
     device = devices.device(device)
-    recipe = recipe or _choose_precision(load_recipe(name), device)
+    recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
     dataset = NavigationData(data, part)
     _require_panoramas(dataset)
@@ -156,8 +156,9 @@ def describe_dataset(data: NavigationData, part: str) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(files.encode()).hexdigest(), "part": part, "segments": len(data)}
 
 
-def _choose_precision(recipe: PostTrainingRecipe, device: str) -> PostTrainingRecipe:
-    return recipe if device.startswith("cuda") else replace(recipe, precision="float32")
+def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
+    """Return the recipe in float32 where there is no GPU, on which half precision is fast."""
+    return recipe if devices.device(device).startswith("cuda") else replace(recipe, precision="float32")
 
 
 def _resolve(weights: str) -> str:

@@ -58,6 +58,7 @@ class PostTrainer(ResumableTrainer):
         self.objective, self.recipe, self._clips = objective, recipe, clips
         self.places = tuple(places)
         self.mean_loss = float("nan")
+        self._active: str | None = None
         self.order = arrange_clips(len(clips), recipe)
         self._ids = np.zeros(len(config.vocabulary), np.int64)
         self._ids[list(config.ids)] = list(config.ids.values())
@@ -90,6 +91,7 @@ class PostTrainer(ResumableTrainer):
             FileError: a clip cannot be read.
         """
         place, own_step = self.locate(self.step_count)
+        self._activate(place)
         batch = self.order.select(own_step)
         self.optimizer.zero_grad(set_to_none=True)
         total = 0.0
@@ -145,6 +147,13 @@ class PostTrainer(ResumableTrainer):
             "this step is kept. Look at these clips (`wiw data verify`), or begin anew with a lower rate or "
             "precision=float32"
         )
+
+    def _activate(self, place: str) -> None:
+        """Keep on the device only the denoiser that is trained."""
+        if self._active != place:
+            for each in self.places:
+                getattr(self.objective.pipeline, each).to(self.objective.device if each == place else "cpu")
+            self._active = place
 
     def _freeze_rest(self) -> None:
         """Let no gradient reach what is not trained."""

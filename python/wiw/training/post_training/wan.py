@@ -5,13 +5,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
-from wiw.training.post_training.objective import Encoded, FlowObjective
+from wiw.training.post_training.objective import Encoded, FlowObjective, to_image
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.world_models.video.model import VideoModel
 
@@ -36,6 +34,7 @@ class WanObjective(FlowObjective):
             self._words, _ = self.pipeline.encode_prompt(
                 prompt="", do_classifier_free_guidance=False, max_sequence_length=MAX_WORDS, device=self.device
             )
+        self.release_text_encoder()
 
     @torch.no_grad()
     def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
@@ -44,7 +43,9 @@ class WanObjective(FlowObjective):
         given = torch.cat([self._condition(each[None], clips.shape[2]) for each in observations])
         encoded = {"latents": self._encode(clips), "first" if self.keeps_first else "given": given}
         if self.pipeline.transformer.config.image_dim is not None:
-            encoded["pictures"] = torch.cat([self.pipeline.encode_image(to_image(each)) for each in observations])
+            encoded["pictures"] = torch.cat(
+                [self.pipeline.encode_image(to_image(each), self.device) for each in observations]
+            )
         return encoded
 
     def draw_levels(self, place: str, latents: Tensor, random: torch.Generator) -> Tensor:
@@ -104,9 +105,3 @@ class WanObjective(FlowObjective):
             for each in (vae.config.latents_mean, vae.config.latents_std)
         )
         return (found - mean) / std
-
-
-def to_image(pixels: Tensor) -> Image.Image:
-    """Return an observation, [3, H, W] from -1 to 1, as the picture it was."""
-    levels = ((pixels + 1) * 127.5).round().clamp(0, 255).permute(1, 2, 0).cpu().numpy()
-    return Image.fromarray(levels.astype(np.uint8))
