@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -40,7 +41,7 @@ from wiw.training.post_training.train import build_config, post_train
 from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
 
 NAMES = sorted(FAMILIES)
-STEPS = {name: 10 if name == "svd-action" else 20 for name in NAMES}
+STEPS = {name: 10 if name in ("svd-action", "wan2.2-a14b-action") else 20 for name in NAMES}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,6 +102,76 @@ def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, wei
         trainer.train_step(3e-3)
     for place in trainer.places:
         assert measure(place) < 0.95 * before[place], (place, before[place], measure(place))
+
+
+@pytest.mark.parametrize("name", ["ltx-action", "wan2.2-5b-action", "cosmos-predict2-action"])
+def test_the_first_frame_is_given_and_out_of_the_loss(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), checkpointing=False)
+    objective, clips = trainer.objective, torch.rand(2, 3, trainer.recipe.frames, *trainer.recipe.size) * 2 - 1
+    encoded = dict(objective.encode(clips, torch.Generator().manual_seed(0)))
+
+    def measure() -> torch.Tensor:
+        with torch.no_grad():
+            return objective.compute_losses("transformer", encoded, torch.Generator().manual_seed(1))
+
+    before, latents = measure(), encoded["latents"]
+    encoded["latents"] = torch.cat([latents[:, :, :1] + 1, latents[:, :, 1:]], dim=2)
+    torch.testing.assert_close(measure(), before, rtol=0, atol=0)  # the target of the first frame plays no part
+    encoded["latents"] = torch.cat([latents[:, :, :1], latents[:, :, 1:] + 1], dim=2)
+    assert (measure() - before).abs().min() > 1e-3
+    encoded |= {"latents": latents, "first": encoded["first"] + 1}
+    assert (measure() - before).abs().min() > 1e-6  # the denoiser sees the one that is given
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_recipe_resumes_exactly(name: str, data: Path, weights: Any) -> None:
+    """From the middle; where there are two experts, from the middle of the second."""
+    changes = {"epochs": 4, "batch": 4, "rows": 4}
+    whole = make_trainer(name, data, weights(name), **changes)
+    steps = whole.steps_per_epoch * 4
+    state = io.BytesIO()
+    for step in range(steps):
+        whole.train_step(1e-3)
+        if step + 1 == 3 * steps // 4:
+            torch.save(whole.state_dict(), state)
+    resumed = make_trainer(name, data, weights(name), **changes)
+    state.seek(0)
+    resumed.load_state_dict(torch.load(state, weights_only=True))
+    assert resumed.step_count == 3 * steps // 4
+    for _ in range(steps - resumed.step_count):
+        resumed.train_step(1e-3)
+    assert resumed.mean_loss == whole.mean_loss
+    assert all(torch.equal(value, resumed.trained[key]) for key, value in whole.trained.items())
+
+
+def test_actions_are_those_of_the_clips_and_dropped_in_a_share(data: Path, weights: Any) -> None:
+    trainer = make_trainer("ltx-action", data, weights("ltx-action"), drop=0.5, rows=4)
+    told: list[tuple[torch.Tensor, torch.Tensor]] = []
+    trainer.encoders["transformer"].register_forward_pre_hook(lambda _, args: told.append(args))
+    for _ in range(6):
+        trainer.train_step(1e-3)
+    assert 0.2 < float(torch.cat([dropped for _, dropped in told]).float().mean()) < 0.8
+    actions = torch.cat([actions for actions, _ in told])
+    assert not actions[:, 0].any() and set(actions[:, 1:].flatten().tolist()) == {1, 2, 3}
+
+
+def test_each_expert_is_trained_on_its_side_of_the_boundary(data: Path, weights: Any) -> None:
+    name = "wan2.2-a14b-action"
+    trainer = make_trainer(name, data, weights(name))
+    like = torch.zeros(2000, 1, 1, 1, 1)
+    random = torch.Generator().manual_seed(0)
+    high, low = (trainer.objective.draw_levels(place, like, random) for place in ("transformer", "transformer_2"))
+    assert high.min() >= 0.9 and low.max() <= 0.9 and low.min() < 0.1
+    assert [trainer.locate(step) for step in range(4)] == [
+        ("transformer", 0),
+        ("transformer", 1),
+        ("transformer_2", 0),
+        ("transformer_2", 1),
+    ]
+    before = {key: value.detach().clone() for key, value in trainer.trained.items()}
+    trainer.train_step(1e-2)
+    moved = {key for key, value in trainer.trained.items() if not torch.equal(value, before[key])}
+    assert moved and not any("transformer_2" in key for key in moved)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -283,10 +354,13 @@ def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tm
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
-def test_sigterm_writes_the_state_and_ends_the_process(data: Path, weights: Any, tmp_path: Path) -> None:
+def test_sigterm_writes_the_state_which_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
     ended = _run("ltx-action", data, weights("ltx-action"), tmp_path / "out", 3, signal.SIGTERM)
     assert ended.returncode == -signal.SIGTERM and ended.stdout.split()[-1] == "3", ended.stderr
     assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    with pytest.raises(ArgumentError, match="other data or options"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=tiny_recipe("ltx-action", epochs=20, seed=1), **options)
 
 
 def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path: Path) -> None:
@@ -304,13 +378,6 @@ def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path
     recipe = tiny_recipe("ltx-action", epochs=4)
     post_train("ltx-action", data, tmp_path / "out", recipe=recipe, on_step=on_step, **options)
     assert found == [2, 2] and signal.getsignal(signal.SIGUSR1) == before
-
-
-def test_other_data_or_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
-    _run("ltx-action", data, weights("ltx-action"), tmp_path / "out", 3, signal.SIGTERM)
-    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
-    with pytest.raises(ArgumentError, match="other data or options"):
-        post_train("ltx-action", data, tmp_path / "out", recipe=tiny_recipe("ltx-action", epochs=20, seed=1), **options)
 
 
 def test_a_loss_that_is_not_finite_names_the_batch_and_keeps_the_state(

@@ -106,7 +106,8 @@ def post_train(
 
     phases = len(model.denoisers)
     order = arrange_clips(len(dataset.clips(recipe.frames)), recipe)
-    with loading.memory_guard(generator), state.watch():
+    remedies = "; ".join(list_remedies(recipe))
+    with devices.memory_guard(f"training {name} on {generator.device}", remedies), state.watch():
         try:
             trainer, _ = run_training(
                 create,
@@ -159,6 +160,16 @@ def describe_dataset(data: NavigationData, part: str) -> dict[str, Any]:
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
     """Return the recipe in float32 where there is no GPU, on which half precision is fast."""
     return recipe if devices.device(device).startswith("cuda") else replace(recipe, precision="float32")
+
+
+def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
+    """List the numbers of a recipe that need less memory than the present ones, the mildest first."""
+    height, width = recipe.size
+    remedies = [f"rows=1 (now {recipe.rows})"] if recipe.rows > 1 else []
+    remedies += ["precision=bfloat16"] if recipe.precision == "float32" else []
+    remedies += [] if recipe.checkpointing else ["checkpointing=true"]
+    remedies += [] if recipe.lora else ["lora=32, for the Wan models"]
+    return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
 
 
 def _resolve(weights: str) -> str:
