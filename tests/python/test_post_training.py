@@ -292,6 +292,61 @@ def _compare_first_frames(name: str, trainer: PostTrainer, trained: dict[str, An
         assert trained["hidden_states"].shape == inferred["hidden_states"].shape
 
 
+def _predict_perfectly(name: str, latents: torch.Tensor) -> Any:
+    """What a denoiser would return that knows the clip's latents: its forward."""
+
+    def predict(*args: Any, **kwargs: Any) -> tuple[torch.Tensor]:
+        if name == "svd-action":
+            noisy, log = args[0][:, :, :4], 4 * args[1].double().reshape(-1, 1, 1, 1, 1)
+            sigma, scale = log.exp(), (log.exp().square() + 1).sqrt()
+            noise = (noisy * scale - latents) / sigma
+            return (((noise - sigma * latents) / scale).float(),)
+        noisy, times = kwargs["hidden_states"], kwargs["timestep"].double()
+        if name == "ltx-action":
+            known = latents.flatten(2).transpose(1, 2)
+            return (((noisy - known) / (times[..., None] / 1000).clamp(min=1e-9)).float(),)
+        level = times if name.startswith("cosmos") else times.reshape(len(times), -1).amax(1) / 1000
+        level = level if name.startswith("cosmos") else level[:, None, None, None, None]
+        return (((noisy[:, : latents.shape[1]] - latents) / level).float(),)
+
+    return predict
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_has_no_loss_in_training_generates_the_clip(
+    name: str, data: Path, weights: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise, times, signs and scales of the loss are those of the pipeline: one perfect denoiser serves both."""
+    from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution as Gaussian
+
+    stock = Gaussian.__init__
+    monkeypatch.setattr(
+        Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
+    )
+    trainer = make_trainer(name, data, weights(name), checkpointing=False, drop=0.0)
+    objective, generator = trainer.objective, trainer.objective.generator
+    clip = load_clips([trainer._clips[0]], generator.size, np.arange(5)).frames
+    encoded = objective.encode(clip, torch.Generator().manual_seed(0))
+    for place in trainer.places:
+        monkeypatch.setattr(getattr(objective.pipeline, place), "forward", _predict_perfectly(name, encoded["latents"]))
+    with torch.no_grad():
+        losses = [
+            objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.places
+        ]
+    assert float(torch.cat(losses).max()) < 1e-6
+    plan = trainer._clips[0].actions[1:]
+    control = Control(plan, action.to_trajectory(plan), action.to_viewpoints(plan))
+    arguments = generator.arguments
+    generator.arguments = lambda *each: {**arguments(*each), "output_type": "latent"}
+    generator.guidance, generator.steps = 1.0, 3
+    image = to_image(clip[0, :, 0])
+    with torch.no_grad():
+        made = torch.from_numpy(generator.generate([image], [control], [torch.Generator().manual_seed(2)]))
+    wanted = encoded["latents"]
+    wanted = wanted.flatten(2).transpose(1, 2) if name == "ltx-action" else wanted
+    torch.testing.assert_close(made.float(), wanted, rtol=0, atol=0.02)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
