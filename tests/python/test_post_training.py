@@ -409,13 +409,33 @@ def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tm
     assert not list(tmp_path.glob("*.checkpoint"))
 
 
-def test_sigterm_writes_the_state_which_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
-    ended = _run("ltx-action", data, weights("ltx-action"), tmp_path / "out", 3, signal.SIGTERM)
-    assert ended.returncode == -signal.SIGTERM and ended.stdout.split()[-1] == "3", ended.stderr
-    assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3
-    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+STOPPED = """
+import os, signal, sys
+from wiw.cli import run_process, train_video
+stock = train_video._Progress.__call__
+def show(self, step, steps, loss):
+    stock(self, step, steps, loss)
+    if step == 3:
+        os.kill(os.getpid(), signal.SIGTERM)
+train_video._Progress.__call__ = show
+run_process()
+"""
+
+
+def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
+    """As a batch system stops the command."""
+    name, out = "ltx-action", tmp_path / "out"
+    numbers = ["frames=9", "size=[64, 128]", "batch=4", "clips=4", "epochs=20"]
+    command = ["train", name, "--data", str(data), "--weights", str(weights(name)), "--part", "all", "--out", str(out)]
+    command += [each for number in numbers for each in ("--option", number)]
+    ended = subprocess.run(
+        [sys.executable, "-c", STOPPED, *command], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert ended.returncode == 75 and "Repeat the command to resume" in ended.stderr, ended.stderr
+    assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3 and not out.exists()
+    options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
     with pytest.raises(ArgumentError, match="other data or options"):
-        post_train("ltx-action", data, tmp_path / "out", recipe=tiny_recipe("ltx-action", epochs=20, seed=1), **options)
+        post_train(name, data, out, recipe=tiny_recipe(name, epochs=20, seed=1), **options)
 
 
 def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path: Path) -> None:

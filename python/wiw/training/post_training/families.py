@@ -66,4 +66,6 @@ def load_generator(
     }
     generator: type[VideoModel] = type(stock.__name__, (stock,), settings)
     given: dict[str, Any] = {"frames": recipe.frames, "size": recipe.size, "precision": recipe.precision, **options}
-    return generator(**given, **({} if weights is None else {"weights": weights}))
+    if weights is not None:
+        given["weights"] = weights
+    return generator(**given)

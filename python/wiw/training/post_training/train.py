@@ -87,7 +87,7 @@ def post_train(
     options = {"revision": revision, "variant": variant, "device": device, **_extra_options(name)}
     generator = load_generator(model, recipe, None if weights is None else _resolve(str(weights)), options)
     recipe = replace(recipe, frames=generator.frames, size=generator.size)
-    card = {
+    card: dict[str, Any] = {
         "model": name,
         "wiw": wiw.__version__,
         "weights": dict(generator._weights.identity),

@@ -169,7 +169,7 @@ class PostTrainer(ResumableTrainer):
                     value.requires_grad_(id(value) in trained)
 
     def _list_trained(self) -> dict[str, nn.Parameter]:
-        found = {}
+        found: dict[str, nn.Parameter] = {}
         for place in self.places:
             found |= {f"encoder.{place}.{name}": value for name, value in self.encoders[place].named_parameters()}
             denoiser = getattr(self.objective.pipeline, place)
