@@ -43,14 +43,18 @@ def make_grid() -> OccupancyGrid:
     return grid
 
 
+def is_color(image: np.ndarray, color: tuple[int, int, int], tolerance: int = 3) -> np.ndarray:
+    """Return which pixels of a map, without its legend, have a colour, bool [H, W]."""
+    return (np.abs(image[: -drawing.LEGEND_HEIGHT].astype(int) - color) <= tolerance).all(axis=2)
+
+
 def find(image: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
     """Return the mean place (x, y) of the pixels of a colour, from the middle of the map, in metres."""
-    rows, columns = np.nonzero((np.abs(image.astype(int) - color) <= 3).all(axis=2))
-    assert len(rows), color
-    height = len(image) - drawing.LEGEND_HEIGHT
-    rows, columns = rows[rows < height], columns[rows < height]
-    place = np.array([columns.mean() - image.shape[1] / 2, rows.mean() - height / 2])
-    return place / drawing.PIXELS_PER_METRE
+    found = is_color(image, color)
+    assert found.any(), color
+    rows, columns = np.nonzero(found)
+    height, width = found.shape
+    return np.array([columns.mean() - width / 2, rows.mean() - height / 2]) / drawing.PIXELS_PER_METRE
 
 
 # -- a picture of a map ------------------------------------------------------------------------------------------------
@@ -250,7 +254,8 @@ def test_an_explorers_pictures_show_its_map(log):
     maps = [decode_jpeg(each["believed/map"]) for each in pictures]
     known = [float((np.abs(each.astype(int) - drawing.UNKNOWN).max(axis=2) > 6).sum()) for each in maps]
     assert len(maps) > 2 and known[-1] > known[0] > 0.05 * maps[0][..., 0].size
-    assert all(find(each, drawing.PATH).size for each in maps)
+    path = [int(is_color(each, drawing.PATH, 20).sum()) for each in maps]  # JPEG blurs colours of small things
+    assert path[0] > 10 and path[-1] > path[0]
     assert all(decode_jpeg(each["believed/views"]).shape[1] == 2 * 336 + 6 for each in pictures)
 
 

@@ -25,10 +25,9 @@ def solve_episode(env: ManipulationEnv, discrete: bool = False) -> dict[str, flo
     kind, setup = env.table.kind, env.table.setup
     while True:
         plan = kind.plan_expert(env.observation.places, setup.target)
-        for pose in GRID.decode(GRID.encode(plan)) if discrete else plan:
-            *_, done, over, info = env.step(pose)
-            if done or over:
-                return info["result"]
+        segment = env.run(GRID.decode(GRID.encode(plan)) if discrete else plan)
+        if segment.terminated or segment.truncated:
+            return env.result()
 
 
 @pytest.mark.parametrize("discrete", [False, True])

@@ -11,10 +11,10 @@ nbformat = pytest.importorskip("nbformat")
 
 FOLDER = Path(__file__).parents[2] / "notebooks"
 SIZES = {  # names of the cell that is tagged "parameters", and what is enough to run every cell
-    "01_quickstart": {},
+    "01_quickstart": {"decisions": 4},
     "02_compare_world_models": {"apartments": 2, "starts": 1, "decisions": 2},
     "03_plug_in_your_model": {"apartments": 2, "places": 16, "training_steps": 20, "starts": 1, "decisions": 2},
-    "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 40},
+    "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 15},
 }
 
 
@@ -40,8 +40,7 @@ def test_notebook_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     if any("import torch" in cell.source for cell in notebook.cells):
         pytest.importorskip("torch", reason="no torch: pip install 'wiw[torch]'")
-    if SIZES[name]:
-        set_parameters(notebook, SIZES[name])
+    set_parameters(notebook, SIZES[name])
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     assert any("image/png" in output.get("data", {}) for output in outputs)

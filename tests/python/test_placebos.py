@@ -228,9 +228,9 @@ def run(two_rooms, tmp_path_factory):
 
     def made(workers, live):
         out = tmp_path_factory.mktemp("run") / "r"
-        return wiw.evaluate(task, agent, 4, out=out, workers=workers, live=live, arms=arms, progress=False)
+        return wiw.evaluate(task, agent, 3, out=out, workers=workers, live=live, arms=arms, progress=False)
 
-    return made(1, 4), made(2, 1)
+    return made(1, 3), made(2, 1)
 
 
 def test_placebos_do_not_depend_on_workers_or_batches(run) -> None:
@@ -250,7 +250,7 @@ def test_placebos_can_be_verified(run) -> None:
 def test_placebos_cost_what_the_real_arm_costs(run) -> None:
     """Where both stand at the same place: at the first decision, with the same proposals."""
     first = {(row["arm"], row["episode"]): row for row in run[0].decisions if row["decision"] == 0}
-    for episode in range(4):
+    for episode in range(3):
         real, swapped = first["copy", episode], first["placebo-swapped", episode]
         assert real["proposals"] == swapped["proposals"] and real["calls"] == swapped["calls"]
         shuffle = first["placebo-shuffled", episode]["calls"]

@@ -449,8 +449,8 @@ def test_an_apartment_without_light_is_the_same_to_walk_and_see(around: generate
 
 
 def test_twin_episodes_name_each_other(tmp_path: Path) -> None:
-    pairs = list(balance.pair_questions(["apartments:val/0"], 0, replace(RULES, twins=1.0), 8, "cpu"))
-    assert len(pairs) == 4
+    pairs = list(balance.pair_questions(["apartments:val/0"], 0, replace(RULES, twins=1.0), 4, "cpu"))
+    assert len(pairs) == 2
     episodes = [episode for i, pair in enumerate(pairs) for episode in balance.to_episodes(pair, 2 * i)]
     check_balance(episodes)
     episode_file.save(tmp_path / "twins.json", episodes, "aeqa")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -129,15 +130,18 @@ def test_looks_are_counted_through(lesson: Any) -> None:
         split_in_half(first)
 
 
-@pytest.mark.slow
-def test_the_command_trains_on_apartments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_trains_on_apartments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     from wiw.perception.recogniser import Recogniser
+    from wiw.training.recogniser import Recipe
 
+    monkeypatch.setattr("wiw.training.recogniser.Recipe", partial(Recipe, batch=24))
     names = ["bed", "chair", "plant", "shower", "television", "toilet"]
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
-    command = ["train", "recogniser", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "14"]
+    command = ["train", "recogniser", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "10"]
     options = ["--out", str(out), "--cache", str(cache), "--workers", "1", "--categories", *names]
-    assert main([*command, *options, "--epochs", "40", "--minutes", "None"]) == 0
+    assert main([*command, *options, "--epochs", "20", "--minutes", "None"]) == 0
     assert "calibration error" in capsys.readouterr().out
     card = Recogniser.load(out).card
     assert card["accuracy"]["start"] > 2.5 / len(names)

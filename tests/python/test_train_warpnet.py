@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +86,11 @@ def test_training_makes_it_better_than_a_plain_room(two_rooms: str, walks: Walks
     assert trained < 0.95 * untrained
 
 
-@pytest.mark.slow
-def test_the_command_makes_a_model_that_beats_the_floor(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_makes_a_model_that_beats_the_floor(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("wiw.training.warpnet.Recipe", partial(Recipe, widths=(8, 16, 16)))
+    monkeypatch.setattr("wiw.training.warpnet.evaluate", partial(evaluate, paths=1))
     out, cache = tmp_path / "weights.safetensors", tmp_path / "looks"
     command = ["train", "warpnet", "--scenes", "apartments:train:2", "--val", "apartments:val:1", "--places", "10"]
     options = ["--out", str(out), "--cache", str(cache), "--workers", "1"]

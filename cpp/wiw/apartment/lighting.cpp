@@ -30,6 +30,38 @@ Vec2 shifted(const Vec2& point, std::uint32_t phase) {
   return {p.x() - std::floor(p.x()), p.y() - std::floor(p.y())};
 }
 
+constexpr std::size_t kBounces = std::size_t{kBouncePackets} * RayTracer::kWidth;
+constexpr std::size_t kPhases = 16;
+
+/// The sampling patterns of one phase. They are the same for all samples, so sines and cosines are computed once.
+struct SamplePoints {
+  std::array<Vec2, RayTracer::kWidth> square;  // even points in the unit square
+  std::array<Vec3, RayTracer::kWidth> ball;    // on the unit ball
+  std::array<Vec3, kBounces> hemisphere;       // unit directions around Z, as many as the cosine says
+
+  explicit SamplePoints(std::uint32_t phase) {
+    for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
+      const Vec2 p = square[i] = shifted(even_point(i), phase);
+      const float z = 2.f * p.x() - 1.f, r = std::sqrt(1.f - z * z);
+      ball[i] = Vec3(r * std::cos(kTurn * p.y()), z, r * std::sin(kTurn * p.y()));
+    }
+    for (std::uint32_t i = 0; i < kBounces; ++i) {
+      const Vec2 p = shifted(even_point(i), phase);
+      const float r = std::sqrt(p.x());
+      hemisphere[i] = Vec3(r * std::cos(kTurn * p.y()), r * std::sin(kTurn * p.y()), std::sqrt(1.f - p.x()));
+    }
+  }
+};
+
+const SamplePoints& points_of(std::uint32_t phase) {
+  static const std::vector<SamplePoints> phases = [] {
+    std::vector<SamplePoints> made;
+    for (std::uint32_t each = 0; each < kPhases; ++each) made.emplace_back(each);
+    return made;
+  }();
+  return phases[phase];
+}
+
 struct Frame {
   Vec3 x, y, z;
 };
@@ -186,15 +218,12 @@ Rgb LightSolver::from_light(const Sample& sample, const VisibleLight& lit) const
   std::array<bool, RayTracer::kWidth> active{};
   std::array<float, RayTracer::kWidth> weight{};
   bool any = false;
+  const SamplePoints& points = points_of(sample.phase);
   for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
-    const Vec2 p = shifted(even_point(i), sample.phase);
-    Vec3 target;
-    if (light.one_sided()) {
-      target = light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v;
-    } else {
-      const float z = 2.f * p.x() - 1.f, r = std::sqrt(1.f - z * z);
-      target = light.center + kLampRadius * Vec3(r * std::cos(kTurn * p.y()), z, r * std::sin(kTurn * p.y()));
-    }
+    const Vec2& p = points.square[i];
+    const Vec3 target = light.one_sided()
+                            ? Vec3(light.center + (2.f * p.x() - 1.f) * light.u + (2.f * p.y() - 1.f) * light.v)
+                            : Vec3(light.center + kLampRadius * points.ball[i]);
     to[i] = target - sample.position;
     const float square = to[i].squaredNorm(), distance = std::sqrt(square);
     const float here = to[i].dot(sample.normal) / distance;
@@ -220,14 +249,13 @@ Rgb LightSolver::direct(const Sample& sample) const {
 Rgb LightSolver::bounced(const Sample& sample, const std::vector<Rgb>& direct_light,
                          const std::vector<Rgb>& ambient) const {
   const Frame frame = frame_around(sample.normal);
+  const SamplePoints& points = points_of(sample.phase);
   Rgb sum = Rgb::Zero();
-  for (std::uint32_t packet = 0; packet < kBouncePackets; ++packet) {
+  for (std::size_t packet = 0; packet < kBouncePackets; ++packet) {
     RayTracer::Directions directions;
-    for (std::uint32_t i = 0; i < RayTracer::kWidth; ++i) {
-      const Vec2 p = shifted(even_point(packet * RayTracer::kWidth + i), sample.phase);
-      const float r = std::sqrt(p.x());
-      directions[i] = r * std::cos(kTurn * p.y()) * frame.x + r * std::sin(kTurn * p.y()) * frame.y +
-                      std::sqrt(1.f - p.x()) * frame.z;
+    for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {
+      const Vec3& local = points.hemisphere[packet * RayTracer::kWidth + i];
+      directions[i] = local.x() * frame.x + local.y() * frame.y + local.z() * frame.z;
     }
     const auto hits = tracer_->trace(sample.position, directions);
     for (std::size_t i = 0; i < RayTracer::kWidth; ++i) {

@@ -32,8 +32,8 @@ class LabelVotes:
         some = np.zeros(views.depth.shape, bool)
         some[:, STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE] = True
         where = np.nonzero(some & (views.depth > 0) & (views.depth <= MOST_DEPTH))
-        pairs = (pack_voxels(unproject(views, *where)) << _BITS) | labels.category[where].astype(np.int64)
-        pairs, inverse = np.unique(pairs, return_inverse=True)
+        keys = (pack_voxels(unproject(views, *where)) << _BITS) | labels.category[where].astype(np.int64)
+        pairs, inverse = np.unique(np.asarray(keys, np.int64), return_inverse=True)
         votes = np.bincount(inverse, labels.confidence[where], len(pairs))
         place = np.searchsorted(self._pairs, pairs)
         known = np.zeros(len(pairs), bool)
@@ -54,4 +54,5 @@ class LabelVotes:
         last = np.searchsorted(self._pairs, (voxels + 1) << _BITS)
         counts = last - first
         rows = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-        return np.bincount(self._pairs[rows] & ((1 << _BITS) - 1), self._votes[rows], categories)
+        found = np.bincount(self._pairs[rows] & ((1 << _BITS) - 1), self._votes[rows], categories)
+        return np.asarray(found, np.float64)

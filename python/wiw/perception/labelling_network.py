@@ -129,7 +129,7 @@ class Convolution(nn.Module):
 
 
 def group_cells(values: Tensor) -> Tensor:
-    """Return the values of cells [B, H, W, ...] in groups of FINE x FINE, [B, H/2, W/2, FINE_CELLS, ...], row by row."""
+    """Return the values of cells [B, H, W, ...] in groups, row by row: [B, H/2, W/2, FINE_CELLS, ...]."""
     count, height, width, *rest = values.shape
     grouped = values.reshape(count, height // FINE, FINE, width // FINE, FINE, *rest).transpose(2, 3)
     return grouped.reshape(count, height // FINE, width // FINE, FINE_CELLS, *rest)

@@ -251,7 +251,7 @@ def _begin_with_history(accepts: Accepts, env: Any, observation: Any, key: Key) 
         plan = _make_segment(accepts.space, observation, 3 - key.episode)
         observation = env.run(plan).observation
         executed += plan.tolist()
-    semantic = env.semantic() if accepts.space == PRIMITIVES else None
+    semantic = env.semantic() if accepts.space == PRIMITIVES and "semantic" in accepts.needs else None
     (history,) = histories.add([Situation(observation, env.goal, key.at(decisions), None, tuple(executed))])
     return _Moment(key.at(decisions), ModelInput(observation, env.fork(), semantic, history))
 

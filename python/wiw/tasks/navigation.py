@@ -184,7 +184,7 @@ class NavigationTask(NavigationSpec, Task):
             if not whole_scene and done >= len(scenes):
                 raise ArgumentError(
                     f"{self.name}: asked for {count} episodes, but there are {len(made)}; "
-                    "name more scenes (apartments:val:N) or raise per_scene"
+                    "name more scenes (apartments:SPLIT:N) or raise per_scene"
                 )
             place = world(scenes[0] if whole_scene else scenes[done], self.backend)
             block = self.generate_episodes(place, self.per_scene * done if whole_scene else 0, made)
