@@ -41,7 +41,7 @@ from wiw.training.post_training.train import build_config, post_train
 from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
 
 NAMES = sorted(FAMILIES)
-STEPS = {name: 10 if name in ("svd-action", "wan2.2-a14b-action") else 20 for name in NAMES}
+STEPS = {name: 6 if name in ("svd-action", "wan2.2-a14b-action") else 12 for name in NAMES}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -563,7 +563,9 @@ def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: py
     out = tmp_path / "out"
     assert main([*command, "--recipe", str(recipe), "--option", "rate=1e-3", "--epochs", "2", "--out", str(out)]) == 0
     said = capsys.readouterr()
-    assert "4 steps of 2 clips, loss " in said.out and f"checkpoint={out}" in said.out
+    assert "4 steps of 2 clips, loss " in said.out and f"checkpoint={out} --world-model-option 'size=[64, 128]'" in (
+        said.out
+    )
     assert "training: step 4/4" in said.err and "clips/s" in said.err and "GB" in said.err
     card = json.loads((out / "training.json").read_text())
     assert card["recipe"]["rate"] == 1e-3 and card["recipe"]["batch"] == 2 and card["steps"] == 4

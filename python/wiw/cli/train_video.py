@@ -66,8 +66,17 @@ def train_video(
         card = post_train(name, data, out, recipe=chosen, on_step=progress, **weights)
     print(f"{card['steps']:,} steps of {chosen.batch} clips, loss {card['loss']:.4f}, {time.monotonic() - began:.0f} s")
     print(f"checkpoint  {out}")
-    print(f"run it:     wiw run imagenav --world-model {name} --world-model-option checkpoint={out}")
+    shown = " ".join(f"--world-model-option {pair}" for pair in (f"checkpoint={out}", *_list_shape(name, card)))
+    print(f"run it:     wiw run imagenav --world-model {name} {shown}")
     return 0
+
+
+def _list_shape(name: str, card: Mapping[str, Any]) -> list[str]:
+    """Return size and frames of the clips as options of the world model, where they are not its own."""
+    from wiw.training.post_training.recipe import load_recipe
+
+    usual = load_recipe(name).describe()
+    return [f"'{key}={card['recipe'][key]}'" for key in ("size", "frames") if card["recipe"][key] != usual[key]]
 
 
 class _Progress:

@@ -87,45 +87,61 @@ def post_train(
     options = {"revision": revision, "variant": variant, "device": device, **_extra_options(name)}
     generator = load_generator(model, recipe, None if weights is None else _resolve(str(weights)), options)
     recipe = replace(recipe, frames=generator.frames, size=generator.size)
-    card: dict[str, Any] = {
-        "model": name,
-        "wiw": wiw.__version__,
-        "weights": dict(generator._weights.identity),
-        "data": describe_dataset(dataset, part),
-        "recipe": recipe.describe(),
-        "versions": loading.versions(),
-    }
+    card = {"model": name, **describe_training(generator, dataset, part, recipe)}
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
-    trainers: list[PostTrainer] = []
-
-    def create() -> PostTrainer:
+    with devices.memory_guard(f"training {name} on {generator.device}", "; ".join(list_remedies(recipe))):
         config = build_config(model.base, model.denoisers[0], generator)
-        clips = dataset.clips(recipe.frames)
-        trainers.append(PostTrainer(objective_class(generator, recipe), config, model.denoisers, clips, recipe))
-        return trainers[-1]
-
-    phases = len(model.denoisers)
-    order = arrange_clips(len(dataset.clips(recipe.frames)), recipe)
-    remedies = "; ".join(list_remedies(recipe))
-    with devices.memory_guard(f"training {name} on {generator.device}", remedies), state.watch():
-        try:
-            trainer, _ = run_training(
-                create,
-                recipe,
-                phases * order.steps_per_epoch,
-                None,
-                lambda progress: recipe.scale_rate(progress * phases % 1),
-                lambda step, steps, _: on_step(step, steps, trainers[-1].mean_loss),
-                state,
-            )
-        except TrainingError:
-            if trainers[-1].step_count:
-                state.save(trainers[-1], recipe.epochs, trainers[-1].step_count)
-            raise
+        objective, clips = objective_class(generator, recipe), dataset.clips(recipe.frames)
+        trainer = PostTrainer(objective, config, model.denoisers, clips, recipe)
+        run_steps(trainer, state, on_step)
     card |= {"steps": trainer.step_count, "loss": trainer.mean_loss}
     write_checkpoint(out, trainer, card)
     state.remove()
     return card
+
+
+def run_steps(trainer: PostTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]) -> None:
+    """Train from the start, or from the state that is kept, to the end.
+
+    Raises:
+        TrainingError: the loss is not finite; the state before is kept.
+        ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
+    """
+    recipe, phases = trainer.recipe, len(trainer.places)
+    with state.watch():
+        try:
+            run_training(
+                lambda: trainer,
+                recipe,
+                trainer.steps_per_epoch,
+                None,
+                lambda progress: recipe.scale_rate(progress * phases % 1),  # each denoiser has a schedule of its own
+                lambda step, steps, _: on_step(step, steps, trainer.mean_loss),
+                state,
+            )
+        except TrainingError:
+            if trainer.step_count:
+                state.save(trainer, recipe.epochs, trainer.step_count)
+            raise
+
+
+def describe_training(
+    generator: VideoModel, data: NavigationData, part: str, recipe: PostTrainingRecipe
+) -> dict[str, Any]:
+    """Return what the outcome of a training depends on, as JSON values."""
+    return {
+        "wiw": wiw.__version__,
+        "weights": identify_weights(generator),
+        "data": describe_dataset(data, part),
+        "recipe": recipe.describe(),
+        "versions": loading.versions(),
+    }
+
+
+def identify_weights(generator: VideoModel) -> dict[str, str]:
+    """Return the hub's commit of a generator's weights, or the digest of their folder."""
+    described = generator.describe()
+    return {key: str(described[key]) for key in ("commit", "digest") if key in described}
 
 
 def write_checkpoint(out: Path, trainer: PostTrainer, card: Mapping[str, Any]) -> None:
@@ -145,7 +161,7 @@ def build_config(base: str, place: str, generator: VideoModel) -> ActionConfig:
     return ActionConfig(
         base=base,
         weights=generator.weights,
-        revision=generator._weights.identity.get("commit"),
+        revision=identify_weights(generator).get("commit"),
         width=embedding_width(getattr(generator.pipeline, place)),
         stride=generator.stride,
     )

@@ -113,12 +113,14 @@ class PostTrainer(ResumableTrainer):
         return total
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of steps, the mean loss, the trained weights and the optimiser's state."""
+        """Return the number of steps, the mean loss, the trained weights and the optimiser's state, in main memory."""
+        optimizer = self.optimizer.state_dict()
+        moments = {key: {name: value.cpu() for name, value in each.items()} for key, each in optimizer["state"].items()}
         return {
             "count": self.step_count,
             "loss": self.mean_loss,
-            "weights": {name: value.detach() for name, value in self.trained.items()},
-            "optimizer": self.optimizer.state_dict(),
+            "weights": {name: value.detach().cpu() for name, value in self.trained.items()},
+            "optimizer": {**optimizer, "state": moments},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
