@@ -151,6 +151,7 @@ def test_actions_are_those_of_the_clips_and_dropped_in_a_share(data: Path, weigh
     for _ in range(6):
         trainer.train_step(1e-3)
     assert 0.2 < float(torch.cat([dropped for _, dropped in told]).float().mean()) < 0.8
+    assert len({tuple(dropped.tolist()) for _, dropped in told}) > 1  # drawn anew in each step
     actions = torch.cat([actions for actions, _ in told])
     assert not actions[:, 0].any() and set(actions[:, 1:].flatten().tolist()) == {1, 2, 3}
 
