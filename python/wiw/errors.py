@@ -21,6 +21,7 @@ __all__ = [
     "RolloutError",
     "ScorerError",
     "StoreError",
+    "TrainingError",
     "VlmError",
     "WeightsError",
     "is_stop_request",
@@ -153,3 +154,7 @@ class ScorerError(InfrastructureError):
 
 class StoreError(Error):
     """A run store is damaged, of another version, or does not fit what is asked of it."""
+
+
+class TrainingError(Error):
+    """A training cannot go on: its loss or its gradient is not finite. The message names the batch."""

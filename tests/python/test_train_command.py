@@ -20,7 +20,7 @@ def test_both_helps_name_all_networks(capsys: pytest.CaptureFixture[str]) -> Non
             main(command)
         assert end.value.code == 0
         text = " ".join(capsys.readouterr().out.replace("│", " ").split())
-        assert "recogniser, warpnet, perception, armnet or diffuser" in text
+        assert "recogniser, warpnet, perception, armnet, diffuser or a video model" in text
 
 
 @pytest.mark.parametrize("what", NETWORKS)

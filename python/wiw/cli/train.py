@@ -12,7 +12,9 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
+from wiw.cli.train_video import VIDEO, train_video
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
@@ -26,17 +28,45 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
     "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
     "cache": ((*ON_SCENES, *ON_PLAYS), "caches no training data"),
+    "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
+    "data": (VIDEO, "does not train on navigation datasets"),
+    "weights": (VIDEO, "begins with random weights"),
+    "recipe": (VIDEO, "reads no recipe"),
+    "option": (VIDEO, "reads no recipe"),
+    "device": (VIDEO, "trains on the CPU"),
+    "part": (VIDEO, "does not train on navigation datasets"),
 }
 """For each option that not all networks use: those that do, and why the others refuse it."""
 
 
 def train(
     what: Positional[
-        Annotated[Literal["recogniser", "warpnet", "perception", "armnet", "diffuser"], arg(metavar="WHAT")]
+        Annotated[
+            Literal[
+                "recogniser",
+                "warpnet",
+                "perception",
+                "armnet",
+                "diffuser",
+                "svd-action",
+                "ltx-action",
+                "wan2.1-action",
+                "wan2.2-5b-action",
+                "wan2.2-a14b-action",
+                "cosmos-predict2-action",
+            ],
+            arg(metavar="WHAT"),
+        ]
     ] = "recogniser",
     /,
     *,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
+    data: Annotated[Path | None, arg(metavar="DIR")] = None,
+    weights: Annotated[str | None, arg(metavar="DIR|HUB")] = None,
+    recipe: Annotated[Path | None, arg(metavar="YAML")] = None,
+    option: Options = (),
+    device: Annotated[str | None, arg(metavar="NAME")] = None,
+    part: Literal["train", "all"] | None = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     val: Annotated[str | None, arg(metavar="SPEC")] = None,
     categories: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
@@ -49,7 +79,7 @@ def train(
     workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Train one of five networks: recogniser, warpnet, perception, armnet or diffuser.
+    """Train a network: recogniser, warpnet, perception, armnet, diffuser or a video model (NAME-action).
 
     recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
     imagined views. Trained on scenes.
@@ -59,6 +89,9 @@ def train(
     armnet: a world model of manipulation; it predicts the front view after each gripper pose of a plan. Trained on
     simulated play at the tables of the manipulation tasks, and on demonstrations if there are any.
     diffuser: the 3D diffusion policy of manipulation. Trained on demonstrations.
+    svd-action, ltx-action, wan2.1-action, wan2.2-5b-action, wan2.2-a14b-action, cosmos-predict2-action: pretrained
+    video generators, post-trained to follow actions of navigation. Trained on a dataset of `wiw collect navigation`, on
+    a GPU; docs/post-training.md explains recipes and needs.
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
@@ -68,11 +101,15 @@ def train(
     $ wiw train armnet --out armnet.safetensors
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
+    $ wiw collect navigation --scenes apartments:train:80 --out data
+    $ wiw train ltx-action --data data --out runs/ltx
+    $ wiw train wan2.1-action --data data --weights /models/wan2.1 --option clips=1600 --option lora=16 --out runs/wan
+    $ wiw run imagenav --world-model ltx-action --world-model-option checkpoint=runs/ltx
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
     it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, diffuser takes
-    a night; less with --minutes. An interrupted training of perception, armnet or diffuser resumes from its checkpoint
-    beside FILE.
+    a night; less with --minutes. An interrupted training of perception, armnet, diffuser or a video model resumes from
+    its checkpoint beside FILE; repeat the command. Video models also write it at SIGUSR1.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
@@ -82,8 +119,18 @@ def train(
     perception for four epochs of a schedule that was first laid out for six (docs/perception.md).
 
     Args:
-        what: recogniser, warpnet, perception, armnet or diffuser.
-        out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors.
+        what: recogniser, warpnet, perception, armnet, diffuser or a video model.
+        out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new folder. Default:
+            WHAT.
+        data: Dataset of `wiw collect navigation`, of panoramas, for video models.
+        weights: Pretrained weights that a video model begins with: a folder as save_pretrained writes it, or a name on
+            the Hugging Face hub. Default: those of the world model.
+        recipe: YAML file with numbers of a video model's recipe, on top of the shipped ones.
+        option: Number of a video model's recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+            `wiw.training.post_training.recipe.PostTrainingRecipe`.
+        device: Of torch, for video models. Default: the GPU if there is one.
+        part: Part of the dataset for video models: train leaves out one in twenty scenes for validation. Default:
+            train.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
             Default: apartments:train:80; 160 of them for perception.
         val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single
@@ -102,7 +149,6 @@ def train(
     """
     from wiw.scenes.store import folder
 
-    out = out or Path(f"{what}.safetensors")
     _check_numbers(epochs=epochs, minutes=minutes, places=places, plays=plays, seed=seed, workers=workers)
     options: dict[str, Any] = {
         "scenes": scenes,
@@ -110,31 +156,39 @@ def train(
         "categories": categories or None,
         "demonstrations": demonstrations,
     }
-    options |= {"places": places, "plays": plays, "workers": workers, "cache": cache}
+    options |= {"places": places, "plays": plays, "workers": workers, "cache": cache, "minutes": minutes}
+    options |= {"data": data, "weights": weights, "recipe": recipe, "option": option or None}
+    options |= {"device": device, "part": part}
     _check_use(what, _drop_none(options))
+    if what in VIDEO:
+        _require_torch(what)
+        numbers = _drop_none({"epochs": epochs, "seed": seed or None})
+        given = {"weights": weights, "device": device, "part": part or "train"}
+        return train_video(what, out or Path(what), data, recipe, option, numbers, given)
+    out = out or Path(f"{what}.safetensors")
     _require_torch(what)
     _check_out(out)
-    data = _DataOptions(
+    source = _DataOptions(
         scenes=scenes or (PERCEPTION_SCENES if what == "perception" else DEFAULT_SCENES),
         val=DEFAULT_VAL if val is None else val,
         seed=seed,
         cache=cache or folder().parent / "looks",
         workers=DEFAULT_WORKERS if workers is None else workers,
     )
-    rules, recipe = _drop_none({"places": places}), _drop_none({"epochs": epochs})
+    rules, lengths = _drop_none({"places": places}), _drop_none({"epochs": epochs})
     if what in ON_SCENES:
-        _check_scenes(data.scenes, data.val)
+        _check_scenes(source.scenes, source.val)
     with announce_resume():
         if what == "recogniser":
-            _train_recogniser(out, data, categories, minutes, rules, recipe)
+            _train_recogniser(out, source, categories, minutes, rules, lengths)
         elif what == "diffuser":
-            _train_diffuser(out, demonstrations, minutes, {**recipe, "seed": seed})
+            _train_diffuser(out, demonstrations, minutes, {**lengths, "seed": seed})
         elif what == "armnet":
-            _train_armnet(out, data, minutes, DEFAULT_PLAYS if plays is None else plays, demonstrations, recipe)
+            _train_armnet(out, source, minutes, DEFAULT_PLAYS if plays is None else plays, demonstrations, lengths)
         elif what == "perception":
-            _train_perception(out, data, minutes, rules, recipe)
+            _train_perception(out, source, minutes, rules, lengths)
         else:
-            _train_warpnet(out, data, minutes, rules, recipe)
+            _train_warpnet(out, source, minutes, rules, lengths)
     print(f"weights   {out} ({out.stat().st_size / 2**20:.2f} MB)")
     return 0
 

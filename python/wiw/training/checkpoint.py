@@ -89,10 +89,17 @@ class Checkpoint:
         Raises:
             FileError: it cannot be written.
         """
+        if time.monotonic() >= self._last_saved + self.seconds:
+            self.save(trainer, epochs, step)
+
+    def save(self, trainer: ResumableTrainer, epochs: int, step: int) -> None:
+        """Write the file atomically.
+
+        Raises:
+            FileError: it cannot be written.
+        """
         import torch
 
-        if time.monotonic() < self._last_saved + self.seconds:
-            return
         packed = io.BytesIO()  # torch's own writer reports a full disk by a bare RuntimeError
         torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": trainer.state_dict()}, packed)
         with atomic_file(self.path) as draft:

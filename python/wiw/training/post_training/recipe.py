@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recipes of post-training: `wiw/configs/post-training/NAME.yaml`, a file of one's own, and options on top."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args, get_type_hints
+
+import yaml
+
+from wiw.errors import ArgumentError, FileError
+
+FOLDER = Path(__file__).parents[2] / "configs" / "post-training"
+Schedule = Literal["constant", "linear", "cosine"]
+Precision = Literal["bfloat16", "float32"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PostTrainingRecipe:
+    """Numbers of one post-training.
+
+    Raises:
+        ArgumentError: a number is out of range.
+    """
+
+    frames: int
+    """Of a clip."""
+    size: tuple[int, int] = (576, 1024)
+    """Height and width in pixels that clips are brought to."""
+    rate: float
+    """Peak learning rate."""
+    schedule: Schedule = "constant"
+    warmup: float = 0.0
+    """Share of the steps in which the learning rate grows from 0."""
+    clips: int | None = 40_000
+    """How many clips are trained on; all there are if None. Fewer clips are always among the more."""
+    epochs: int = 1
+    batch: int = 16
+    """Clips per step of the optimiser."""
+    rows: int = 1
+    """Clips in one pass through the networks; gradients of several passes are added up."""
+    lora: int = 0
+    """Rank of the LoRA; 0 trains the whole denoiser."""
+    shift: float = 1.0
+    """How far noise levels are moved towards noise, where the model's schedule has a shift."""
+    drop: float = 0.1
+    """Share of clips whose actions are replaced by the null token."""
+    clip_norm: float = 1.0
+    """Largest norm of the gradient."""
+    weight_decay: float = 0.01
+    precision: Precision = "bfloat16"
+    """Of the networks' products and of frozen weights; trained weights are float32."""
+    checkpointing: bool = True
+    """Whether activations are computed again in the backward pass, which takes less memory."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "size", tuple(self.size))
+        counts = {"clips": self.clips or 1, "epochs": self.epochs, "batch": self.batch, "rows": self.rows}
+        for name, value in {**counts, "frames": self.frames - 1}.items():
+            if value < 1:
+                raise ArgumentError(f"recipe: {name}: expected {2 if name == 'frames' else 1} or more, got {value}")
+        for name in ("rate", "clip_norm", "shift"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
+        for name in ("warmup", "drop"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
+        if self.lora < 0 or self.weight_decay < 0 or not 0 <= self.seed < 2**63:
+            raise ArgumentError("recipe: expected lora and weight_decay of 0 or more, and a seed from 0 to 2**63 - 1")
+        if len(self.size) != 2 or min(self.size) < 8:
+            raise ArgumentError(f"recipe: size: expected height and width in pixels, got {self.size}")
+        if self.batch % self.rows:
+            raise ArgumentError(f"recipe: rows: expected a divisor of batch ({self.batch}), got {self.rows}")
+
+    def scale_rate(self, progress: float) -> float:
+        """Return the factor of the learning rate after a share of the steps, 0 to 1."""
+        if progress < self.warmup:
+            return progress / self.warmup
+        left = 1 - (progress - self.warmup) / (1 - self.warmup)
+        factors: dict[Schedule, Callable[[], float]] = {
+            "constant": lambda: 1.0,
+            "linear": lambda: left,
+            "cosine": lambda: 0.5 * (1 - math.cos(math.pi * left)),
+        }
+        return factors[self.schedule]()
+
+    def describe(self) -> dict[str, Any]:
+        """Return the recipe as JSON values."""
+        return {**asdict(self), "size": list(self.size)}
+
+
+def load_recipe(
+    name: str, file: str | Path | None = None, options: Mapping[str, Any] | None = None
+) -> PostTrainingRecipe:
+    """Return the recipe of a model: shipped, with a YAML file of one's own and options on top.
+
+    Raises:
+        ArgumentError: a key that no recipe has, or a value of another type.
+        FileError: the file cannot be read.
+    """
+    values: dict[str, Any] = {}
+    for path in (FOLDER / f"{name}.yaml", *([Path(file)] if file else [])):
+        values |= _check(_read(path), str(path))
+    values |= _check(dict(options or {}), "recipe")
+    return PostTrainingRecipe(**values)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise FileError(f"{path}: expected a recipe in YAML, got {error}") from error
+    if not isinstance(content, dict):
+        raise FileError(f"{path}: expected a mapping of a recipe's numbers, got {type(content).__name__}")
+    return content
+
+
+def _check(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    known = [field.name for field in fields(PostTrainingRecipe)]
+    kinds = get_type_hints(PostTrainingRecipe)
+    found: dict[str, Any] = {}
+    for name, given in values.items():
+        if name not in known:
+            raise ArgumentError(f"{where}: no recipe has '{name}'; expected {', '.join(known)}")
+        value = _parse_float(given) if kinds[name] is float else given
+        if not _fits(value, kinds[name]):
+            raise ArgumentError(f"{where}: {name}: expected {_describe(kinds[name])}, got {given!r}")
+        found[name] = value
+    return found
+
+
+def _parse_float(value: Any) -> Any:
+    """Return a number as a float, also one that YAML takes for text, such as 1e-5; anything else as it is."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return value
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    if kind in (int, float, bool):
+        allowed: Any = (int, float) if kind is float else kind
+        return isinstance(value, allowed) and (kind is bool or not isinstance(value, bool))
+    if kind == int | None:
+        return value is None or _fits(value, int)
+    if kind == tuple[int, int]:
+        return isinstance(value, list | tuple) and all(_fits(side, int) for side in value)
+    return value in get_args(kind)
+
+
+def _describe(kind: Any) -> str:
+    names = {int: "a whole number", float: "a number", bool: "true or false", tuple[int, int]: "[height, width]"}
+    if kind in names:
+        return names[kind]
+    return "a whole number or null" if kind == int | None else f"one of {', '.join(get_args(kind))}"

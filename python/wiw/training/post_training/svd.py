@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What Stable Video Diffusion is trained on: noise of a log-normal level, in the preconditioning of EDM."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from wiw.training.post_training.objective import Encoded, Objective, to_image
+from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.world_models.video.model import VideoModel
+
+LOG_SIGMA = (0.7, 1.6)
+"""Mean and standard deviation of the noise's logarithm."""
+LOG_GIVEN = (-3.0, 0.5)
+"""The same of the noise on the observation."""
+
+
+class SVDObjective(Objective):
+    """SVD: predict v = (noise - sigma x clip) / sqrt(sigma^2 + 1), all levels weighted alike (Karras et al. 2022).
+
+    The observation goes in beside the noisy clip, in channels of its own, and as an embedding; all frames are noisy and
+    in the loss, as the pipeline generates them all. For guidance, the embedding alone, both, or the channels alone are
+    blank in a share `drop` of the clips each.
+    """
+
+    def __init__(self, generator: VideoModel, recipe: PostTrainingRecipe) -> None:
+        super().__init__(generator, recipe)
+        arguments = self.read_arguments(1)
+        self._ids = (arguments["fps"] - 1, arguments["motion_bucket_id"])  # the pipeline counts frames a second so
+
+    @torch.no_grad()
+    def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
+        """Return the latents [B, N, C, h, w], and the observation as embedding and as noisy latents."""
+        vae, observations = self.pipeline.vae, clips[:, :, 0]
+        found = vae.encode(clips.transpose(1, 2).flatten(0, 1).to(vae.dtype)).latent_dist
+        latents = found.mean.float() + found.std.float() * self.draw_normal(found.mean, random)
+        noise = torch.exp(LOG_GIVEN[0] + LOG_GIVEN[1] * torch.randn(len(clips), generator=random)).to(clips)
+        noisy = observations + noise[:, None, None, None] * self.draw_normal(observations, random)
+        pictures = self.pipeline._encode_image([to_image(each) for each in observations], self.device, 1, False)
+        return {
+            "latents": latents.unflatten(0, (len(clips), clips.shape[2])) * vae.config.scaling_factor,
+            "given": vae.encode(noisy.to(vae.dtype)).latent_dist.mode().float(),
+            "noise": noise,
+            "pictures": pictures.float(),
+        }
+
+    def compute_losses(self, place: str, encoded: Encoded, random: torch.Generator) -> Tensor:
+        """Return the mean squared error of v for each clip."""
+        latents = encoded["latents"]
+        logs = (LOG_SIGMA[0] + LOG_SIGMA[1] * torch.randn(len(latents), generator=random)).to(latents)
+        sigma = logs.exp()[:, None, None, None, None]
+        noise = self.draw_normal(latents, random)
+        scale = (sigma.square() + 1).sqrt()
+        given, pictures = self._blank(encoded, random)
+        unet = getattr(self.pipeline, place)
+        beside = given[:, None].expand(-1, latents.shape[1], -1, -1, -1)
+        with self.autocast():
+            predicted = unet(
+                torch.cat([(latents + sigma * noise) / scale, beside], dim=2).to(unet.dtype),
+                0.25 * logs,
+                encoder_hidden_states=pictures.to(unet.dtype),
+                added_time_ids=self._identify(encoded["noise"]).to(unet.dtype),
+                return_dict=False,
+            )[0]
+        wanted = (noise - sigma * latents) / scale
+        return (predicted.float() - wanted).square().mean(dim=(1, 2, 3, 4))
+
+    def _identify(self, noise: Tensor) -> Tensor:
+        """Return what the pipeline says of a clip, [B, 3]: frames a second, motion, noise on the observation."""
+        return torch.stack([torch.full_like(noise, self._ids[0]), torch.full_like(noise, self._ids[1]), noise], dim=1)
+
+    def _blank(self, encoded: Encoded, random: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Return the observation's channels and embedding, each blank in a share of the clips."""
+        drop = self.recipe.drop
+        lot = torch.rand(len(encoded["latents"]), generator=random).to(encoded["latents"].device)
+        pictures = encoded["pictures"].masked_fill((lot < 2 * drop)[:, None, None], 0)
+        channels = (lot >= drop) & (lot < 3 * drop)
+        return encoded["given"].masked_fill(channels[:, None, None, None], 0), pictures

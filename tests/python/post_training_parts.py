@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A tiny navigation dataset, and tiny recipes on it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from wiw.datasets.navigation import META
+from wiw.datasets.navigation_files import (
+    FORMAT,
+    SEGMENTS,
+    build_table,
+    navigation_schema,
+    write_frames,
+    write_segment_list,
+)
+from wiw.datasets.navigation_segment import NavigationSegment, encode_color
+from wiw.datasets.parquet_files import MANIFEST
+from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
+
+FRAMES = {"svd-action": 3, "ltx-action": 9}
+SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128)}
+SCENES = ("flat", "loft", "house")
+
+
+def save_dataset(folder: Path, frames: int = 12, projection: str = "equirectangular") -> Path:
+    """Coloured panoramas that brighten ahead and roll with turns, in the files of `wiw collect navigation`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    segments = [_make_segment(scene, number, frames) for number, scene in enumerate(SCENES)]
+    schema = navigation_schema(False, {})
+    write_frames(folder / "frames.parquet", schema, [build_table(each, schema) for each in segments])
+    rows = [_list_segment(each, group) for group, each in enumerate(segments)]
+    write_segment_list(folder / SEGMENTS, rows)
+    camera = {"projection": projection, "size": [64, 128], "height_m": 1.0}
+    meta = {"format": FORMAT, "camera": camera, "files": {"frames.parquet": {"sha256": "0"}}}
+    (folder / META).write_text(json.dumps(meta))
+    (folder / MANIFEST).write_text(json.dumps({"what": "navigation"}))
+    return folder
+
+
+def _make_segment(scene: str, number: int, frames: int) -> NavigationSegment:
+    random = np.random.default_rng(number)
+    room = np.kron(random.integers(40, 180, (4, 8, 3)), np.ones((16, 16, 1))).astype(np.uint8)
+    actions = np.concatenate([[0], random.integers(1, 4, frames - 1)]).astype(np.int8)
+    heading = np.cumsum(np.select([actions == 2, actions == 3], [8, -8], 0))
+    steps = np.cumsum(actions == 1)
+    shown = [np.roll(np.clip(room + 6 * k, 0, 255).astype(np.uint8), h, 1) for k, h in zip(steps, heading, strict=True)]
+    return NavigationSegment(
+        scene=scene,
+        pass_index=0,
+        island=0,
+        segment=number,
+        seed=0,
+        height=1.0,
+        actions=actions,
+        poses=np.tile(np.eye(4), (frames, 1, 1)),
+        sources=np.arange(frames, dtype=np.int32),
+        rolls=np.zeros(frames, np.int32),
+        encoded_images=tuple(encode_color(image, True) for image in shown),
+        encoded_depths=None,
+    )
+
+
+def _list_segment(segment: NavigationSegment, group: int) -> dict[str, Any]:
+    counts = {"forward": 0, "turn_left": 0, "turn_right": 0}
+    return {
+        "scene": segment.scene,
+        "pass": 0,
+        "island": 0,
+        "segment": segment.segment,
+        "file": "frames.parquet",
+        "row_group": group,
+        "frames": len(segment),
+        "pictures": len(segment),
+        **counts,
+        "ending": "reached",
+    }
+
+
+def tiny_recipe(name: str, **changes: Any) -> PostTrainingRecipe:
+    """The shipped recipe with clips and batches as small as the tiny networks."""
+    small = {
+        "frames": FRAMES.get(name, 5),
+        "size": SIZES.get(name, (32, 64)),
+        "batch": 4,
+        "rows": 2,
+        "clips": 4,
+        "epochs": 2,
+        "precision": "float32",
+    }
+    if load_recipe(name).lora:
+        small["lora"] = 4
+    return load_recipe(name, options={**small, **changes})

@@ -1,0 +1,592 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Post-training of action-conditioned models, on diffusers' real classes with tiny random weights."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw import action
+from wiw.cli.app import main
+from wiw.cli.train_video import VIDEO
+from wiw.datasets.navigation import NavigationData
+from wiw.errors import ArgumentError, TrainingError
+from wiw.types import Conditioning, Control
+
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
+pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+
+import torch
+from post_training_parts import save_dataset, tiny_recipe
+
+import tiny_pipelines
+from wiw.training.post_training.clip_order import ClipOrder
+from wiw.training.post_training.families import FAMILIES, find_family, load_generator
+from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
+from wiw.training.post_training.objective import to_image
+from wiw.training.post_training.recipe import load_recipe
+from wiw.training.post_training.train import build_config, post_train
+from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
+
+NAMES = sorted(FAMILIES)
+STEPS = {name: 6 if name in ("svd-action", "wan2.2-a14b-action") else 12 for name in NAMES}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_dataset(tmp_path_factory.mktemp("post") / "data")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("stock")
+
+    def get(name: str) -> Path:
+        base = name.removesuffix("-action")
+        if not (folder / base).exists():
+            tiny_pipelines.save(base, folder / base)
+        return folder / base
+
+    return get
+
+
+def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
+    model, objective = find_family(name)
+    recipe = tiny_recipe(name, **changes)
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    generator = load_generator(model, recipe, str(weights), options)
+    config = build_config(model.base, model.denoisers[0], generator)
+    clips = NavigationData(data).clips(recipe.frames)
+    return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# -- every recipe ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
+    """Measured on the same noise before and after."""
+    trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0)
+
+    def measure(place: str) -> float:
+        clips = [trainer._clips[int(row)] for row in trainer.order.select(0)]
+        with torch.no_grad():
+            return float(trainer._compute_losses(place, clips * 4, torch.Generator().manual_seed(9)).mean())
+
+    before = {place: measure(place) for place in trainer.places}
+    for _ in range(STEPS[name] * trainer.steps_per_epoch):
+        trainer.train_step(3e-3)
+    for place in trainer.places:
+        assert measure(place) < 0.95 * before[place], (place, before[place], measure(place))
+
+
+@pytest.mark.parametrize("name", ["ltx-action", "wan2.2-5b-action", "cosmos-predict2-action"])
+def test_the_first_frame_is_given_and_out_of_the_loss(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), checkpointing=False)
+    objective, clips = trainer.objective, torch.rand(2, 3, trainer.recipe.frames, *trainer.recipe.size) * 2 - 1
+    encoded = dict(objective.encode(clips, torch.Generator().manual_seed(0)))
+
+    def measure() -> torch.Tensor:
+        with torch.no_grad():
+            return objective.compute_losses("transformer", encoded, torch.Generator().manual_seed(1))
+
+    before, latents = measure(), encoded["latents"]
+    encoded["latents"] = torch.cat([latents[:, :, :1] + 1, latents[:, :, 1:]], dim=2)
+    torch.testing.assert_close(measure(), before, rtol=0, atol=0)  # the target of the first frame plays no part
+    encoded["latents"] = torch.cat([latents[:, :, :1], latents[:, :, 1:] + 1], dim=2)
+    assert (measure() - before).abs().min() > 1e-3
+    encoded |= {"latents": latents, "first": encoded["first"] + 1}
+    assert (measure() - before).abs().min() > 1e-6  # the denoiser sees the one that is given
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_recipe_resumes_exactly(name: str, data: Path, weights: Any) -> None:
+    """From the middle; where there are two experts, from the middle of the second."""
+    changes = {"epochs": 4, "batch": 4, "rows": 4}
+    whole = make_trainer(name, data, weights(name), **changes)
+    steps = whole.steps_per_epoch * 4
+    state = io.BytesIO()
+    for step in range(steps):
+        whole.train_step(1e-3)
+        if step + 1 == 3 * steps // 4:
+            torch.save(whole.state_dict(), state)
+    resumed = make_trainer(name, data, weights(name), **changes)
+    state.seek(0)
+    resumed.load_state_dict(torch.load(state, weights_only=True))
+    assert resumed.step_count == 3 * steps // 4
+    for _ in range(steps - resumed.step_count):
+        resumed.train_step(1e-3)
+    assert resumed.mean_loss == whole.mean_loss
+    assert all(torch.equal(value, resumed.trained[key]) for key, value in whole.trained.items())
+
+
+def test_actions_are_those_of_the_clips_and_dropped_in_a_share(data: Path, weights: Any) -> None:
+    trainer = make_trainer("ltx-action", data, weights("ltx-action"), drop=0.5, rows=4)
+    told: list[tuple[torch.Tensor, torch.Tensor]] = []
+    trainer.encoders["transformer"].register_forward_pre_hook(lambda _, args: told.append(args))
+    for _ in range(6):
+        trainer.train_step(1e-3)
+    assert 0.2 < float(torch.cat([dropped for _, dropped in told]).float().mean()) < 0.8
+    assert len({tuple(dropped.tolist()) for _, dropped in told}) > 1  # drawn anew in each step
+    actions = torch.cat([actions for actions, _ in told])
+    assert not actions[:, 0].any() and set(actions[:, 1:].flatten().tolist()) == {1, 2, 3}
+
+
+def test_each_expert_is_trained_on_its_side_of_the_boundary(data: Path, weights: Any) -> None:
+    name = "wan2.2-a14b-action"
+    trainer = make_trainer(name, data, weights(name))
+    like = torch.zeros(2000, 1, 1, 1, 1)
+    random = torch.Generator().manual_seed(0)
+    high, low = (trainer.objective.draw_levels(place, like, random) for place in ("transformer", "transformer_2"))
+    assert high.min() >= 0.9 and low.max() <= 0.9 and low.min() < 0.1
+    assert [trainer.locate(step) for step in range(4)] == [
+        ("transformer", 0),
+        ("transformer", 1),
+        ("transformer_2", 0),
+        ("transformer_2", 1),
+    ]
+    before = {key: value.detach().clone() for key, value in trainer.trained.items()}
+    trainer.train_step(1e-2)
+    moved = {key for key, value in trainer.trained.items() if not torch.equal(value, before[key])}
+    assert moved and not any("transformer_2" in key for key in moved)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_half_precision_trains_weights_in_float32(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), precision="bfloat16")
+    assert np.isfinite(trainer.train_step(1e-3)) and np.isfinite(trainer.train_step(1e-3))
+    assert {value.dtype for value in trainer.trained.values()} == {torch.float32}
+    frozen = {
+        value.dtype
+        for place in trainer.places
+        for value in getattr(trainer.objective.pipeline, place).parameters()
+        if not value.requires_grad
+    }
+    assert not trainer.recipe.lora or torch.bfloat16 in frozen
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_gradients_reach_what_is_trained_and_nothing_else(name: str, data: Path, weights: Any) -> None:
+    trainer = make_trainer(name, data, weights(name), drop=0.0)
+    pipeline, lora = trainer.objective.pipeline, trainer.recipe.lora
+    before = {
+        f"{place}.{key}": value.detach().clone()
+        for place, network in pipeline.components.items()
+        if isinstance(network, torch.nn.Module)
+        for key, value in network.named_parameters()
+    }
+    for _ in range(2 * trainer.steps_per_epoch):
+        trainer.train_step(1e-2)
+    moved = set()
+    for place, network in pipeline.components.items():
+        if isinstance(network, torch.nn.Module):
+            for key, value in network.named_parameters():
+                if not torch.equal(value, before[f"{place}.{key}"]):
+                    moved.add(f"{place}.{key}")
+    expected = {key for key in trainer.trained if not key.startswith("encoder.")}
+    assert moved <= expected and expected
+    assert all((".actions." in key) == bool(lora) for key in expected)
+    still = {key for key in expected - moved if not key.endswith(".bias")}  # a key's bias has no effect on attention
+    assert len(still) <= 0.1 * len(expected), sorted(still)
+    for place in trainer.places:
+        encoder = trainer.encoders[place]
+        assert all(torch.isfinite(value).all() for value in encoder.parameters())
+        assert encoder.mlp[-1].weight.abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_denoisers_are_called_as_world_models_call_them(
+    name: str, data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Same arguments but for noise and time, and the same first frame: trained on what inference gives."""
+    from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution as Gaussian
+
+    stock = Gaussian.__init__
+    monkeypatch.setattr(
+        Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
+    )
+    trainer = make_trainer(name, data, weights(name), checkpointing=False, rows=1, drop=0.0)
+    clip = trainer._clips[0]
+    trained = _record(
+        trainer, lambda: trainer._compute_losses(trainer.places[0], [clip], torch.Generator().manual_seed(0))
+    )
+    generator = trainer.objective.generator
+    control = Control(clip.actions[1:], action.to_trajectory(clip.actions[1:]), action.to_viewpoints(clip.actions[1:]))
+    generator.guidance = 1.0
+    observed = load_clips([clip], generator.size, np.arange(5)).frames[0, :, 0]
+    image = np.asarray(to_image(observed))[None]
+    with torch.no_grad():
+        inferred = _record(trainer, lambda: generator.make_clips(image, [control], np.zeros(1, np.uint64)))
+    assert trained.keys() | {"attention_kwargs"} == inferred.keys() | {"attention_kwargs"}
+    if name == "svd-action":  # what it says of the observation's noise is drawn anew for each clip
+        assert trained.pop("added_time_ids")[0, :2].tolist() == inferred.pop("added_time_ids")[0, :2].tolist()
+    for key in trained.keys() - {"hidden_states", "timestep", "sample"}:
+        if isinstance(trained[key], torch.Tensor):
+            torch.testing.assert_close(trained[key].expand_as(inferred[key]), inferred[key], msg=key)
+        else:
+            assert trained[key] == inferred[key], key
+    _compare_first_frames(name, trainer, trained, inferred)
+
+
+def _record(trainer: PostTrainer, call: Any) -> dict[str, Any]:
+    """The arguments of the first call of a denoiser."""
+    calls: list[dict[str, Any]] = []
+    denoiser = getattr(trainer.objective.pipeline, trainer.places[0])
+
+    def note(_: Any, args: Any, kwargs: Any) -> None:
+        positional = dict(zip(("sample", "timestep"), args, strict=False))
+        calls.append({**positional, **kwargs})
+
+    handle = denoiser.register_forward_pre_hook(note, with_kwargs=True, prepend=True)
+    call()
+    handle.remove()
+    return calls[0]
+
+
+def _compare_first_frames(name: str, trainer: PostTrainer, trained: dict[str, Any], inferred: dict[str, Any]) -> None:
+    if name == "ltx-action":
+        first = 2 * 4  # tokens of the first frame
+        torch.testing.assert_close(trained["hidden_states"][:, :first], inferred["hidden_states"][:, :first])
+        assert not trained["timestep"][:, :first].any() and not inferred["timestep"][:, :first].any()
+        assert trained["timestep"][:, first:].min() > 0
+    elif name == "wan2.2-5b-action":
+        first = 1 * 2  # of 2 x 4 latents, patches of 2 x 2
+        torch.testing.assert_close(trained["hidden_states"][:, :, 0], inferred["hidden_states"][:, :, 0])
+        assert not trained["timestep"][:, :first].any() and trained["timestep"][:, first:].min() > 0
+    elif name.startswith("wan"):  # mask and observation in channels of their own
+        torch.testing.assert_close(trained["hidden_states"][:, 16:], inferred["hidden_states"][:, 16:])
+        assert trained["hidden_states"][:, 16:20, 0].all() and not trained["hidden_states"][:, 16:20, 1:].any()
+    elif name == "cosmos-predict2-action":
+        torch.testing.assert_close(trained["hidden_states"][:, :, 0], inferred["hidden_states"][:, :, 0])
+        torch.testing.assert_close(trained["timestep"][:, :, 0], inferred["timestep"][:, :, 0])
+    if name == "svd-action":
+        assert trained["sample"].shape == inferred["sample"].shape
+        seen, shown = (each["sample"][0, :, 4:].flatten(1) for each in (trained, inferred))
+        assert torch.equal(seen[0], seen[-1]) and float(torch.corrcoef(torch.stack([seen[0], shown[0]]))[0, 1]) > 0.9
+        assert float(inferred["timestep"]) == pytest.approx(0.25 * np.log(700), rel=1e-3)  # a quarter of ln sigma
+    else:
+        assert trained["timestep"].shape == inferred["timestep"].shape
+        assert trained["hidden_states"].shape == inferred["hidden_states"].shape
+
+
+def _predict_perfectly(name: str, latents: torch.Tensor) -> Any:
+    """What a denoiser would return that knows the clip's latents: its forward."""
+
+    def predict(*args: Any, **kwargs: Any) -> tuple[torch.Tensor]:
+        if name == "svd-action":
+            noisy, log = args[0][:, :, :4], 4 * args[1].double().reshape(-1, 1, 1, 1, 1)
+            sigma, scale = log.exp(), (log.exp().square() + 1).sqrt()
+            noise = (noisy * scale - latents) / sigma
+            return (((noise - sigma * latents) / scale).float(),)
+        noisy, times = kwargs["hidden_states"], kwargs["timestep"].double()
+        if name == "ltx-action":
+            known = latents.flatten(2).transpose(1, 2)
+            return (((noisy - known) / (times[..., None] / 1000).clamp(min=1e-9)).float(),)
+        level = times if name.startswith("cosmos") else times.reshape(len(times), -1).amax(1) / 1000
+        level = level if name.startswith("cosmos") else level[:, None, None, None, None]
+        return (((noisy[:, : latents.shape[1]] - latents) / level).float(),)
+
+    return predict
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_has_no_loss_in_training_generates_the_clip(
+    name: str, data: Path, weights: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise, times, signs and scales of the loss are those of the pipeline: one perfect denoiser serves both."""
+    from diffusers.models.autoencoders.vae import DiagonalGaussianDistribution as Gaussian
+
+    stock = Gaussian.__init__
+    monkeypatch.setattr(
+        Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
+    )
+    trainer = make_trainer(name, data, weights(name), checkpointing=False, drop=0.0)
+    objective, generator = trainer.objective, trainer.objective.generator
+    clip = load_clips([trainer._clips[0]], generator.size, np.arange(5)).frames
+    encoded = objective.encode(clip, torch.Generator().manual_seed(0))
+    for place in trainer.places:
+        monkeypatch.setattr(getattr(objective.pipeline, place), "forward", _predict_perfectly(name, encoded["latents"]))
+    with torch.no_grad():
+        losses = [
+            objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.places
+        ]
+    assert float(torch.cat(losses).max()) < 1e-6
+    plan = trainer._clips[0].actions[1:]
+    control = Control(plan, action.to_trajectory(plan), action.to_viewpoints(plan))
+    arguments = generator.arguments
+    generator.arguments = lambda *each: {**arguments(*each), "output_type": "latent"}
+    generator.guidance, generator.steps = 1.0, 3
+    image = to_image(clip[0, :, 0])
+    with torch.no_grad():
+        made = torch.from_numpy(generator.generate([image], [control], [torch.Generator().manual_seed(2)]))
+    wanted = encoded["latents"]
+    wanted = wanted.flatten(2).transpose(1, 2) if name == "ltx-action" else wanted
+    torch.testing.assert_close(made.float(), wanted, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    card = post_train(name, data, out, weights=weights(name), device="cpu", recipe=tiny_recipe(name), part="all")
+    assert card["steps"] == 2 * len(find_family(name)[0].denoisers) and np.isfinite(card["loss"])
+    assert not (tmp_path / "out.checkpoint").exists()
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    recipe = tiny_recipe(name)
+    model = wiw.world_model(
+        name, checkpoint=str(out), device="cpu", size=recipe.size, frames=recipe.frames, steps=2, **options
+    )
+    plan = action.pad([action.TURN_LEFT], recipe.frames - 1)
+    views = action.to_trajectory(plan), action.to_viewpoints(plan)
+    control = Control(plan, *views, ids=action.with_null(plan), length=1)
+    image = np.full((1, *recipe.size, 3), 90, np.uint8)
+    frames = model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64))
+    assert frames.shape == (1, recipe.frames, *recipe.size, 3)
+    np.testing.assert_array_equal(frames[:, 0], image)
+    assert json.loads((out / "training.json").read_text())["model"] == name
+
+
+# -- resuming ----------------------------------------------------------------------------------------------------------
+
+VICTIM = """
+import sys, os, signal, torch
+sys.path[:0] = {path!r}
+torch.set_num_threads(1)
+from post_training_parts import tiny_recipe
+from wiw.training.post_training.train import post_train
+stop, number = {stop}, {number}
+def on_step(step, steps, loss):
+    print(step, flush=True)
+    if step == stop:
+        os.kill(os.getpid(), number)
+recipe = tiny_recipe({name!r}, epochs=20)
+options = dict(weights={weights!r}, device="cpu", recipe=recipe, part="all", seconds=0, on_step=on_step)
+post_train({name!r}, {data!r}, {out!r}, **options)
+"""
+
+
+def _run(name: str, data: Path, weights: Path, out: Path, stop: int, number: int) -> subprocess.CompletedProcess[str]:
+    path = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+    script = VICTIM.format(
+        path=path, name=name, data=str(data), out=str(out), weights=str(weights), stop=stop, number=int(number)
+    )
+    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300, check=False)
+
+
+def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tmp_path: Path) -> None:
+    name = "ltx-action"
+    options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe(name, epochs=20)
+    post_train(name, data, tmp_path / "whole", recipe=recipe, **options)
+    killed = _run(name, data, weights(name), tmp_path / "killed", 11, signal.SIGKILL)
+    assert killed.returncode == -signal.SIGKILL and killed.stdout.split()[-1] == "11", killed.stderr
+    steps: list[int] = []
+    post_train(name, data, tmp_path / "killed", recipe=recipe, on_step=lambda step, *_: steps.append(step), **options)
+    assert steps == list(range(11, 21))  # the state after step 10 was the last on disk
+    assert contents(tmp_path / "whole") == contents(tmp_path / "killed")
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+STOPPED = """
+import os, signal, sys
+from wiw.cli import run_process, train_video
+stock = train_video._Progress.__call__
+def show(self, step, steps, loss):
+    stock(self, step, steps, loss)
+    if step == 3:
+        os.kill(os.getpid(), signal.SIGTERM)
+train_video._Progress.__call__ = show
+run_process()
+"""
+
+
+def test_sigterm_writes_the_state_and_other_numbers_do_not_resume(data: Path, weights: Any, tmp_path: Path) -> None:
+    """As a batch system stops the command."""
+    name, out = "ltx-action", tmp_path / "out"
+    numbers = ["frames=9", "size=[64, 128]", "batch=4", "clips=4", "epochs=20"]
+    command = ["train", name, "--data", str(data), "--weights", str(weights(name)), "--part", "all", "--out", str(out)]
+    command += [each for number in numbers for each in ("--option", number)]
+    ended = subprocess.run(
+        [sys.executable, "-c", STOPPED, *command], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert ended.returncode == 75 and "Repeat the command to resume" in ended.stderr, ended.stderr
+    assert torch.load(tmp_path / "out.checkpoint", weights_only=True)["step"] == 3 and not out.exists()
+    options: dict[str, Any] = {"weights": weights(name), "device": "cpu", "part": "all"}
+    with pytest.raises(ArgumentError, match="other data or options"):
+        post_train(name, data, out, recipe=tiny_recipe(name, epochs=20, seed=1), **options)
+
+
+def test_sigusr1_writes_the_state_and_goes_on(data: Path, weights: Any, tmp_path: Path) -> None:
+    found: list[int] = []
+    state = tmp_path / "out.checkpoint"
+
+    def on_step(step: int, steps: int, loss: float) -> None:
+        if step == 2:
+            os.kill(os.getpid(), signal.SIGUSR1)
+        if step > 2 and state.exists():
+            found.append(torch.load(state, weights_only=True)["step"])
+
+    before = signal.getsignal(signal.SIGUSR1)
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action", epochs=4)
+    post_train("ltx-action", data, tmp_path / "out", recipe=recipe, on_step=on_step, **options)
+    assert found == [2, 2] and signal.getsignal(signal.SIGUSR1) == before
+
+
+def test_a_loss_that_is_not_finite_names_the_batch_and_keeps_the_state(
+    data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stock = PostTrainer._compute_losses
+
+    def spoil(self: PostTrainer, *args: Any) -> torch.Tensor:
+        return stock(self, *args) * (torch.nan if self.step_count == 3 else 1)
+
+    monkeypatch.setattr(PostTrainer, "_compute_losses", spoil)
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action", epochs=6)
+    with pytest.raises(TrainingError, match=r"step 4: the loss is not finite on a batch of clip \d+ \(scene "):
+        post_train("ltx-action", data, tmp_path / "out", recipe=recipe, **options)
+    content = torch.load(tmp_path / "out.checkpoint", weights_only=True)
+    assert content["step"] == 3
+    assert all(torch.isfinite(value).all() for value in content["state"]["weights"].values())
+    monkeypatch.undo()
+    assert post_train("ltx-action", data, tmp_path / "out", recipe=recipe, **options)["steps"] == 6
+
+
+# -- order, noise, recipes ---------------------------------------------------------------------------------------------
+
+
+def test_the_order_covers_the_clips_and_subsets_are_nested() -> None:
+    order = ClipOrder(total=50, count=12, batch=4, seed=3)
+    assert order.steps_per_epoch == 3
+    epochs = [np.concatenate([order.select(3 * epoch + step) for step in range(3)]) for epoch in range(2)]
+    assert len(set(epochs[0])) == 12 and set(epochs[0]) == set(epochs[1]) and list(epochs[0]) != list(epochs[1])
+    more = replace(order, count=24)
+    assert set(epochs[0]) < set(np.concatenate([more.select(step) for step in range(6)]))
+    np.testing.assert_array_equal(order.select(4), ClipOrder(50, 12, 4, 3).select(4))
+
+
+def test_levels_of_a_shifted_schedule_stay_on_their_side() -> None:
+    random = torch.Generator().manual_seed(0)
+    high = draw_shifted_uniform(20000, 5.0, random, 0.9, 1.0)
+    assert high.min() >= 0.9 and high.max() <= 1
+    both = draw_shifted_uniform(20000, 5.0, random)
+    assert abs(float((both >= 0.9).float().mean()) - 0.357) < 0.02  # the noisy expert's share of the schedule
+    weights = weigh_by_bell(both, 5.0)
+    assert abs(float(weights.mean()) - 1) < 0.02 and weights.min() >= 0
+    assert weigh_by_bell(torch.tensor([0.5]), 5.0) > weigh_by_bell(torch.tensor([0.95]), 5.0)
+
+
+def test_shipped_recipes_are_those_of_the_world_models() -> None:
+    for name in NAMES:
+        recipe, (model, _) = load_recipe(name), find_family(name)
+        assert recipe.frames == model.accepts.frames and recipe.size == (576, 1024)
+        assert recipe.drop == 0.1 and recipe.epochs == 1 and recipe.clips == 40_000
+
+
+def test_rates_follow_the_schedule() -> None:
+    recipe = load_recipe("ltx-action", options={"schedule": "cosine", "warmup": 0.2})
+    assert recipe.scale_rate(0.1) == pytest.approx(0.5) and recipe.scale_rate(0.2) == pytest.approx(1)
+    assert recipe.scale_rate(0.6) == pytest.approx(0.5) and recipe.scale_rate(1.0) == pytest.approx(0)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"lr": 1}, "no recipe has 'lr'"),
+        ({"rate": "fast"}, "rate: expected a number, got 'fast'"),
+        ({"rate": -1.0}, "rate: expected a finite number above 0"),
+        ({"batch": 3, "rows": 2}, "rows: expected a divisor of batch"),
+        ({"schedule": "step"}, "one of constant, linear, cosine"),
+        ({"frames": 1}, "frames: expected 2 or more"),
+        ({"drop": 1.0}, "drop: expected a share"),
+    ],
+)
+def test_recipes_that_make_no_sense_are_refused(options: dict[str, Any], said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        load_recipe("ltx-action", options=options)
+
+
+def test_what_cannot_be_trained_is_refused(data: Path, weights: Any, tmp_path: Path) -> None:
+    with pytest.raises(ArgumentError, match="'nwm-action' is not trained here; expected one of"):
+        post_train("nwm-action", data, tmp_path / "out")
+    front = save_dataset(tmp_path / "front", projection="perspective")
+    options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
+    recipe = tiny_recipe("ltx-action")
+    with pytest.raises(ArgumentError, match="see panoramas"):
+        post_train("ltx-action", front, tmp_path / "out", recipe=recipe, **options)
+    with pytest.raises(ArgumentError, match="no segment has 33 frames"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=replace(recipe, frames=33), **options)
+    with pytest.raises(ArgumentError, match="expected at least 400 clips"):
+        post_train("ltx-action", data, tmp_path / "out", recipe=replace(recipe, batch=400), **options)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note").touch()
+    with pytest.raises(ArgumentError, match="holds something already"):
+        post_train("ltx-action", data, tmp_path / "full", recipe=recipe, **options)
+
+
+def test_a_lora_that_covers_nothing_is_refused() -> None:
+    pipeline = tiny_pipelines.ltx()
+    with pytest.raises(ArgumentError, match=r"has no layers ffn.net.0.proj, ffn.net.2"):
+        add_lora(pipeline, "transformer", 4)
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    recipe = tmp_path / "mine.yaml"
+    recipe.write_text("{frames: 9, size: [64, 128], batch: 2, clips: 4}")
+    command = ["train", "ltx-action", "--data", str(data), "--weights", str(weights("ltx-action")), "--part", "all"]
+    out = tmp_path / "out"
+    assert main([*command, "--recipe", str(recipe), "--option", "rate=1e-3", "--epochs", "2", "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "4 steps of 2 clips, loss " in said.out and f"checkpoint={out} --world-model-option 'size=[64, 128]'" in (
+        said.out
+    )
+    assert "training: step 4/4" in said.err and "clips/s" in said.err and "GB" in said.err
+    card = json.loads((out / "training.json").read_text())
+    assert card["recipe"]["rate"] == 1e-3 and card["recipe"]["batch"] == 2 and card["steps"] == 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ltx-action"], "ltx-action trains on a navigation dataset"),
+        (["ltx-action", "--minutes", "3"], "--minutes: ltx-action has no time limit"),
+        (["ltx-action", "--scenes", "house.glb"], "--scenes: ltx-action does not train on scenes"),
+        (["warpnet", "--data", "data"], "--data: warpnet does not train on navigation datasets"),
+        (["ltx-action", "--data", "nowhere"], "meta.json is missing"),
+        (["ltx-action", "--data", "nowhere", "--option", "lr=1"], "no recipe has 'lr'"),
+    ],
+)
+def test_the_command_refuses(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", *arguments]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_command_names_all_that_is_trained() -> None:
+    assert set(VIDEO) == set(FAMILIES)
