@@ -67,8 +67,8 @@ def make_episodes(
                 return made[:count]
     raise ArgumentError(
         f"only {len(made)} of {count} questions in {blocks} blocks of up to {BLOCK} scenes with {rules.rooms} rooms or "
-        "more, each asked in two of them with different answers; name more scenes (apartments:SPLIT:N), raise per_scene, "
-        "or lower rooms"
+        "more, each asked in two of them with different answers; name more scenes (apartments:SPLIT:N), raise "
+        "per_scene, or lower rooms"
     )
 
 
