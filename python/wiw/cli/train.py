@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
-from wiw.cli.train_video import VIDEO, train_video
+from wiw.cli.train_video import VIDEO, VideoName, train_video
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
@@ -41,22 +41,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 def train(
     what: Positional[
-        Annotated[
-            Literal[
-                "recogniser",
-                "warpnet",
-                "perception",
-                "armnet",
-                "diffuser",
-                "svd-action",
-                "ltx-action",
-                "wan2.1-action",
-                "wan2.2-5b-action",
-                "wan2.2-a14b-action",
-                "cosmos-predict2-action",
-            ],
-            arg(metavar="WHAT"),
-        ]
+        Annotated[Literal["recogniser", "warpnet", "perception", "armnet", "diffuser", VideoName], arg(metavar="WHAT")]
     ] = "recogniser",
     /,
     *,

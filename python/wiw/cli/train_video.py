@@ -7,19 +7,20 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from wiw.cli.bars import Bars
 from wiw.cli.stop import announce_resume
 
-VIDEO = (
+VideoName = Literal[
     "svd-action",
     "ltx-action",
     "wan2.1-action",
     "wan2.2-5b-action",
     "wan2.2-a14b-action",
     "cosmos-predict2-action",
-)
+]
+VIDEO: tuple[str, ...] = get_args(VideoName)
 """World models that are video generators trained to follow actions."""
 LINE_SECONDS = 60.0
 """Time between two lines of progress where the output is no terminal."""

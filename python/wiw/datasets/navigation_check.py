@@ -14,7 +14,7 @@ import numpy as np
 from wiw.action import FORWARD, NULL, STOP, TURN_LEFT, TURN_RIGHT, ActionSpace
 from wiw.datasets.navigation import META, NavigationData
 from wiw.datasets.navigation_files import FrameFile
-from wiw.datasets.navigation_segment import NavigationSegment
+from wiw.datasets.navigation_segment import NavigationSegment, describe_segment
 from wiw.datasets.parquet_files import hash_file
 from wiw.datasets.scene_splits import find_named_split
 from wiw.errors import FileError
@@ -157,18 +157,7 @@ def _check_frames(data: NavigationData, name: str, found: Verification, seen: _P
 
 def find_row_errors(segment: NavigationSegment, row: Mapping[str, Any]) -> Iterator[str]:
     """Yield what a segment has otherwise than `segments.parquet` says."""
-    counts = {
-        "scene": segment.scene,
-        "pass": segment.pass_index,
-        "island": segment.island,
-        "segment": segment.segment,
-        "frames": len(segment),
-        "pictures": len(np.unique(segment.sources)),
-        "forward": int((segment.actions == FORWARD).sum()),
-        "turn_left": int((segment.actions == TURN_LEFT).sum()),
-        "turn_right": int((segment.actions == TURN_RIGHT).sum()),
-    }
-    for name, value in counts.items():
+    for name, value in describe_segment(segment).items():
         if row[name] != value:
             yield f"expected {name} {row[name]} as in segments.parquet, got {value}"
 

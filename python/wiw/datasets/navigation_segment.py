@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from wiw.action import NULL
+from wiw.action import FORWARD, NULL, TURN_LEFT, TURN_RIGHT
 from wiw.errors import ArgumentError, FileError
 
 DEPTH_UNITS = 1000
@@ -168,3 +168,18 @@ def encode_millimetres(depth: NDArray[np.float32]) -> bytes:
     if (choice := getattr(cv2, "IMWRITE_PNG_FILTER", None)) is not None:  # older OpenCV: larger files, the same pixels
         options += [choice, PNG_FILTER_UP]
     return bytes(cv2.imencode(".png", units, options)[1])
+
+
+def describe_segment(segment: NavigationSegment) -> dict[str, Any]:
+    """Return a segment's row of `segments.parquet`, but for where it is stored and how it ended."""
+    return {
+        "scene": segment.scene,
+        "pass": segment.pass_index,
+        "island": segment.island,
+        "segment": segment.segment,
+        "frames": len(segment),
+        "pictures": len(np.unique(segment.sources)),
+        "forward": int((segment.actions == FORWARD).sum()),
+        "turn_left": int((segment.actions == TURN_LEFT).sum()),
+        "turn_right": int((segment.actions == TURN_RIGHT).sum()),
+    }

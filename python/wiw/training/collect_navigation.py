@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 import wiw
-from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
 from wiw.datasets.navigation import META, NavigationData, read_navigation_manifest
 from wiw.datasets.navigation_card import build_card
 from wiw.datasets.navigation_files import (
@@ -32,7 +31,7 @@ from wiw.datasets.navigation_files import (
     write_frames,
     write_segment_list,
 )
-from wiw.datasets.navigation_segment import NavigationSegment
+from wiw.datasets.navigation_segment import describe_segment
 from wiw.datasets.parquet_files import hash_file, require_pyarrow
 from wiw.datasets.scene_splits import find_evaluation_split, name_scene
 from wiw.datasets.worlds import World, world
@@ -244,7 +243,7 @@ class SceneJob:
                     part = FrameFile(self._part(number))
                     traversal, at = jobs[number]
                     where = {"file": name, "row_group": row_group, "ending": traversal.segments[at].ending}
-                    found.append({**_describe_segment(part.read_segment(0)), **where})
+                    found.append({**describe_segment(part.read_segment(0)), **where})
                     yield part.read(0).replace_schema_metadata(schema.metadata)
 
             write_frames(self.folder / name, schema, tables())
@@ -264,20 +263,6 @@ class SceneJob:
             groups[-1].append(number)
             room -= size
         return groups
-
-
-def _describe_segment(segment: NavigationSegment) -> dict[str, Any]:
-    return {
-        "scene": segment.scene,
-        "pass": segment.pass_index,
-        "island": segment.island,
-        "segment": segment.segment,
-        "frames": len(segment),
-        "pictures": len(np.unique(segment.sources)),
-        "forward": int((segment.actions == FORWARD).sum()),
-        "turn_left": int((segment.actions == TURN_LEFT).sum()),
-        "turn_right": int((segment.actions == TURN_RIGHT).sum()),
-    }
 
 
 def _describe_file(path: Path, frames: int) -> dict[str, Any]:
