@@ -18,7 +18,7 @@ struct ModelSpec {
   int frames = 0;       // length of a rollout, the observation included; 0: any
   action::Padding padding = action::Padding::kForward;
   Leading leading = Leading::kSameDirection;
-  int max_rows = 0;  // most rows in one call; 0: all at once
+  int max_rows = 0;   // most rows in one call; 0: all at once
   bool ends = false;  // of each plan only the last observation is read
   action::ActionSpace space;
 

@@ -28,7 +28,9 @@ bool FurnitureBuilder::draw_open(double chance) {
   return open;
 }
 
-MaterialId FurnitureBuilder::case_material(const Rgb& color) { return color == look.wood ? wood(color) : plain("lacquer", color); }
+MaterialId FurnitureBuilder::case_material(const Rgb& color) {
+  return color == look.wood ? wood(color) : plain("lacquer", color);
+}
 
 namespace {
 

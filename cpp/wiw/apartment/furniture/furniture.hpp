@@ -88,8 +88,8 @@ void add_legs(FurnitureBuilder& m, MaterialId material, float width, float depth
               const Vec3& center = Vec3::Zero());
 /// Doors or drawers on the front of a case: `columns` x `rows` fields with handles; the doors of the first
 /// `open_columns` columns stand open.
-void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
-                bool drawers, int open_columns = 0);
+void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns,
+                int rows, bool drawers, int open_columns = 0);
 /// Frame of a leaf that hangs at `hinge` (x and z) and is turned outwards; it covers `low` to `high` when closed, which
 /// the design's leaves are told.
 Eigen::Affine3f open_leaf(FurnitureBuilder& m, const Vec2& hinge, const Vec3& low, const Vec3& high);

@@ -13,8 +13,8 @@ Eigen::Affine3f open_leaf(FurnitureBuilder& m, const Vec2& hinge, const Vec3& lo
   return turn;
 }
 
-void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns, int rows,
-                bool drawers, int open_columns) {
+void add_fronts(FurnitureBuilder& m, MaterialId front, MaterialId metal, const Vec3& low, const Vec3& high, int columns,
+                int rows, bool drawers, int open_columns) {
   const Eigen::Affine3f before = m.shape.frame();
   const int handle = static_cast<int>(m.rng.below(3));
   const float w = (high.x() - low.x()) / static_cast<float>(columns),
