@@ -30,6 +30,7 @@ from wiw.experiments.privileged_explorers import (
 from wiw.loop.memory import Query
 from wiw.loop.privileged import LiveEnvironments
 from wiw.loop.scheduler import run_episodes
+from wiw.mapping.fragments import pack_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
 from wiw.perception.scene_labels import CATEGORIES, STATES, Labeller, SceneLabels
@@ -103,6 +104,42 @@ def test_knowledge_is_counted_in_train_apartments(tmp_path):
 def test_the_table_has_the_axes_of_scenes():
     forward, left, up = to_table_frame(np.eye(3))
     assert forward.tolist() == [0, 0, -1] and left.tolist() == [-1, 0, 0] and up.tolist() == [0, 1, 0]
+
+
+# -- from the map to a home -------------------------------------------------------------------------------------------
+
+
+def make_boxes(
+    category: str, *boxes: tuple[tuple[float, float], tuple[float, float]]
+) -> tuple[ObjectMap, OccupancyGrid]:
+    """Return a map in which a category fills boxes 0.5 m high, given by their range along x and y."""
+    objects = ObjectMap(CATEGORIES, STATES)
+    votes = np.eye(len(CATEGORIES))[CATEGORIES.index(category)]
+    for number, ((x0, x1), (y0, y1)) in enumerate(boxes, start=1):
+        axes = [np.arange(low, high, 0.05) + 0.025 for low, high in ((x0, x1), (y0, y1), (0.0, 0.5))]
+        voxels = pack_voxels(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3))
+        objects._objects[number] = MapObject(
+            number, np.unique(voxels), votes, np.zeros(len(STATES)), (), category, "", "", 0.1, 1.0, 1, 0, 0
+        )
+    return objects, OccupancyGrid()
+
+
+@pytest.mark.parametrize(
+    ("category", "boxes", "count"),
+    [
+        ("sofa", [((0, 0.9), (0, 0.9)), ((0.95, 1.9), (0, 0.9))], 1),  # two ends of one
+        ("sofa", [((0, 1.9), (0, 0.9)), ((1.95, 3.9), (0, 0.9))], 2),  # side by side
+        ("sofa", [((0, 0.6), (0, 0.9)), ((1.2, 1.9), (0, 0.9))], 2),  # apart
+        ("cup", [((0, 0.05), (0, 0.05)), ((0.1, 0.15), (0, 0.05))], 2),  # small things stand close together
+    ],
+)
+def test_parts_that_fill_the_space_of_one_thing_are_one(category, boxes, count):
+    objects, grid = make_boxes(category, *boxes)
+    home = believe_home(objects, grid, [], load_knowledge())
+    assert len(home.objects) == count
+    assert sum(len(thing.voxels) for thing in home.objects.values()) == sum(
+        len(thing.voxels) for thing in objects.objects
+    )
 
 
 # -- questions ---------------------------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What voxels are labelled as in all views, against a dictionary of them."""
+"""Votes for the category of voxels, against a dictionary of them."""
 
 from __future__ import annotations
 
@@ -59,6 +59,10 @@ def test_votes_are_those_of_a_dictionary(seed: int, looks: int) -> None:
     found = votes.count(asked, len(NAMES))
     for kind in range(len(NAMES)):
         assert found[kind] == pytest.approx(sum(expected[voxel, kind] for voxel in asked.tolist()))
+        own = np.array([expected[voxel, kind] for voxel in asked.tolist()])
+        total = np.array([sum(expected[voxel, each] for each in range(len(NAMES))) for voxel in asked.tolist()])
+        shares = np.divide(own, total, out=np.ones_like(total), where=total > 0)
+        assert votes.measure_shares(asked, kind) == pytest.approx(shares)
 
 
 def test_a_thing_that_other_looks_see_a_wall_in_loses_support() -> None:
@@ -72,3 +76,17 @@ def test_a_thing_that_other_looks_see_a_wall_in_loses_support() -> None:
         objects.add(make_views(2.0), make_labels(wall))
         (chair,) = objects.find("chair")
         assert objects.measure_support(chair) == pytest.approx(1 / (1 + look), abs=0.05)
+
+
+def test_voxels_that_most_looks_see_a_wall_in_are_no_part_of_a_thing() -> None:
+    once, often = np.full((4, *SIZE), 1, np.uint8), np.full((4, *SIZE), 1, np.uint8)
+    once[0, 8:16, 4:28] = NAMES.index("chair")
+    often[0, 8:16, 4:16] = NAMES.index("chair")
+    objects = ObjectMap(NAMES)
+    for labels in (once, often, often, often):
+        objects.add(make_views(0.3), make_labels(labels))
+    (chair,) = objects.find("chair")
+    kept = objects.find_supported(chair, 0.35)
+    assert set(kept) < set(chair.voxels)
+    assert len(kept) == pytest.approx(len(chair.voxels) / 2, rel=0.15)
+    assert np.array_equal(objects.find_supported(chair, 0.0), chair.voxels)

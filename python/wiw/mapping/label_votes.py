@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each voxel of a home was labelled as, in all views of it, background included."""
+"""Votes of all views of a home for the category of each voxel, background included."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ MOST_DEPTH = 6.0
 STRIDE = 2
 """Rows and columns between the pixels that vote."""
 _BITS = 8
-"""Of a key, below the voxel: the category."""
+"""Lowest bits of a key, which hold the category; those above hold the voxel."""
+_CATEGORY = (1 << _BITS) - 1
 
 
 @dataclass
@@ -50,9 +51,26 @@ class LabelVotes:
             voxels: sorted keys, see `wiw.mapping.fragments.pack_voxels`.
             categories: how many there are.
         """
-        first = np.searchsorted(self._pairs, voxels << _BITS)
-        last = np.searchsorted(self._pairs, (voxels + 1) << _BITS)
-        counts = last - first
-        rows = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
-        found = np.bincount(self._pairs[rows] & ((1 << _BITS) - 1), self._votes[rows], categories)
+        rows, _ = self._find_rows(voxels)
+        found = np.bincount(self._pairs[rows] & _CATEGORY, self._votes[rows], categories)
         return np.asarray(found, np.float64)
+
+    def measure_shares(self, voxels: NDArray[np.int64], category: int) -> NDArray[np.float64]:
+        """Return the share of each voxel's votes that a category has, float64 [N]; 1 where there are no votes.
+
+        Args:
+            voxels: keys, see `wiw.mapping.fragments.pack_voxels`.
+            category: its number.
+        """
+        rows, place = self._find_rows(voxels)
+        votes = self._votes[rows]
+        total = np.bincount(place, votes, len(voxels))
+        own = np.bincount(place, votes * (self._pairs[rows] & _CATEGORY == category), len(voxels))
+        return np.divide(own, total, out=np.ones(len(voxels)), where=total > 0)
+
+    def _find_rows(self, voxels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the rows of some voxels' pairs, and for each row the place of its voxel among those."""
+        first = np.searchsorted(self._pairs, voxels << _BITS)
+        counts = np.searchsorted(self._pairs, (voxels + 1) << _BITS) - first
+        place = np.repeat(np.arange(len(voxels)), counts)
+        return np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts), place

@@ -160,7 +160,7 @@ class ObjectMap:
     confusable: tuple[frozenset[str], ...] = CONFUSABLE
     least_confidence: float = LEAST_CONFIDENCE
     votes: LabelVotes = field(default_factory=LabelVotes)
-    """What each voxel was labelled as, background included."""
+    """Votes of all views for the category of each voxel, background included."""
     _objects: dict[int, MapObject] = field(default_factory=dict)
     _next_id: int = 1
     _decision: int = -1
@@ -234,7 +234,7 @@ class ObjectMap:
         """Unite a fragment with the object that it is part of, or make it one; return its object's id."""
         same = self._find_matches(new)
         if same:
-            self._objects[same[0]] = self._unite(self._objects[same[0]], new)
+            self._objects[same[0]] = self.unite(self._objects[same[0]], new)
             return same[0]
         number, self._next_id = self._next_id, self._next_id + 1
         self._objects[number] = replace(new, id=number)
@@ -252,7 +252,7 @@ class ObjectMap:
             matches = [other for other in self._find_matches(thing) if self._objects[other].category == thing.category]
             if matches:
                 lower, upper = min(number, matches[0]), max(number, matches[0])
-                self._objects[lower] = self._unite(self._objects[lower], self._objects.pop(upper))
+                self._objects[lower] = self.unite(self._objects[lower], self._objects.pop(upper))
                 owners[owners == upper] = lower
                 waiting.insert(0, lower)
         return owners
@@ -277,7 +277,7 @@ class ObjectMap:
                 found.append((-overlap, int(numbers[row])))
         return [number for _, number in sorted(found)]
 
-    def _unite(self, one: MapObject, other: MapObject) -> MapObject:
+    def unite(self, one: MapObject, other: MapObject) -> MapObject:
         """Return what both are together, under the id of the first; a fragment, whose id is 0, comes second."""
         known = max(one.decisions, other.decisions) if other.id else one.decisions + (other.last > one.last)
         return self._summarise(
@@ -325,6 +325,14 @@ class ObjectMap:
         votes = self.votes.count(some, len(self.categories))
         total = votes.sum()
         return float(votes[self.categories.index(thing.category)] / total) if total > 0 else 1.0
+
+    def find_supported(self, thing: MapObject, least: float) -> NDArray[np.int64]:
+        """Return the voxels of a thing that at least some share of their own votes say are of its category.
+
+        Labels do not end where depth does: what a thing's edge was painted across lies on the wall behind it, and
+        other views see the wall there.
+        """
+        return thing.voxels[self.votes.measure_shares(thing.voxels, self.categories.index(thing.category)) >= least]
 
     def find(self, category: str, least_size: float = 0.0) -> tuple[MapObject, ...]:
         """Return the objects of a category, by id; spaces and underscores, upper and lower case are the same."""

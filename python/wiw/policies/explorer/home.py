@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.questions.facts import FRONTED, Room, SceneTable, Thing
+from wiw.datasets.questions.facts import FRONTED, SMALL, Room, SceneTable, Thing
 from wiw.mapping.fragments import split_voxels
 from wiw.mapping.object_map import MapObject, ObjectMap
 from wiw.mapping.occupancy import OccupancyGrid
@@ -29,6 +29,10 @@ LEAST_SHARE = 0.4
 """Share of its votes that a thing's category must have."""
 LEAST_SUPPORT = 0.1
 """Share of the votes of all views for what is there, background included, that a thing's category must have."""
+LEAST_VOXEL_SHARE = 0.35
+"""The same of a single voxel for being part of the thing."""
+LEAST_KEPT = 0.1
+"""Share of a thing's voxels that must be left."""
 
 WORKTOPS = frozenset({"kitchen counter", "kitchen cabinet"})
 """Categories that stand against walls and have no left and right."""
@@ -36,6 +40,10 @@ WALL_REACH = 0.7
 """Metres behind what was seen of furniture in which its wall is looked for."""
 TOO_LONG = 1.3
 """Times the usual length of its category, from which on a thing of the map may be several."""
+APART = 0.1
+"""Metres between two things of the map up to which they may be parts of one."""
+ONE_SIZE = (1.1, 0.1)
+"""Times the usual sides of its category, and metres added, that such parts fill together at most."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +125,7 @@ def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Sur
         and thing.category_share >= LEAST_SHARE
         and objects.measure_support(thing) >= LEAST_SUPPORT
     ]
-    seen = _take_apart(known, knowledge)
+    seen = _take_apart(_put_together(_drop_strays(known, objects), objects, knowledge), knowledge)
     places = {thing.id: grid.find_room(thing.points) for thing in seen}
     rooms, names, kinds = _name_rooms(seen, places, grid, knowledge)
     things = [_make_thing(thing, names.get(places[thing.id], ""), grid, knowledge) for thing in seen]
@@ -128,6 +136,45 @@ def believe_home(objects: ObjectMap, grid: OccupancyGrid, surfaces: Sequence[Sur
 def to_table_frame(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return points (x forward, y left, z up) in the axes of scene tables, which have Y up and look down -Z."""
     return np.asarray(np.stack([-points[..., 1], points[..., 2], -points[..., 0]], axis=-1))
+
+
+def _drop_strays(things: Sequence[MapObject], objects: ObjectMap) -> list[MapObject]:
+    """Return the things without the voxels that views mostly saw as something else, where enough of them is left."""
+    found = []
+    for thing in things:
+        voxels = objects.find_supported(thing, LEAST_VOXEL_SHARE)
+        if len(voxels) >= max(1, LEAST_KEPT * len(thing.voxels)):
+            found.append(replace(thing, voxels=voxels))
+    return found
+
+
+def _put_together(things: Sequence[MapObject], objects: ObjectMap, knowledge: Knowledge) -> list[MapObject]:
+    """Return the things by id, those of one category that touch and are together no larger than one united.
+
+    Of a large thing near ones only see parts. Small things stay as they are: they stand close together.
+    """
+    found = list[MapObject]()
+    for thing in sorted(things, key=lambda thing: (-len(thing.voxels), thing.id)):
+        for place, other in enumerate(found):
+            if other.category == thing.category and _may_be_one(thing, other, knowledge):
+                first, second = sorted((thing, other), key=lambda part: part.id)
+                found[place] = objects.unite(first, second)
+                break
+        else:
+            found.append(thing)
+    return sorted(found, key=lambda thing: thing.id)
+
+
+def _may_be_one(thing: MapObject, other: MapObject, knowledge: Knowledge) -> bool:
+    """Whether two things of one category touch, and fit together into the usual size of one."""
+    usual = knowledge.sides.get(thing.category)
+    if usual is None or thing.category in SMALL:
+        return False
+    if (np.maximum(other.box[0] - thing.box[1], thing.box[0] - other.box[1]) > APART).any():
+        return False
+    low, high = np.minimum(thing.bounds[0], other.bounds[0]), np.maximum(thing.bounds[1], other.bounds[1])
+    factor, more = ONE_SIZE
+    return bool((np.sort((high - low)[:2])[::-1] <= factor * np.array(usual) + more).all())
 
 
 def _take_apart(things: Sequence[MapObject], knowledge: Knowledge) -> list[MapObject]:
