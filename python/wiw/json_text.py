@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import Any
 
 MOST_LEVELS = 32
-"""Of lists and objects in one another; values are walked through recursively later."""
+"""Deepest nesting of lists and objects; values are walked through recursively later."""
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 

@@ -25,7 +25,7 @@ class WeightFile(Generic[N]):
     """The files of one kind of network."""
 
     name: str
-    """Of the world model or policy, as it is trained by `wiw train NAME`."""
+    """Name of the world model or policy, as in `wiw train NAME`."""
     sizes: Callable[[N], dict[str, Any]]
     """JSON-able: what a network of the same shape is built of."""
     build: Callable[[Mapping[str, Any]], N]

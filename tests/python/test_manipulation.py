@@ -33,7 +33,7 @@ def solve_episode(env: ManipulationEnv, discrete: bool = False) -> dict[str, flo
 @pytest.mark.parametrize("discrete", [False, True])
 @pytest.mark.parametrize("name", TABLETOP_TASKS)
 def test_experts_do_what_they_are_told(name: str, discrete: bool) -> None:
-    """Of these few all but one; `docs/results.md` has 200 tables of each."""
+    """All but one of these few succeed; `docs/results.md` has 200 tables of each."""
     env = Manipulation(name, seed=7).environment()
     results = []
     for index in range(4):

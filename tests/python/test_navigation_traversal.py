@@ -167,15 +167,15 @@ def test_waypoints_are_those_of_the_paper() -> None:
     for index in sorted(range(count), key=lambda i: -leaf_score(distances, i, range(count))):
         if all(distances[index, other] >= SMALL.spacing for other in chosen):
             chosen.append(index)
-    assert waypoints.unvisited.tolist() == chosen[: math.ceil(0.5 * count)]
+    assert waypoints.candidates.tolist() == chosen[: math.ceil(0.5 * count)]
     here = waypoints.samples[chosen[2]]
     others = [index for index in chosen if index != chosen[2]]
     assert waypoints.find_next(here, chosen[2]) == min(others, key=lambda i: distances[chosen[2], i])
     waypoints.mark_visited(np.stack([here, waypoints.samples[chosen[0]]]))
     left = [index for index in chosen if min(distances[index, chosen[2]], distances[index, chosen[0]]) >= 0.5]
-    assert waypoints.unvisited.tolist() == sorted(left, key=lambda i: -leaf_score(distances, i, left))
+    assert waypoints.candidates.tolist() == sorted(left, key=lambda i: -leaf_score(distances, i, left))
     waypoints.drop(left[0])
-    assert left[0] not in waypoints.unvisited and len(waypoints.unvisited) == len(left) - 1
+    assert left[0] not in waypoints.candidates and len(waypoints.candidates) == len(left) - 1
 
 
 def leaf_score(distances: Any, index: int, among: Any) -> float:
@@ -210,18 +210,18 @@ def test_a_sample_that_no_path_leads_to_is_left_out() -> None:
 def test_candidates_are_the_most_peripheral_waypoints() -> None:
     navmesh = NavMesh.build(room([]))
     few = Waypoints(navmesh, 0, 5, replace(SMALL, leaf_ratio=0.02))
-    assert len(few.unvisited) == 2 < len(few.points)
-    np.testing.assert_array_equal(few.samples[few.unvisited], few.points[:2])
+    assert len(few.candidates) == 2 < len(few.points)
+    np.testing.assert_array_equal(few.samples[few.candidates], few.points[:2])
 
 
 def test_two_metres_are_preferred_where_asked() -> None:
     navmesh = NavMesh.build(room([]))
     waypoints = Waypoints(navmesh, 0, 5, replace(SMALL, next_waypoint="2m"))
-    here = waypoints.samples[waypoints.unvisited[0]]
-    others = waypoints.unvisited[1:]
+    here = waypoints.samples[waypoints.candidates[0]]
+    others = waypoints.candidates[1:]
     metres = navmesh.geodesic_distance(waypoints.samples[others], here)
     expected = others[np.argmin(np.abs(metres - 2))]
-    assert waypoints.find_next(here, int(waypoints.unvisited[0])) == expected
+    assert waypoints.find_next(here, int(waypoints.candidates[0])) == expected
 
 
 def test_each_large_island_is_traversed_and_small_ones_are_not() -> None:

@@ -294,7 +294,7 @@ def _compare_first_frames(name: str, trainer: PostTrainer, trained: dict[str, An
 
 
 def _predict_perfectly(name: str, latents: torch.Tensor) -> Any:
-    """What a denoiser would return that knows the clip's latents: its forward."""
+    """Forward of a denoiser that knows the clip's latents."""
 
     def predict(*args: Any, **kwargs: Any) -> tuple[torch.Tensor]:
         if name == "svd-action":

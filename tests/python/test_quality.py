@@ -486,6 +486,8 @@ def test_arms_of_several_runs_are_named_by_run(run: Path, two_rooms: str, tmp_pa
     assert first.scores == last.scores
     chosen = wiw.quality([run, again], frames=8, arms=["warp", "again/copy"])
     assert chosen.table.control == "SSIM"  # the oracle tells what is true, compared or not
+    alone = wiw.quality([run, again], frames=8, arms=["warp"])  # no arm of the second run
+    assert [line.arm for line in alone.table.arms] == ["warp"]
 
 
 def test_what_cannot_be_compared_is_refused(

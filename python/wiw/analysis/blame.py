@@ -51,7 +51,7 @@ class ArmBlame:
     judged: int
     """Episodes of the run that ended without an error."""
     failures: int
-    """Of those, the ones without success."""
+    """Episodes of these without success."""
     errors: tuple[int, ...]
     """Episodes of the run that ended with an error; nothing is blamed for them."""
     episodes: tuple[EpisodeBlame, ...]

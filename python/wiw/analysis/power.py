@@ -34,7 +34,7 @@ class Power:
     losses: float
     """Percent of episodes that only the arm compared with succeeds in."""
     correlation: float
-    """Of the differences of two episodes of a scene."""
+    """Correlation of the differences of two episodes of a scene."""
     per_scene: int
     arms: int
     wanted: float

@@ -41,7 +41,7 @@ FEW_ARMS = 8
 
 @dataclass(frozen=True)
 class Sample:
-    """What was measured of one arm."""
+    """Measurements of one arm."""
 
     arm: str
     success: Mapping[int, float]
@@ -71,14 +71,14 @@ class QualityTable:
     correlations: tuple[Correlation, ...]
     measures: tuple[str, ...]
     outcome: str
-    """What counts as success: "SR", or "Score" where answers have marks."""
+    """Measure of success: "SR", or "Score" where answers have marks."""
     episodes: int
     """Scored in every arm; success is over these."""
     pictured: int
-    """Those that frames were drawn from."""
+    """Episodes that frames were drawn from."""
     scenes: int
     frames: int
-    """Of each arm."""
+    """Number of frames of each arm."""
     notes: tuple[str, ...] = ()
     scorers: tuple[Mapping[str, Any], ...] = field(default=())
     """Cards of the scorers, with "command"."""

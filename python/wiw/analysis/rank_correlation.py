@@ -34,13 +34,13 @@ class Correlation:
     rho: float
     """Spearman's coefficient over the arms, -1 to 1; NaN below three arms, and where all are equal in one."""
     low: float
-    """Of the 95 % interval from drawing scenes anew, the arms staying as they are; NaN where there is none."""
+    """Lower end of the 95 % interval from resampling scenes with the arms fixed; NaN where there is none."""
     high: float
     p: float
     """Two-sided, exact to eight arms: how often a random order of the arms is as extreme."""
     arms: int
     unit: str
-    """What was drawn anew: "scenes" or "episodes"."""
+    """Unit of resampling: "scenes" or "episodes"."""
     units: int
     defined: float
     """Share of the draws that have a coefficient."""

@@ -88,7 +88,7 @@ class Group:
     """Commands of two words."""
 
     line: str
-    """What they do, in the list of commands."""
+    """Summary shown in the list of commands."""
     description: str
     commands: tuple[tuple[Callable[..., int], str, str], ...]
     default: str | None = None

@@ -74,7 +74,7 @@ def stats_data(folder: Folder, /, *, clip: Annotated[int, arg(metavar="N")] = 14
 
 
 LISTED_SCENES = 10
-"""Those with the least coverage."""
+"""Scenes with the least coverage that are listed."""
 LENGTHS = (2, 10, 20, 30, 40, 60, 80, 120)
 """Frames: where the ranges of the histogram of lengths begin."""
 BAR = 40

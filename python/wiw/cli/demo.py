@@ -29,7 +29,7 @@ class Part:
     more: str
     """A command for more of the same."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Of the task."""
+    """Options of the task."""
     requires: Requirements = field(default_factory=Requirements)
     """Packages that the policy needs."""
 

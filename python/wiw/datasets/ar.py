@@ -103,7 +103,7 @@ class EpisodeRules:
     survey: int = 250
     """Places looked at in a scene."""
     places: int = 30
-    """Of those near a target, places where its visible share is measured."""
+    """Places near a target where its visible share is measured."""
     attempts: int = 6
     """Starts tried for a target."""
 

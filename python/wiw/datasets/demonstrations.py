@@ -29,7 +29,7 @@ from wiw.errors import ArgumentError, FileError
 SHARD = 10
 """Demonstrations a file."""
 QUALITY = 95
-"""Of JPEG, whose colours are as fine as its brightness."""
+"""JPEG quality; colours are as fine as brightness (4:4:4)."""
 
 Format = Literal["jpeg", "png"]
 

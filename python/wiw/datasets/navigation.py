@@ -54,7 +54,7 @@ class NavigationData(Sequence[NavigationSegment]):
         """Camera, encoding, rules, scenes and checksums."""
         rows = read_segment_list(self.folder / SEGMENTS)
         self.segments = [row for row in rows if part == "all" or part == part_of(row["scene"], held_out)]
-        """What `segments.parquet` says about each segment: scene, file, row group, frames, numbers of actions."""
+        """Rows of `segments.parquet`: scene, file, row group, frames and action counts of each segment."""
         self._files: dict[str, FrameFile] = {}
 
     def __len__(self) -> int:

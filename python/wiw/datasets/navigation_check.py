@@ -24,7 +24,7 @@ STEP_TOLERANCE = 0.011
 """Metres: a step's end is moved onto the mesh by up to a centimetre."""
 HEADINGS = 16
 LISTED_PROBLEMS = 50
-"""Of each kind; the rest are counted."""
+"""Problems of each kind that are listed; the rest are counted."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a file that is checked, the number of those, and of how many."""
@@ -32,7 +32,7 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass
 class Verification:
-    """What was found."""
+    """Findings of a verification."""
 
     files: int = 0
     segments: int = 0

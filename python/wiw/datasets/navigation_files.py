@@ -42,7 +42,7 @@ SEGMENT_COLUMNS: Mapping[str, str] = {
     "turn_right": "int32",
     "ending": "string",
 }
-"""Of `segments.parquet`, with their types."""
+"""Columns of `segments.parquet`, with their types."""
 SEGMENTS = "segments.parquet"
 
 

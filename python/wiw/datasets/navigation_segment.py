@@ -41,7 +41,7 @@ class NavigationSegment:
     segment: int
     """Number within the pass over the scene."""
     seed: int
-    """Of the dataset."""
+    """Seed of the dataset."""
     height: float
     """Metres of the camera above the floor."""
     actions: NDArray[np.int8]
@@ -99,7 +99,7 @@ class NavigationSegment:
         actions[0] = int(NULL)
         sources = np.maximum(self.sources[frames] - start, 0)
 
-        def cut(pictures: tuple[bytes | None, ...]) -> tuple[bytes | None, ...]:
+        def cut_pictures(pictures: tuple[bytes | None, ...]) -> tuple[bytes | None, ...]:
             return (pictures[first], *pictures[start + 1 : start + length])
 
         return replace(
@@ -108,8 +108,8 @@ class NavigationSegment:
             poses=self.poses[frames],
             sources=sources.astype(np.int32),
             rolls=self.rolls[frames],
-            encoded_images=cut(self.encoded_images),
-            encoded_depths=None if self.encoded_depths is None else cut(self.encoded_depths),
+            encoded_images=cut_pictures(self.encoded_images),
+            encoded_depths=None if self.encoded_depths is None else cut_pictures(self.encoded_depths),
         )
 
     def decode(self, frame: int) -> tuple[NDArray[np.uint8], NDArray[np.uint16] | None]:

@@ -39,7 +39,7 @@ class NavigationStatistics:
     endings: dict[str, int]
     """Number of segments that reached their waypoint, got stuck, or were cut at the cap."""
     scenes: tuple[SceneFigures, ...]
-    """Those with the least coverage first."""
+    """Figures of each scene, least coverage first."""
 
     @property
     def coverage(self) -> float:

@@ -13,9 +13,9 @@ from wiw.errors import DependencyError, FileError
 from wiw.files import atomic_file
 
 MANIFEST = "manifest.json"
-"""Of a folder: what was asked for."""
+"""Name of the file in a folder that says what was asked for."""
 KEY = b"wiw"
-"""Of the metadata, which are JSON."""
+"""Key of the Parquet metadata, which are JSON."""
 
 
 def require_pyarrow(what: str) -> None:

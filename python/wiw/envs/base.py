@@ -28,7 +28,7 @@ class Segment:
     terminated: bool
     truncated: bool
     key: Key | None = None
-    """Of the next decision, where the environment counts decisions itself."""
+    """Key of the next decision, where the environment counts decisions itself."""
     refused: tuple[str, ...] = ()
     """Why actions were not carried out to their ends, one reason for each such action."""
 

@@ -92,7 +92,7 @@ class NavigationGuide(Guide):
     task: NavigationSpec
     state: EpisodeState
     fork: Any
-    """Of the simulator."""
+    """Fork of the simulator."""
     path: ShortestPath
 
     def evaluate_plan(self, plan: Sequence[int] | NDArray[np.int8]) -> float:

@@ -21,7 +21,7 @@ class Pointing:
     """How a task's target is boxed, and whether the episode ends when it is lost."""
 
     scale: float = 1.0
-    """Of the box about its centre."""
+    """Scale of the box about its centre."""
     part: Literal["all", "largest"] = "all"
     """Whether the box holds all visible pixels or the largest piece of them."""
     lost: Literal["continue", "stop"] = "continue"

@@ -36,7 +36,7 @@ class Sensors:
     ids: bool = False
     cloud: bool = False
     joints: int = 9
-    """Of the arm and its fingers."""
+    """Number of joints, of the arm and its fingers."""
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.cameras if name not in CAMERAS]:

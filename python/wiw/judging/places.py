@@ -14,7 +14,7 @@ from wiw.judging.words import split_clauses
 
 ANCHOR_MARK, ROOM_MARK, CATEGORY_MARK = 4, 3, 2
 BROADER_ROOM_MARK = 4
-"""Of "bedroom" where "kids room" is all that was asked for."""
+"""Mark of "bedroom" where "kids room" is all that was asked for."""
 _SIDES = {
     "under": ("under", "below", "beneath", "underneath"),
     "above": ("above", "over"),

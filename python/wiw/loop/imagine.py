@@ -31,7 +31,7 @@ class ImaginedPrimitives(Imagination):
     """Answer to one batch of plans."""
 
     rollouts: list[list[Rollout]]
-    """[episode][candidate]."""
+    """Rollouts by [episode][candidate]."""
     costs: list[dict[str, int]]
     """What the batch cost each episode: a consultation, rows asked and frames imagined."""
     observations: Sequence[Observation]
@@ -39,7 +39,7 @@ class ImaginedPrimitives(Imagination):
     answers: list[NDArray[np.uint8]]
     """What the world model gave, one array a part of the batch."""
     view: View
-    """Of the answers."""
+    """View that the answers show."""
 
     def show(self, frames: FrameSpec) -> list[list[Rollout]]:
         """Return the rollouts in other views than the reviser's."""

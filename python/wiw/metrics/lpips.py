@@ -25,7 +25,7 @@ AT_ONCE = 32
 LEAST = 32
 """Pixels of an image's shorter side that leave something of it after three poolings."""
 SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-"""Of the network's input, channel by channel, from images in [-1, 1]."""
+"""Normalisation of the network's input by channel, from images in [-1, 1]."""
 STAGES = (("0", 4, 2, False), ("3", 1, 2, True), ("6", 1, 1, True), ("8", 1, 1, False), ("10", 1, 1, False))
 """Number of a convolution among AlexNet's `features`, its stride and padding, and whether a pooling leads to it."""
 

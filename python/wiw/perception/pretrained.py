@@ -16,9 +16,9 @@ from wiw.errors import ArgumentError, DependencyError, WeightsError
 from wiw.networks import explain_hub_error, is_path
 
 MEAN = (0.485, 0.456, 0.406)
-"""ImageNet's mean and standard deviation, channel by channel."""
+"""ImageNet's mean, channel by channel."""
 STD = (0.229, 0.224, 0.225)
-"""Of ImageNet, channel by channel."""
+"""ImageNet's standard deviation, channel by channel."""
 
 
 def load_network(loader: str, kinds: Sequence[str], weights: str | Path, revision: str | None, device: str) -> Any:

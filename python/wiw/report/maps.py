@@ -14,7 +14,7 @@ from wiw.runs.scene_map import to_pixels
 from wiw.types import Episode
 
 PIXELS_PER_METRE = 60.0
-"""Of a map without a picture."""
+"""Scale of a map without a picture."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ ABOUT = {
     "colourfulness": "Hasler and Suesstrunk 2003: 0 grey, 15 slightly, 45 fairly, 109 extremely colourful.",
     "laion_aesthetic": "LAION's improved aesthetic predictor, about 1 to 10.",
 }
-"""What a measure is, in a sentence."""
+"""Meaning of each measure, in a sentence."""
 RANK_TITLES = ("Spearman", "95 %", "p", "arms")
 
 

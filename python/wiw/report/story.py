@@ -98,7 +98,7 @@ class Candidate:
     real_frames: int
     """How many leading frames are the real view turned."""
     frames: int
-    """Of the strips."""
+    """Frames of the strips."""
     drawing: Drawing | None = None
     """The plan on what the camera sees, where it is one of poses."""
     text: str = ""

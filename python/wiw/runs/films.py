@@ -22,7 +22,7 @@ from wiw.tasks.base import Task
 SIDE = (256, 256)
 """Pixels."""
 SPEED = 2.0
-"""Of what is shown, against what happened."""
+"""Speed of a film against what happened."""
 RATE = 15.0
 """Frames a second, as shown."""
 MOST = 200
@@ -30,7 +30,7 @@ MOST = 200
 LAST = 1500
 """Milliseconds that the end is shown before it begins again."""
 QUALITY = 85
-"""Of WebP; below it, where the arm was shines through."""
+"""WebP quality; below it, where the arm was shines through."""
 
 
 def film_episodes(store: RunStore, task: Task) -> None:

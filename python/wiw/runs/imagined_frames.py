@@ -25,7 +25,7 @@ from wiw.runs.store import RunStore
 
 @dataclass(frozen=True, order=True)
 class FrameKey:
-    """What an imagined frame shows: the same key in two arms is the same future, imagined twice."""
+    """Identity of an imagined future: two arms that imagined the same one have frames of the same key."""
 
     episode: int
     decision: int
@@ -118,7 +118,7 @@ def read_frames(
             images = store.images(*at)
         jpeg = images.get(f"{kind}/{place.plan}")
         if jpeg is not None:
-            yield key, _cut(decode_jpeg(jpeg), place, key.view)
+            yield key, _cut_frame(decode_jpeg(jpeg), place, key.view)
 
 
 def digest_frame(frame: NDArray[np.uint8]) -> str:
@@ -158,6 +158,6 @@ def _measure(jpeg: bytes) -> tuple[int, int]:
         raise StoreError(f"a picture of {len(jpeg)} bytes is no JPEG; the run store is damaged") from error
 
 
-def _cut(strip: NDArray[np.uint8], place: FramePlace, view: int) -> NDArray[np.uint8]:
+def _cut_frame(strip: NDArray[np.uint8], place: FramePlace, view: int) -> NDArray[np.uint8]:
     column = np.split(strip, place.columns, axis=1)[place.column]
     return np.ascontiguousarray(np.split(column, place.views, axis=0)[view])

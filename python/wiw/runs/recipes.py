@@ -80,7 +80,7 @@ class AgentRecipe(AgentConfig):
     model_options: Mapping[str, Any] = field(default_factory=dict)
     """What the world model is made with, by name."""
     policy_options: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
+    """Options of policies, by their names: {"vlm": {"vlm": "http://localhost:8000/v1"}}."""
     ground_truth: Sequence[str] = ()
     """Stages that are given the ground truth (`wiw.experiments.ground_truth`)."""
     semantics: Any = None

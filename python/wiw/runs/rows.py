@@ -19,7 +19,7 @@ from wiw.types import Answer, ArmObservation, DecisionRecord, EpisodeResult, Fid
 STRIP_HEIGHT = 160
 JPEG_QUALITY = 85
 MOST_FRAMES = 20
-"""Of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for fewer."""
+"""Most frames of a rollout that are kept as pictures: a JPEG has room for 65535 pixels, a reader for fewer."""
 
 
 @dataclass(frozen=True)

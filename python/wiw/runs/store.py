@@ -708,7 +708,7 @@ def _episode_values(index: int, episode: Episode) -> tuple[Any, ...]:
 
 
 _TYPES: dict[str, tuple[type, ...]] = {"TEXT": (str,), "INTEGER": (int,), "REAL": (float, int), "BLOB": (bytes,)}
-"""Of Python, by SQLite's names."""
+"""Python types by SQLite's names."""
 
 
 def _episode(row: dict[str, Any], info: dict[str, Any]) -> Episode:

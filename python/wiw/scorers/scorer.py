@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scorer of images is: a card that says who it is, and numbers for PNG files."""
+"""The interface of image scorers: a card that identifies the scorer, and numbers for PNG files."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ScorerCard:
 
     @property
     def digest(self) -> str:
-        """Of the card: scores under it are by one scorer in one version."""
+        """Digest of the card: scores stored under it are by one scorer in one version."""
         return hashlib.sha256(json.dumps(self.as_dict(), sort_keys=True).encode()).hexdigest()[:16]
 
     @property

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 UNSENT_BYTES = 256 * 2**20
-"""Of a client's messages that wait; an answer beyond that is not queued, and the client must ask again."""
+"""Most bytes of a client's messages that wait; an answer beyond that is not queued, and the client must ask again."""
 
 
 class Outbox:
@@ -30,7 +30,7 @@ class Outbox:
         self._sent, self._sent_before, self._buffered_before = 0, 0, 0
         self._progress_at = time.monotonic()
         self.unsent_bytes = 0
-        """Of messages that have not left, the one that is being sent included."""
+        """Bytes of messages that have not left, the one that is being sent included."""
 
     def __len__(self) -> int:
         """Return how many messages have not left."""

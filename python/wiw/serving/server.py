@@ -40,7 +40,7 @@ PORT = 8765
 CLIENTS = 256
 """Most connections at a time."""
 KNOWN_BYTES = 512 * 2**20
-"""Of answers that are kept for clients that ask again."""
+"""Most bytes of answers that are kept for clients that ask again."""
 AHEAD = 4
 """Full batches that one client may have unanswered, so that rows travel while others are computed."""
 HEARTBEAT, SILENCE, HANDSHAKE = 10.0, 30.0, 10.0

@@ -48,7 +48,7 @@ class Row:
     depth: Any
     semantic: Any
     history: History | None
-    """Of one row."""
+    """History of one row."""
     simulator: Any
     """As the model is handed it, if it is."""
     control: Control
@@ -79,9 +79,9 @@ class ModelQueries:
         )
         self._moments = [_begin_with_history(model.accepts, *each) for each in episodes]
         self.row_seconds = 0.0
-        """What a row took in the last call."""
+        """Seconds a row took in the last call."""
         self.changed: set[str] = set()
-        """What of its inputs the model has changed."""
+        """Names of the inputs that the model has changed."""
         self.reuses = False
         """Whether an answer lay in the memory of an earlier one."""
         self.rewrites = False

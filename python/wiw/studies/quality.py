@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ from wiw.studies.compare import require_comparable
 from wiw.studies.run_log import RunLog, load_run
 
 FRAMES = 200
-"""Of each arm, where the caller does not say how many."""
+"""Default number of frames of each arm."""
 ALWAYS = "pixels"
 """The scorer that needs nothing and takes no time."""
 VIEW = (128, 128)
@@ -104,6 +105,11 @@ class _Arm:
     true: dict[FrameKey, Image] = field(default_factory=dict)
     scores: dict[str, dict[FrameKey, float]] = field(default_factory=dict)
 
+    @cached_property
+    def digests(self) -> dict[FrameKey, str]:
+        """Digests of `frames`, once these are read."""
+        return {key: digest_frame(frame) for key, frame in self.frames.items()}
+
 
 def quality(
     runs: str | Path | RunLog | Sequence[str | Path | RunLog],
@@ -149,7 +155,7 @@ def quality(
         raise ArgumentError("quality: expected at least one run, got none")
     judged = None if lpips is None else Lpips(lpips)  # fails before anything takes time
     with ExitStack() as stack:
-        logs = [one if isinstance(one, RunLog) else stack.enter_context(_opened(one)) for one in given]
+        logs = [one if isinstance(one, RunLog) else stack.enter_context(_open_run(one)) for one in given]
         for log in logs[1:]:
             require_comparable(logs[0], log)
         chosen, notes = _choose_arms(logs, arms)
@@ -166,11 +172,11 @@ def quality(
             notes.append("No true frames, so no controllability: run with --fidelity, or with arm oracle.")
         table = _summarise(chosen, cards, notes, logs[0])
     folder = Path(out) if out is not None else logs[0].path / "quality"
-    return Quality(table, folder, _show(chosen, keys))
+    return Quality(table, folder, _choose_pictures(chosen, keys))
 
 
 @contextmanager
-def _opened(path: str | Path) -> Iterator[RunLog]:
+def _open_run(path: str | Path) -> Iterator[RunLog]:
     """Open a run for a `with` block."""
     log = load_run(path)
     try:
@@ -257,9 +263,10 @@ def _score(
     scorer: Scorer, spec: str, arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], watch: Watch | None
 ) -> None:
     card = scorer.card
-    digests = {arm.label: {key: digest_frame(frame) for key, frame in arm.frames.items()} for arm in arms}
-    images = {digests[arm.label][key]: frame for arm in arms for key, frame in arm.frames.items()}
-    homes = _homes(arms, digests)
+    images = {arm.digests[key]: frame for arm in arms for key, frame in arm.frames.items()}
+    homes = {
+        path: {digest for arm in arms if arm.log.path == path for digest in arm.digests.values()} for path in stores
+    }
     known = {path: store.read(card.digest, homes[path]) for path, store in stores.items()}
     found = {digest: scores for own in known.values() for digest, scores in own.items()}
     for path, store in stores.items():
@@ -274,15 +281,7 @@ def _score(
                 store.write(card.digest, digest, scores)
     for arm in arms:
         for name in card.scores:
-            arm.scores[name] = {key: found[digest][name] for key, digest in digests[arm.label].items()}
-
-
-def _homes(arms: Sequence[_Arm], digests: Mapping[str, Mapping[FrameKey, str]]) -> dict[Path, set[str]]:
-    """Return the frames of each run."""
-    homes: dict[Path, set[str]] = {}
-    for arm in arms:
-        homes.setdefault(arm.log.path, set()).update(digests[arm.label].values())
-    return {**{path: set() for path in {arm.log.path for arm in arms}}, **homes}
+            arm.scores[name] = {key: found[digest][name] for key, digest in arm.digests.items()}
 
 
 def _ask(
@@ -309,9 +308,9 @@ def _compare_with_truth(
     arms: Sequence[_Arm], stores: Mapping[Path, FrameScores], lpips: Lpips | None, watch: Watch | None
 ) -> None:
     """Add controllability: SSIM, and 1 - LPIPS where its weights are, of each frame against the true one."""
-    measures: dict[str, Callable[[Image, Image], float]] = {CONTROL_BY_SSIM: _similarity}
+    measures: dict[str, Callable[[Image, Image], float]] = {CONTROL_BY_SSIM: _measure_similarity}
     if lpips is not None:
-        measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - _distance(lpips, a, b), **measures}
+        measures = {CONTROL_BY_LPIPS: lambda a, b: 1 - _measure_distance(lpips, a, b), **measures}
     for name, measure in measures.items():
         card = ScorerCard("truth", "1", "Apache-2.0", {name: None})
         total = sum(key in arm.true for arm in arms for key in arm.frames)
@@ -326,13 +325,13 @@ def _is_panorama(frame: Image) -> bool:
     return frame.shape[1] == 2 * frame.shape[0]
 
 
-def _similarity(frame: Image, true: Image) -> float:
+def _measure_similarity(frame: Image, true: Image) -> float:
     """Return SSIM, of panoramas weighted by latitude."""
     found = ssim(frame, true, weights="latitude" if _is_panorama(frame) else "uniform")
     return min(1.0, float(np.asarray(found)))  # rounding of the weights
 
 
-def _distance(lpips: Lpips, frame: Image, true: Image) -> float:
+def _measure_distance(lpips: Lpips, frame: Image, true: Image) -> float:
     """Return LPIPS; it knows no sphere, so of panoramas the mean over front, left, right and back."""
     if not _is_panorama(frame):
         return float(np.asarray(lpips(frame, true)))
@@ -347,11 +346,7 @@ def _compare_arm(
     arm: _Arm, store: FrameScores, card: ScorerCard, name: str, measure: Callable[[Image, Image], float]
 ) -> dict[FrameKey, float]:
     """Return a measure of an arm's frames against the true ones, where these are known."""
-    pairs = {
-        key: f"{digest_frame(frame)}:{digest_frame(arm.true[key])}"
-        for key, frame in arm.frames.items()
-        if key in arm.true
-    }
+    pairs = {key: f"{digest}:{digest_frame(arm.true[key])}" for key, digest in arm.digests.items() if key in arm.true}
     store.add_scorer(card.digest, card.as_dict(), name)
     known = store.read(card.digest, pairs.values())
     for key, pair in pairs.items():
@@ -382,7 +377,7 @@ def _summarise(
 
 def _read_outcomes(arms: Sequence[_Arm]) -> tuple[Metric, dict[str, dict[int, float]]]:
     """Return what counts as success, and its value by arm and episode."""
-    done = {arm.label: split_outcomes([arm.name], _outcomes(arm))[0][arm.name] for arm in arms}
+    done = {arm.label: split_outcomes([arm.name], _list_outcomes(arm))[0][arm.name] for arm in arms}
     for metric in (SUCCESS, ANSWER_SCORE):
         values = {
             label: {index: row["metrics"][metric.name] for index, row in rows.items() if metric.name in row["metrics"]}
@@ -396,7 +391,7 @@ def _read_outcomes(arms: Sequence[_Arm]) -> tuple[Metric, dict[str, dict[int, fl
     )
 
 
-def _outcomes(arm: _Arm) -> list[dict[str, Any]]:
+def _list_outcomes(arm: _Arm) -> list[dict[str, Any]]:
     return [row for row in arm.log.store.outcomes() if row["arm"] == arm.name]
 
 
@@ -408,7 +403,7 @@ def _by_episode(scores: Mapping[FrameKey, float]) -> dict[int, float]:
     return {episode: float(np.mean(own)) for episode, own in values.items()}
 
 
-def _show(arms: Sequence[_Arm], keys: Sequence[FrameKey]) -> dict[str, list[Image]]:
+def _choose_pictures(arms: Sequence[_Arm], keys: Sequence[FrameKey]) -> dict[str, list[Image]]:
     """Return the first frames of the sample, the same of each arm, and the true ones where all are known."""
     shown = list(keys[:SHOWN])
     pictures = {arm.label: [arm.frames[key] for key in shown] for arm in arms}

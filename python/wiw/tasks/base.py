@@ -29,9 +29,9 @@ class Task(ABC):
     """
 
     name: str
-    """As in tables and run folders."""
+    """Name in tables and run folders."""
     seed: int = 0
-    """Of the run, where it is not given another."""
+    """Seed of a run that is given none."""
     space: str = PRIMITIVES
     """Elements of plans: `wiw.types.PRIMITIVES`, `wiw.types.GRIPPER_POSES`, or a space of the task's own."""
     metrics: tuple[str, ...] = ("success",)

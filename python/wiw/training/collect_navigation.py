@@ -48,7 +48,7 @@ Progress = Callable[[str, int, int, int], None]
 """Called with a scene that is finished, the number of passes over scenes that are, of how many, and their frames."""
 
 MAX_FILE_BYTES = 500 * 10**6
-"""Of a Parquet file, as the Hub and its viewer like it; a single segment may have more."""
+"""Largest Parquet file, for the Hub and its viewer; a single segment may be larger."""
 RECORDS, PARTS, DATA = "scenes", "parts", "data"
 """Folders: what is known about each finished pass, segments of unfinished ones, frames."""
 

@@ -28,7 +28,7 @@ CLIP = 14
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a collection would be."""
+    """Size and cost of a planned collection."""
 
     scenes: int
     planned_scenes: int
@@ -39,13 +39,13 @@ class Estimate:
     """Frames that are not after a turn, each with a picture."""
     segments: int
     windows: int
-    """Of `CLIP` frames, one frame apart."""
+    """Windows of `CLIP` frames, one frame apart."""
     coverage: float
     """Mean share of the floor within 1 m of a frame, weighted by area."""
     dropped: int
     gigabytes: float
     core_hours: float
-    """Of processor time on this machine."""
+    """Hours of one core of this machine."""
 
     def __str__(self) -> str:
         planned = "" if self.planned_scenes == self.scenes else f" (estimated from {self.planned_scenes} of them)"
@@ -112,7 +112,7 @@ def _open_navmesh(spec: str, options: NavigationCollection) -> NavMesh:
 
 @dataclass(frozen=True)
 class _Cost:
-    """Of a picture, on average."""
+    """Mean cost of a picture."""
 
     bytes: float = 0.0
     seconds: float = 0.0

@@ -24,7 +24,7 @@ Backend = Literal["auto", "cpu", "gpu"]
 BATCH = 32
 """Pictures rendered in one call: 100 MB at 576 x 1024."""
 HFOV_DEG = 90.0
-"""Of perspective views, as the agent's front view."""
+"""Field of view of perspective views, as of the agent's front view."""
 PANORAMA, FRONT = (576, 1024), (480, 480)
 
 

@@ -151,7 +151,7 @@ def _start(
 
     Waypoints lie at the periphery, some in nooks shorter than a step, out of which no heading leads.
     """
-    starts = waypoints.unvisited
+    starts = waypoints.candidates
     dropped = 0
     for index in starts[np.argsort(core.uniform(key, len(starts)))]:
         follower = Follower(navmesh, waypoints.samples[index], north, rules)

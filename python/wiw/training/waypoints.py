@@ -44,13 +44,13 @@ class Waypoints:
         """float32 [W, 3]: all waypoints, in descending order of leaf score."""
 
     @property
-    def unvisited(self) -> NDArray[np.int64]:
+    def candidates(self) -> NDArray[np.int64]:
         """Indices into `samples` of the candidates for the next waypoint, int64 [U]."""
         return self._remaining[: self._leaf_count]
 
     def find_next(self, position: NDArray[np.float32], current: int) -> int | None:
         """Return the index of the waypoint to go to from a position on the mesh; None where only `current` is left."""
-        candidates = self.unvisited[self.unvisited != current]
+        candidates = self.candidates[self.candidates != current]
         if not len(candidates):
             return None
         metres = self._navmesh.distances_from(position)(self.samples[candidates])

@@ -23,7 +23,7 @@ from wiw.vlm.messages import Call, Completion, Message
 Dialect = Literal["openai", "vllm", "legacy"]
 DIALECTS = ("openai", "vllm", "legacy")
 MOST_BYTES = 4 << 20
-"""Of a reply's body; what goes beyond is not read."""
+"""Most bytes of a reply's body; what goes beyond is not read."""
 MOST_OF_AN_ERROR = 1 << 16
 """Bytes of an error's body that are read."""
 LONGEST_WAIT = 60.0

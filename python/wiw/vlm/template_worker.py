@@ -21,11 +21,11 @@ from jinja2 import StrictUndefined, TemplateSyntaxError, meta
 from jinja2.sandbox import SandboxedEnvironment
 
 SECONDS = 2.0
-"""Of processor time, for one prompt."""
+"""Seconds of processor time for one prompt."""
 MEMORY = 256 << 20
 """Bytes of address space."""
 CHARACTERS = 1 << 20
-"""Of one prompt."""
+"""Most characters of one prompt."""
 ENVIRONMENT = SandboxedEnvironment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
 
 

@@ -27,10 +27,10 @@ from wiw.wire.arrays import pack_array, unpack_array
 
 VERSION = 1
 MOST_BYTES = 256 * 2**20
-"""Of any message, in either direction; a server takes no more than a row of its model needs."""
+"""Most bytes of a message, in either direction; a server takes no more than a row of its model needs."""
 MOST_ITEMS = 32
-"""Of any map or list, and of maps and lists in a message: unpacked they take many times the bytes that they came in,
-and msgpack makes room for as many items as are declared."""
+"""Most items of any map or list, and of maps and lists in a message: unpacked they take many times the bytes that they
+came in, and msgpack makes room for as many items as are declared."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Refusal:
 
     id: bytes
     kind: str
-    """Of the `RemoteError` or `ContractError` that the client raises."""
+    """Kind of the `RemoteError` or `ContractError` that the client raises."""
     text: str
 
 

@@ -30,7 +30,7 @@ class Row:
     depth: NDArray[np.float32] | None
     semantic: NDArray[np.uint32] | None
     history: History | None
-    """Of one row."""
+    """History of one row."""
     control: Control
     seed: int
 

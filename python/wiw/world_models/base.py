@@ -153,13 +153,13 @@ class Requirements:
     packages: tuple[str, ...] = ()
     """Importable names."""
     extra: str = ""
-    """Of wiw, which installs them: `pip install 'wiw[EXTRA]'`."""
+    """Extra of wiw that installs them: `pip install 'wiw[EXTRA]'`."""
     weights: str = ""
     """Name on the Hugging Face hub of what is loaded by default; of a served model, where its weights are published."""
     gpu: bool = False
     """Whether it is of no practical use without one."""
     variables: tuple[str, ...] = ()
-    """Of the environment, such as the key of a service."""
+    """Environment variables, such as the key of a service."""
     options: tuple[str, ...] = ()
     """Without which it cannot be made."""
     served: str = ""
@@ -184,8 +184,8 @@ class WorldModel(ABC):
 
     accepts: Accepts
     version: ClassVar[str] = ""
-    """Of the answers: the author raises it with every change of code that changes one. The rollout cache names what it
-    keeps by it, and keeps nothing of a model without one."""
+    """Version of the answers: the author raises it with every change of code that changes one. The rollout cache
+    names what it keeps by it, and keeps nothing of a model without one."""
     immaterial: ClassVar[tuple[str, ...]] = ()
     """Options in `describe()` that the answers do not depend on, such as where the weights lie."""
     requires: ClassVar[Requirements] = Requirements()

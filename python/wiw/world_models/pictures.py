@@ -16,7 +16,7 @@ from wiw.errors import ContractError
 from wiw.types import Control
 
 COLUMNS = 64
-"""Of a sample, about."""
+"""Columns of a picture's sample, about."""
 FLAT = 2.0
 """Standard deviation, in levels of 255, up to which a picture has no structure to compare."""
 CLOSE = 16.0
@@ -31,7 +31,7 @@ ALTERED: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
     "turned by 180 degrees": lambda picture: picture[::-1, ::-1],
     "inverted": lambda picture: 255 - picture,
 }
-"""What is done to pictures by mistake."""
+"""Common mistakes with pictures, by name."""
 CHANNELS = "red and blue are exchanged (BGR): give RGB, as frames[..., ::-1] of what OpenCV gives"
 SCALE = (
     "no value is above 1: floats from 0 to 1 were cast to uint8 as they are; give "

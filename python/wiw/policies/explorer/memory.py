@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an explorer remembers of an episode: its map, what it believes, and where it has tried to go."""
+"""An explorer's memory of an episode: its map, its beliefs, and the places it has tried to reach."""
 
 from __future__ import annotations
 

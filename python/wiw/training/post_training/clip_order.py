@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which clips each step of a training is made of: a function of the seed and the step, with no state of its own."""
+"""The order of clips in a training: a function of the seed and the step, with no state of its own."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Cosmos-Predict2 is trained on: flow between noise and clip, the first latent frame given."""
+"""The training objective of Cosmos-Predict2: flow between noise and clip, the first latent frame given."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What LTX-Video is trained on: flow between noise and clip, tokens of the first frame given."""
+"""The training objective of LTX-Video: flow between noise and clip, tokens of the first frame given."""
 
 from __future__ import annotations
 

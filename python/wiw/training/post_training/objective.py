@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a denoiser is trained to predict: the base of one class per line of models.
+"""Training objectives of denoisers: the base of one class per line of models.
 
 A denoiser is called as its pipeline calls it, with the pipeline's own embeddings of the empty prompt, which is what
 an action-conditioned world model is given.

@@ -27,7 +27,7 @@ class PostTrainingRecipe:
     """
 
     frames: int
-    """Of a clip."""
+    """Frames of a clip."""
     size: tuple[int, int] = (576, 1024)
     """Height and width in pixels that clips are brought to."""
     rate: float
@@ -52,7 +52,7 @@ class PostTrainingRecipe:
     """Largest norm of the gradient."""
     weight_decay: float = 0.01
     precision: Precision = "bfloat16"
-    """Of the networks' products and of frozen weights; trained weights are float32."""
+    """Precision of matrix products and of frozen weights; trained weights are float32."""
     checkpointing: bool = True
     """Whether activations are computed again in the backward pass, which takes less memory."""
     seed: int = 0

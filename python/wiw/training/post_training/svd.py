@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Stable Video Diffusion is trained on: noise of a log-normal level, in the preconditioning of EDM."""
+"""The training objective of Stable Video Diffusion: noise of a log-normal level, in the preconditioning of EDM."""
 
 from __future__ import annotations
 

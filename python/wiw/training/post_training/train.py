@@ -29,7 +29,7 @@ from wiw.world_models.video.model import VideoModel
 from wiw.world_models.video.weights import is_path
 
 CARD = "training.json"
-"""What a checkpoint was trained on and how, beside its weights."""
+"""Name of the file beside the weights that says on what and how they were trained."""
 
 
 def post_train(

@@ -62,7 +62,7 @@ class PostTrainer(ResumableTrainer):
         self.order = arrange_clips(len(clips), recipe)
         self._ids = np.zeros(len(config.vocabulary), np.int64)
         self._ids[list(config.ids)] = list(config.ids.values())
-        with _seeded(_mix_seed(recipe.seed, "weights"), objective.device):
+        with _seed_torch(_mix_seed(recipe.seed, "weights"), objective.device):
             self.encoders = {place: ActionEncoder(config).to(objective.device) for place in self.places}
             for place in self.places:
                 prepare_denoiser(objective.pipeline, place, recipe)
@@ -97,7 +97,9 @@ class PostTrainer(ResumableTrainer):
         total = 0.0
         for first in range(0, self.recipe.batch, self.recipe.rows):
             rows = batch[first : first + self.recipe.rows]
-            with _seeded(_mix_seed(self.recipe.seed, "step", self.step_count, first), self.objective.device) as random:
+            with _seed_torch(
+                _mix_seed(self.recipe.seed, "step", self.step_count, first), self.objective.device
+            ) as random:
                 losses = self._compute_losses(place, [self._clips[int(row)] for row in rows], random)
                 loss = losses.sum() / self.recipe.batch
                 self._require_finite(losses, rows, "loss")
@@ -278,7 +280,7 @@ def _mix_seed(seed: int, *parts: object) -> int:
 
 
 @contextmanager
-def _seeded(seed: int, device: torch.device) -> Iterator[torch.Generator]:
+def _seed_torch(seed: int, device: torch.device) -> Iterator[torch.Generator]:
     """Yield a generator on the CPU, and seed torch's own ones, which are as before afterwards."""
     devices = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the Wan models are trained on: flow between noise and clip, on a schedule shifted towards noise."""
+"""The training objective of the Wan models: flow between noise and clip, on a schedule shifted towards noise."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 SIZE = (480, 480)
-"""Of the front views that come in and go out."""
+"""Height and width of the front views that come in and go out."""
 ROBOT = {"name": "panda"}
 """What runs record of the arm that it draws."""
 

@@ -22,7 +22,7 @@ from wiw.world_models.runway_gen4.videos import encode_data_uri, fetch_video
 LONGEST_PROMPT = 1000
 """UTF-16 code units that the service takes."""
 SIDE = 960
-"""Of the service's clips, in pixels."""
+"""Pixels of a side of the service's clips."""
 
 
 @dataclass(kw_only=True, eq=False)

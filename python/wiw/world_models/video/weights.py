@@ -26,7 +26,7 @@ __all__ = [
 ]
 
 SAMPLES, SAMPLE_BYTES = 16, 1 << 16
-"""Of each file of weights this much is read to identify it: training changes all of a network."""
+"""Samples of each file of weights that identify it: training changes all of a network."""
 
 
 @dataclass(frozen=True)
@@ -108,4 +108,4 @@ def digest_folder(folder: Path) -> str:
 
 
 SUFFIXES = {".json", ".safetensors", ".bin", ".model", ".txt"}
-"""Of what a pipeline is read from; cards and pictures beside it do not count."""
+"""Suffixes of files that a pipeline is read from; cards and pictures beside it do not count."""

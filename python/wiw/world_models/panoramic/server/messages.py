@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 VERSION = 1
-"""Of the protocol."""
+"""Version of the protocol."""
 VIEW = (576, 1024)
-"""Of wiw's panoramas."""
+"""Height and width of wiw's panoramas."""
 ITEMS = 32
 """Most entries of a map or list, and most maps and lists of a message."""
 ACTIONS = 128

@@ -41,7 +41,7 @@ IN_FLIGHT = 4
 QUEUE = 64
 """Rows of all clients that may wait."""
 KNOWN_BYTES = 256 * 2**20
-"""Of answers that are kept for clients that ask again because they never got them."""
+"""Most bytes of answers that are kept for clients that ask again because they never got them."""
 _log = logging.getLogger("shim.connections")
 _log.addHandler(logging.NullHandler())
 _log.propagate = False  # every stranger who connects would write a line

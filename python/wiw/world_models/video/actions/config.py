@@ -30,7 +30,7 @@ class ActionConfig:
     """Commit of the repository."""
     kind: Literal["discrete", "pose7"] = "discrete"
     width: int
-    """Of the denoiser's time embedding."""
+    """Width of the denoiser's time embedding."""
     stride: int
     """Frames that the autoencoder makes one latent of."""
     vocabulary: tuple[str, ...] = ("null", "forward", "turn_left", "turn_right", "stop")

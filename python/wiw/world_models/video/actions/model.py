@@ -60,7 +60,7 @@ class ActionConditioned(WorldModel):
     front_size: ClassVar[tuple[int, int]] = (480, 480)
     """(height, width) of the views in which poses are seen, unless the user says otherwise."""
     defaults: ClassVar[Mapping[str, Any]] = {"guidance": 1.0}
-    """Of the generator's options where they differ from its own; the length of a clip is that of `accepts`."""
+    """Defaults of the generator's options where they differ from its own; the length of a clip is that of `accepts`."""
     __signature__: ClassVar[inspect.Signature]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
