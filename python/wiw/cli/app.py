@@ -16,7 +16,7 @@ from wiw.cli.check_model import check_model
 from wiw.cli.collect_manipulation import collect_manipulation
 from wiw.cli.collect_navigation import collect_navigation
 from wiw.cli.compare import compare
-from wiw.cli.data import show_data, stats_data, verify_data
+from wiw.cli.data import export_data, import_data, show_data, stats_data, verify_data
 from wiw.cli.demo import demo
 from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
@@ -111,16 +111,19 @@ GROUPS: Mapping[str, Group] = {
         default="manipulation",
     ),
     "data": Group(
-        "Check, summarise or draw a navigation dataset.",
-        """Check, summarise or draw a dataset of `wiw collect navigation`.
+        "Check, summarise or draw a navigation dataset; convert collected data to LeRobot's format and back.",
+        """Check, summarise or draw a dataset of `wiw collect navigation`; export what `wiw collect` has collected to LeRobot.
 
   $ wiw data verify data
   $ wiw data stats data
-  $ wiw data show data --out data.png""",
+  $ wiw data show data --out data.png
+  $ wiw data export data --format lerobot --out data-lerobot""",
         (
             (verify_data, "verify", "Check every file, frame and split."),
             (stats_data, "stats", "Print frames, actions, lengths, coverage and sizes."),
             (show_data, "show", "Draw maps of what is covered, and a contact sheet of clips."),
+            (export_data, "export", "Write navigation or manipulation data as a LeRobot dataset, format v3.0."),
+            (import_data, "import", "Write the collection that a LeRobot dataset was exported from."),
         ),
     ),
 }

@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 if TYPE_CHECKING:
+    from wiw.cli.bars import Bars
     from wiw.datasets.navigation_statistics import NavigationStatistics
 
 Folder = Positional[Annotated[Path, arg(metavar="DIR")]]
@@ -160,3 +162,70 @@ def show_data(
         sheet.save(draft, format="PNG")
     print(f"sheet  {out}")
     return 0
+
+
+def export_data(
+    folder: Folder,
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="DIR")],
+    format: Literal["lerobot"] = "lerobot",  # noqa: A002 - the option's name
+    fps: Annotated[int | None, arg(metavar="N")] = None,
+    workers: Annotated[int, arg(metavar="N")] = 1,
+) -> int:
+    """Write what was collected as a LeRobot dataset, format v3.0.
+
+    $ wiw data export data --out data-lerobot --workers 4
+    $ wiw data export demos --out demos-lerobot --fps 30
+
+    A segment of `wiw collect navigation` or a demonstration of `wiw collect manipulation` becomes an episode. Pictures
+    stay exactly as they are, depth has 16 bits; LeRobot's own tools make videos of them. `docs/lerobot.md` lists the
+    features. The new folder is there once all of it is written.
+
+    Args:
+        folder: Finished collection.
+        out: New folder.
+        format: Format of the new dataset; there is one.
+        fps: Frames a second that timestamps are counted in; 5 for navigation and the mean rate of demonstrations if not
+            given.
+        workers: Threads that encode pictures of navigation.
+    """
+    from wiw.cli.bars import Bars
+    from wiw.datasets.lerobot import export_lerobot
+
+    with Bars() as bars:
+        export_lerobot(folder, out, fps=fps, workers=workers, progress=partial(_show_episodes, bars))
+    print(f"written   {out}, {format} v3.0")
+    return 0
+
+
+def import_data(
+    folder: Folder,
+    /,
+    *,
+    out: Annotated[Path, arg(metavar="DIR")],
+    format: Literal["lerobot"] = "lerobot",  # noqa: A002 - the option's name
+) -> int:
+    """Write the collection that a LeRobot dataset was exported from.
+
+    $ wiw data import data-lerobot --out data
+    $ wiw data verify data
+
+    Only what `wiw data export` has written can be read: others lack poses, cameras and scenes or tables.
+
+    Args:
+        folder: LeRobot dataset, format v3.0.
+        out: New folder.
+        format: Format of the dataset; there is one.
+    """
+    from wiw.cli.bars import Bars
+    from wiw.datasets.lerobot import import_lerobot
+
+    with Bars() as bars:
+        data = import_lerobot(folder, out, progress=partial(_show_episodes, bars))
+    print(f"written   {out}, {len(data)} episodes of {format}")
+    return 0
+
+
+def _show_episodes(bars: Bars, done: int, total: int) -> None:
+    bars.show("episodes", done, total, f"{done}/{total}")

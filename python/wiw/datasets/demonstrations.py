@@ -64,8 +64,9 @@ class Demonstrations(Sequence[Demonstration]):
         self.config = read_manifest(self.folder)
         """Options of the collection."""
         paths = [path for task in self._resolve_tasks(tasks) for path in shard_paths(self.folder, self.config, task)]
-        self._shards = [Shard(path) for path in paths if not partial or path.exists()]
-        self._ends = list(accumulate(len(shard) for shard in self._shards))
+        self.files = [Shard(path) for path in paths if not partial or path.exists()]
+        """Files of demonstrations, in order."""
+        self._ends = list(accumulate(len(shard) for shard in self.files))
 
     def __len__(self) -> int:
         return self._ends[-1] if self._ends else 0
@@ -82,16 +83,16 @@ class Demonstrations(Sequence[Demonstration]):
         if not 0 <= at < len(self):
             raise IndexError(f"expected one of {len(self)} demonstrations, got {index}")
         shard = bisect_right(self._ends, at)
-        return self._shards[shard][at - (self._ends[shard - 1] if shard else 0)]
+        return self.files[shard][at - (self._ends[shard - 1] if shard else 0)]
 
     def __iter__(self) -> Iterator[Demonstration]:
-        return (shard[index] for shard in self._shards for index in range(len(shard)))
+        return (shard[index] for shard in self.files for index in range(len(shard)))
 
     @property
     def failed(self) -> dict[str, int]:
         """Tables that experts failed at, by task; another one was set in the place of each, unless they were kept."""
         counts = dict.fromkeys(self.config["tasks"], 0)
-        for shard in self._shards:
+        for shard in self.files:
             counts[shard.facts["task"]] += shard.facts["failed"]
         return counts
 
@@ -102,9 +103,9 @@ class Demonstrations(Sequence[Demonstration]):
         Raises:
             FileError: nothing has been collected yet.
         """
-        if not self._shards:
+        if not self.files:
             raise FileError(f"{self.folder}: nothing has been collected yet")
-        facts = self._shards[0].facts["camera"]
+        facts = self.files[0].facts["camera"]
         return FrontCamera(np.array(facts["intrinsics"]), np.array(facts["T_world_camera"]))
 
     def _resolve_tasks(self, tasks: str | Sequence[str]) -> list[str]:

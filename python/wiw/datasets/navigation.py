@@ -14,16 +14,19 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import blake2b
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from wiw.datasets.navigation_card import build_card
 from wiw.datasets.navigation_files import FORMAT, SEGMENTS, FrameFile, read_segment_list
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
 from wiw.errors import ArgumentError, FileError
+from wiw.files import atomic_file
 
 META = "meta.json"
 Part = Literal["all", "train", "held-out"]
@@ -164,6 +167,29 @@ def read_meta(folder: Path) -> dict[str, Any]:
     if found.get("format") != FORMAT:
         raise FileError(f"{path}: expected a navigation dataset of format {FORMAT}, got {found.get('format')}")
     return found
+
+
+def count_totals(
+    rows: Sequence[Mapping[str, Any]], files: Mapping[str, Any], passes: Sequence[Mapping[str, Any]]
+) -> dict[str, int]:
+    """Return the totals of `meta.json` from rows of `segments.parquet`, its files, and its passes over scenes."""
+    totals = Counter({"segments": len(rows), "bytes": sum(file["bytes"] for file in files.values())})
+    for row in rows:
+        totals.update({name: row[name] for name in ("frames", "pictures", "forward", "turn_left", "turn_right")})
+    totals["dropped"] = sum(each["dropped"] for record in passes for each in record["traversals"])
+    return {"scenes": len({record["scene"] for record in passes}), **totals}
+
+
+def write_meta(folder: Path, meta: Mapping[str, Any]) -> None:
+    """Write the card and, last of all, `meta.json`, with which a dataset is finished.
+
+    Raises:
+        FileError: they cannot be written.
+    """
+    with atomic_file(folder / "README.md") as draft:
+        draft.write_text(build_card(meta))
+    with atomic_file(folder / META) as draft:
+        draft.write_text(json.dumps(meta) + "\n")
 
 
 def read_navigation_manifest(folder: Path) -> dict[str, Any]:

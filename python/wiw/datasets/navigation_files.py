@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from wiw.datasets.navigation_segment import NavigationSegment
-from wiw.datasets.parquet_files import RowGroupFile, build_schema, image_type, image_values, write_row_groups
+from wiw.datasets.parquet_files import (
+    RowGroupFile,
+    build_schema,
+    hash_file,
+    image_type,
+    image_values,
+    write_row_groups,
+)
 
 FORMAT = 1
 COLUMNS: Mapping[str, str] = {
@@ -171,6 +178,11 @@ def _build_segment(table: Any) -> NavigationSegment:
         encoded_images=pictures("rgb") or (None,) * count,
         encoded_depths=pictures("depth"),
     )
+
+
+def describe_file(path: Path, frames: int) -> dict[str, Any]:
+    """Return what `meta.json` says about a file with so many frames."""
+    return {"frames": frames, "bytes": path.stat().st_size, "sha256": hash_file(path)}
 
 
 def write_segment_list(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -163,7 +163,11 @@ def encode_color(image: NDArray[np.uint8], lossless: bool) -> bytes:
 
 def encode_millimetres(depth: NDArray[np.float32]) -> bytes:
     """Encode metres float32 [H, W] as a 16-bit PNG in millimetres; 65.535 m stands for all that is further away."""
-    units = np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16)
+    return encode_units(np.clip(np.rint(depth * DEPTH_UNITS), 0, np.iinfo(np.uint16).max).astype(np.uint16))
+
+
+def encode_units(units: NDArray[np.uint16]) -> bytes:
+    """Encode millimetres uint16 [H, W] as a 16-bit PNG."""
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1]
     if (choice := getattr(cv2, "IMWRITE_PNG_FILTER", None)) is not None:  # older OpenCV: larger files, the same pixels
         options += [choice, PNG_FILTER_UP]

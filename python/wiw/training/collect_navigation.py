@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -20,19 +19,19 @@ from typing import Any
 import numpy as np
 
 import wiw
-from wiw.datasets.navigation import META, NavigationData, read_navigation_manifest
-from wiw.datasets.navigation_card import build_card
+from wiw.datasets.navigation import META, NavigationData, count_totals, read_navigation_manifest, write_meta
 from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
     FrameFile,
     build_table,
+    describe_file,
     navigation_schema,
     write_frames,
     write_segment_list,
 )
 from wiw.datasets.navigation_segment import describe_segment
-from wiw.datasets.parquet_files import hash_file, require_pyarrow
+from wiw.datasets.parquet_files import require_pyarrow
 from wiw.datasets.scene_splits import find_evaluation_split, name_scene
 from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError, BackendError, Error, FileError, InfrastructureError
@@ -248,7 +247,7 @@ class SceneJob:
 
             write_frames(self.folder / name, schema, tables())
             segments += found
-            files[name] = _describe_file(self.folder / name, sum(row["frames"] for row in found))
+            files[name] = describe_file(self.folder / name, sum(row["frames"] for row in found))
         return files, segments
 
     def _group_parts(self, count: int) -> list[list[int]]:
@@ -263,10 +262,6 @@ class SceneJob:
             groups[-1].append(number)
             room -= size
         return groups
-
-
-def _describe_file(path: Path, frames: int) -> dict[str, Any]:
-    return {"frames": frames, "bytes": path.stat().st_size, "sha256": hash_file(path)}
 
 
 def _describe_traversal(place: World, traversal: Traversal) -> dict[str, Any]:
@@ -338,24 +333,17 @@ def _finish(
     rows = [row for record in records for row in record["segments"]]
     write_segment_list(folder / SEGMENTS, rows)
     files = {name: file for record in records for name, file in record["files"].items()}
-    files[SEGMENTS] = _describe_file(folder / SEGMENTS, 0)
-    totals = Counter({"segments": len(rows), "bytes": sum(file["bytes"] for file in files.values())})
-    for row in rows:
-        totals.update({name: row[name] for name in ("frames", "pictures", "forward", "turn_left", "turn_right")})
-    totals["dropped"] = sum(each["dropped"] for record in records for each in record["traversals"])
+    files[SEGMENTS] = describe_file(folder / SEGMENTS, 0)
     meta = {
         "format": FORMAT,
         **describe_data(options),
         "config": config,
-        "totals": {"scenes": len({record["scene"] for record in records}), **totals},
+        "totals": count_totals(rows, files, records),
         "left_out": dict(sorted(errors.items())),
         "files": files,
         "passes": [
             {"scene": record["scene"], "pass": record["pass"], "traversals": record["traversals"]} for record in records
         ],
     }
-    with atomic_file(folder / "README.md") as draft:
-        draft.write_text(build_card(meta))
-    with atomic_file(folder / META) as draft:
-        draft.write_text(json.dumps(meta) + "\n")
+    write_meta(folder, meta)
     shutil.rmtree(folder / PARTS, ignore_errors=True)

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Demonstrations of manipulation tasks as LeRobot datasets: an episode is a demonstration.
+
+LeRobot pairs a frame with the pose that is commanded from it on, wiw with the one that was commanded before it: actions move by a
+frame, and the last is repeated.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets import shards
+from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration
+from wiw.datasets.demonstrations import Demonstrations
+from wiw.datasets.lerobot.layout import Episode, Feature, color_feature, depth_feature
+from wiw.datasets.lerobot.reading import LeRobotFolder
+from wiw.datasets.parquet_files import MANIFEST
+
+FRONT, DEPTH = "observation.images.front", "observation.images.front_depth"
+POSE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "gripper_open")
+FACTS = ("kind", "variation", "seed", "episode", "success", "places", "file")
+"""Of an episode, beside its frames; kind is the task that wiw knows it by."""
+
+
+def describe_features(size: int, depth: bool) -> dict[str, Feature]:
+    """Return the features of demonstrations with front views of so many pixels square."""
+    features = {
+        "observation.state": Feature("where the gripper is, z up, R = Rz Ry Rx", "float64", (7,), POSE),
+        "action": Feature("pose that is commanded after this frame, likewise", "float64", (7,), POSE),
+        "seconds": Feature("time of the physics since frame 0", "float64"),
+        "key": Feature("number of the action that led here, from 1; 0 in frame 0", "int32"),
+        "ended": Feature("whether that action ends in this frame, which makes it a key frame", "bool"),
+        FRONT: color_feature("the front view", (size, size)),
+    }
+    if depth:  # LeRobot knows millimetres and metres alone, and leaves other units as they are
+        about = f"the front view's planar depth, {DEPTH_UNITS} a metre, 0 where nothing is hit"
+        features[DEPTH] = depth_feature(about, (size, size), units_per_metre=DEPTH_UNITS)
+    return features
+
+
+def estimate_rate(data: Demonstrations) -> int:
+    """Return the mean number of frames a second, rounded; frames are spread evenly over the time of each demonstration."""
+    times = [shard.read(index, ["seconds"]).column(0) for shard in data.files for index in range(len(shard))]
+    seconds = sum(each[-1].as_py() for each in times)
+    return max(1, round(sum(len(each) - 1 for each in times) / seconds)) if seconds else 1
+
+
+def build_episodes(data: Demonstrations) -> Iterator[Episode]:
+    """Yield the demonstrations as episodes.
+
+    Raises:
+        FileError: a file is damaged.
+    """
+    for shard in data.files:
+        for index in range(len(shard)):
+            yield _build_episode(shard[index], shard.path.name)
+
+
+def _build_episode(each: Demonstration, file: str) -> Episode:
+    columns = {
+        "observation.state": each.poses,
+        "action": np.concatenate([each.actions[1:], each.actions[-1:]]),
+        "seconds": each.seconds,
+        "key": each.keys,
+        "ended": each.ended,
+        FRONT: each.encoded_images,
+    }
+    if each.encoded_depths is not None:
+        columns[DEPTH] = each.encoded_depths
+    places = json.dumps({name: pose.tolist() for name, pose in each.places.items()})
+    values = each.task, each.variation, each.seed, each.episode, each.success, places, file
+    return Episode(each.instruction, columns, dict(zip(FACTS, values, strict=True)))
+
+
+def describe_source(data: Demonstrations) -> dict[str, Any]:
+    """Return what importing needs beyond the episodes."""
+    files = {shard.path.name: _strip_facts(shard.facts) for shard in data.files}
+    return {"what": "manipulation", "manifest": data.config, "files": files}
+
+
+def _strip_facts(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Leave out what writing a file adds."""
+    return {name: value for name, value in facts.items() if name not in ("format", "columns")}
+
+
+def write_demonstrations(found: LeRobotFolder, out: Path, progress: Any) -> None:
+    """Write the demonstrations that were exported into an empty folder.
+
+    Raises:
+        FileError: a file or a column is missing or damaged, or the folder cannot be written.
+    """
+    manifest, facts = found.source["manifest"], found.source["files"]
+    episodes = found.read_episodes(describe_features(manifest["size"], manifest["depth"]), FACTS)
+    done = 0
+    for name, of_file in groupby(episodes, lambda episode: str(episode.facts["file"])):
+        demonstrations = [build_demonstration(episode) for episode in of_file]
+        shards.write(out / name, demonstrations, facts[name])
+        done += len(demonstrations)
+        progress(done, len(found))
+    (out / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
+
+
+def build_demonstration(episode: Episode) -> Demonstration:
+    """Return the demonstration that an episode was built of."""
+    columns, facts = episode.columns, episode.facts
+    action: NDArray[np.float64] = columns["action"]
+    return Demonstration(
+        task=facts["kind"],
+        variation=facts["variation"],
+        seed=facts["seed"],
+        episode=facts["episode"],
+        instruction=episode.instruction,
+        success=facts["success"],
+        places={name: np.array(pose) for name, pose in json.loads(facts["places"]).items()},
+        seconds=columns["seconds"],
+        poses=columns["observation.state"],
+        actions=np.concatenate([action[:1], action[:-1]]),
+        keys=columns["key"],
+        ended=columns["ended"],
+        encoded_images=tuple(columns[FRONT]),
+        encoded_depths=tuple(columns[DEPTH]) if DEPTH in columns else None,
+    )
