@@ -22,9 +22,13 @@ def read(folder, out):
     items = [plain[index] for index in range(len(plain))]
     found = {f"item/{key}": np.stack([np.asarray(item[key]) for item in items]) for key in items[0]}
     steps = [0, 1, 2]
-    windows = LeRobotDataset("wiw/exported", root=folder, delta_timestamps={"action": [each / meta.fps for each in steps]})
+    windows = LeRobotDataset(
+        "wiw/exported", root=folder, delta_timestamps={"action": [each / meta.fps for each in steps]}
+    )
     ahead = [windows[index] for index in range(len(windows))]
-    found |= {f"ahead/{key}": np.stack([np.asarray(each[key]) for each in ahead]) for key in ("action", "action_is_pad")}
+    found |= {
+        f"ahead/{key}": np.stack([np.asarray(each[key]) for each in ahead]) for key in ("action", "action_is_pad")
+    }
     second = LeRobotDataset("wiw/exported", root=folder, episodes=[1])
     found["second/index"] = np.array([int(second[index]["index"]) for index in range(len(second))])
     computed = [compute_episode(meta, folder, index) for index in range(meta.total_episodes)]

@@ -112,7 +112,7 @@ GROUPS: Mapping[str, Group] = {
     ),
     "data": Group(
         "Check, summarise or draw a navigation dataset; convert collected data to LeRobot's format and back.",
-        """Check, summarise or draw a dataset of `wiw collect navigation`; export what `wiw collect` has collected to LeRobot.
+        """Check, summarise or draw a dataset of `wiw collect navigation`; convert what `wiw collect` has collected.
 
   $ wiw data verify data
   $ wiw data stats data

@@ -169,7 +169,7 @@ def export_data(
     /,
     *,
     out: Annotated[Path, arg(metavar="DIR")],
-    format: Literal["lerobot"] = "lerobot",  # noqa: A002 - the option's name
+    format: Literal["lerobot"] = "lerobot",
     fps: Annotated[int | None, arg(metavar="N")] = None,
     workers: Annotated[int, arg(metavar="N")] = 1,
 ) -> int:
@@ -204,7 +204,7 @@ def import_data(
     /,
     *,
     out: Annotated[Path, arg(metavar="DIR")],
-    format: Literal["lerobot"] = "lerobot",  # noqa: A002 - the option's name
+    format: Literal["lerobot"] = "lerobot",
 ) -> int:
     """Write the collection that a LeRobot dataset was exported from.
 

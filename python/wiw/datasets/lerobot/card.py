@@ -32,8 +32,9 @@ configs:
 ---
 # LeRobot dataset: {what}
 
-{episodes} episodes at {fps} frames a second, LeRobot format v3.0, exported by `wiw data export` (wiw {wiw.__version__}) from what
-`wiw collect {what}` has collected. `wiw data import` makes that again. `action` is what is done after a frame is seen.
+{episodes} episodes at {fps} frames a second, LeRobot format v3.0, exported by `wiw data export` (wiw {wiw.__version__})
+from what `wiw collect {what}` has collected; `wiw data import` makes that again. An `action` follows the frame that it
+is stored with.
 
 | feature | type | |
 |---|---|---|

@@ -24,15 +24,15 @@ Progress = Callable[[int, int], None]
 def export_lerobot(
     folder: str | Path, out: str | Path, *, fps: int | None = None, workers: int = 1, progress: Progress | None = None
 ) -> None:
-    """Write a LeRobot dataset, format v3.0, of what `wiw collect navigation` or `wiw collect manipulation` has collected.
+    """Write what `wiw collect navigation` or `wiw collect manipulation` has collected as a LeRobot dataset, v3.0.
 
-    Pictures stay exactly what they are: stored ones are copied, those after turns of panoramas are encoded without
-    loss, depth in 16 bits.
+    Pictures stay exactly what they are: those of frames after turns of panoramas are encoded without loss, as is depth.
 
     Args:
         folder: a finished collection.
         out: a new or empty folder, which has the dataset whole or not at all.
-        fps: frames a second, which timestamps are counted in; 5 for navigation and the mean rate of demonstrations if None.
+        fps: frames a second, which timestamps are counted in; 5 for navigation and the mean rate of demonstrations if
+            None.
         workers: threads that encode pictures of navigation.
         progress: called after each episode.
 
@@ -92,7 +92,7 @@ def import_lerobot(
     """Write the collection that a LeRobot dataset was exported from.
 
     Args:
-        folder: what `export_lerobot` has written; other episodes may be gone, columns added.
+        folder: what `export_lerobot` has written.
         out: a new or empty folder, which has the collection whole or not at all.
         progress: called after each episode.
 

@@ -77,7 +77,7 @@ def color_feature(about: str, size: Sequence[int]) -> Feature:
 
 
 def depth_feature(about: str, size: Sequence[int], **info: Any) -> Feature:
-    """Return the feature of 16-bit depth pictures of (height, width), with what `info` says about them."""
+    """Return the feature of depth pictures of (height, width), with what `info` says about them, such as the unit."""
     info = {"is_depth_map": True, **info}
     return Feature(about, "image", (size[0], size[1], 1), ("height", "width", "channels"), info)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Demonstrations of manipulation tasks as LeRobot datasets: an episode is a demonstration.
 
-LeRobot pairs a frame with the pose that is commanded from it on, wiw with the one that was commanded before it: actions move by a
-frame, and the last is repeated.
+LeRobot pairs a frame with the pose that is commanded from it on, wiw with the one that was commanded before it: actions
+move by a frame, and the last is repeated.
 """
 
 from __future__ import annotations
@@ -13,17 +13,20 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wiw.datasets import shards
-from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration
-from wiw.datasets.demonstrations import Demonstrations
+from wiw.datasets.demonstration import Demonstration
+from wiw.datasets.demonstrations import Demonstrations, encode_depth
 from wiw.datasets.lerobot.layout import Episode, Feature, color_feature, depth_feature
-from wiw.datasets.lerobot.reading import LeRobotFolder
+from wiw.datasets.lerobot.reading import LeRobotFolder, check_file_name
 from wiw.datasets.parquet_files import MANIFEST
+from wiw.errors import FileError
 
 FRONT, DEPTH = "observation.images.front", "observation.images.front_depth"
+TIFF_DEFLATE = 8
 POSE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "gripper_open")
 FACTS = ("kind", "variation", "seed", "episode", "success", "places", "file")
 """Of an episode, beside its frames; kind is the task that wiw knows it by."""
@@ -39,14 +42,14 @@ def describe_features(size: int, depth: bool) -> dict[str, Feature]:
         "ended": Feature("whether that action ends in this frame, which makes it a key frame", "bool"),
         FRONT: color_feature("the front view", (size, size)),
     }
-    if depth:  # LeRobot knows millimetres and metres alone, and leaves other units as they are
-        about = f"the front view's planar depth, {DEPTH_UNITS} a metre, 0 where nothing is hit"
-        features[DEPTH] = depth_feature(about, (size, size), units_per_metre=DEPTH_UNITS)
+    if depth:
+        about = "the front view's planar depth, in metres, 0 where nothing is hit"
+        features[DEPTH] = depth_feature(about, (size, size), depth_unit="m", measure="planar")
     return features
 
 
 def estimate_rate(data: Demonstrations) -> int:
-    """Return the mean number of frames a second, rounded; frames are spread evenly over the time of each demonstration."""
+    """Return the mean number of frames a second, rounded."""
     times = [shard.read(index, ["seconds"]).column(0) for shard in data.files for index in range(len(shard))]
     seconds = sum(each[-1].as_py() for each in times)
     return max(1, round(sum(len(each) - 1 for each in times) / seconds)) if seconds else 1
@@ -72,8 +75,8 @@ def _build_episode(each: Demonstration, file: str) -> Episode:
         "ended": each.ended,
         FRONT: each.encoded_images,
     }
-    if each.encoded_depths is not None:
-        columns[DEPTH] = each.encoded_depths
+    if each.depths is not None:
+        columns[DEPTH] = [_encode_metres(depth) for depth in each.depths]
     places = json.dumps({name: pose.tolist() for name, pose in each.places.items()})
     values = each.task, each.variation, each.seed, each.episode, each.success, places, file
     return Episode(each.instruction, columns, dict(zip(FACTS, values, strict=True)))
@@ -96,12 +99,12 @@ def write_demonstrations(found: LeRobotFolder, out: Path, progress: Any) -> None
     Raises:
         FileError: a file or a column is missing or damaged, or the folder cannot be written.
     """
-    manifest, facts = found.source["manifest"], found.source["files"]
+    manifest = found.get_source("manifest", ("tasks", "episodes", "size", "depth"))
     episodes = found.read_episodes(describe_features(manifest["size"], manifest["depth"]), FACTS)
     done = 0
-    for name, of_file in groupby(episodes, lambda episode: str(episode.facts["file"])):
+    for name, of_file in groupby(episodes, lambda episode: check_file_name(episode.facts["file"])):
         demonstrations = [build_demonstration(episode) for episode in of_file]
-        shards.write(out / name, demonstrations, facts[name])
+        shards.write(out / name, demonstrations, found.get_source("files", [name])[name])
         done += len(demonstrations)
         progress(done, len(found))
     (out / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n")
@@ -125,5 +128,20 @@ def build_demonstration(episode: Episode) -> Demonstration:
         keys=columns["key"],
         ended=columns["ended"],
         encoded_images=tuple(columns[FRONT]),
-        encoded_depths=tuple(columns[DEPTH]) if DEPTH in columns else None,
+        encoded_depths=tuple(encode_depth(_decode_metres(each)) for each in columns[DEPTH])
+        if DEPTH in columns
+        else None,
     )
+
+
+def _encode_metres(depth: NDArray[np.float32]) -> bytes:
+    """Encode metres float32 [H, W] as TIFF: LeRobot's other unit is the millimetre, which is not fine enough."""
+    options = [cv2.IMWRITE_TIFF_COMPRESSION, TIFF_DEFLATE]
+    return bytes(cv2.imencode(".tiff", depth, options)[1])
+
+
+def _decode_metres(encoded: bytes) -> NDArray[np.float32]:
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 2 or image.dtype != np.float32:
+        raise FileError("expected depth as TIFF of one float32 a pixel, got something else; copy the dataset again")
+    return image

@@ -2,8 +2,8 @@
 """Navigation datasets as LeRobot datasets: an episode is a segment.
 
 LeRobot pairs a frame with the action that is taken in it, wiw with the one that led to it: actions move by a frame. The
-last frame of an episode has none, which is a motion of zero. Frames after turns, whose picture wiw stores as a roll of another one,
-get pictures of their own, which are the rolled ones exactly.
+last frame of an episode has none, which is a motion of zero. Frames after turns, which wiw stores as a roll of another
+picture, get pictures of their own, equal to the rolled ones.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from wiw.action import NULL, to_trajectory
 from wiw.datasets.lerobot.layout import Episode, Feature, color_feature, depth_feature
-from wiw.datasets.lerobot.reading import LeRobotFolder
+from wiw.datasets.lerobot.reading import LeRobotFolder, check_file_name
 from wiw.datasets.navigation import NavigationData, count_totals, write_meta
 from wiw.datasets.navigation_files import (
     SEGMENTS,
@@ -140,7 +140,7 @@ def write_navigation(found: LeRobotFolder, out: Path, progress: Any) -> None:
     Raises:
         FileError: a file or a column is missing or damaged, or the folder cannot be written.
     """
-    meta = found.source["meta"]
+    meta = found.get_source("meta", ("format", "passes", *FRAME_FACTS))
     schema = navigation_schema(meta["depth"] is not None, {name: meta[name] for name in FRAME_FACTS})
     episodes = found.read_episodes(describe_features(meta), FACTS)
     rows: list[dict[str, Any]] = []
@@ -154,7 +154,7 @@ def write_navigation(found: LeRobotFolder, out: Path, progress: Any) -> None:
             progress(len(rows), len(found))
             yield build_table(segment, schema)
 
-    for name, of_file in groupby(episodes, lambda episode: str(episode.facts["file"])):
+    for name, of_file in groupby(episodes, lambda episode: check_file_name(episode.facts["file"])):
         before = len(rows)
         write_frames(out / name, schema, build_tables(name, of_file))
         files[name] = describe_file(out / name, sum(row["frames"] for row in rows[before:]))

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import accumulate
-from pathlib import Path
+from itertools import accumulate, groupby
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -52,7 +52,19 @@ class LeRobotFolder:
     def __len__(self) -> int:
         return len(self._episodes)
 
-    def read_features(self, expected: Mapping[str, Feature]) -> None:
+    def get_source(self, part: str, names: Sequence[str]) -> dict[str, Any]:
+        """Return a part of `meta/wiw.json`, which must have some keys.
+
+        Raises:
+            FileError: it has not.
+        """
+        found = self.source.get(part)
+        if not isinstance(found, dict) or (missing := [name for name in names if name not in found]):
+            lack = f"no {', '.join(missing)}" if isinstance(found, dict) else "none"
+            raise FileError(f"{self.folder / SOURCE}: expected {part} with {', '.join(names)}, got {lack}")
+        return found
+
+    def check_features(self, expected: Mapping[str, Feature]) -> None:
         """Check that the dataset has some features, with their types and shapes.
 
         Raises:
@@ -83,21 +95,21 @@ class LeRobotFolder:
         Raises:
             FileError: a file or a column of it is missing or damaged, or timestamps do not fit the rate.
         """
-        self.read_features({**features, **INDICES})
+        self.check_features({**features, **INDICES})
         if missing := [name for name in facts if name not in self._episodes[0]]:
             raise FileError(
                 f"{self.folder / 'meta/episodes'}: expected columns {', '.join(facts)}, got no {', '.join(missing)}"
             )
-        files: dict[str, _DataFile] = {}
-        for row in self._episodes:
-            name = self._locate(row)
-            if name not in files:
-                files = {name: _DataFile(self.folder / name)}
-            start = row["dataset_from_index"] - self._starts[name]
-            table = files[name].read(start, row["length"], [*features, *INDICES])
-            self._check_frames(row, table, files[name].path)
-            columns = {key: _read_column(table.column(key), feature) for key, feature in features.items()}
-            yield Episode(row["tasks"][0], columns, {key: row[key] for key in facts})
+        for name, rows in groupby(self._episodes, self._locate):
+            file = _DataFile(self.folder / name)
+            for row in rows:
+                start = row["dataset_from_index"] - self._starts[name]
+                table = file.read(start, row["length"], [*features, *INDICES])
+                self._check_frames(row, table, file.path)
+                columns = {key: _read_column(table.column(key), feature) for key, feature in features.items()}
+                if empty := [key for key, each in features.items() if each.is_image and None in columns[key]]:
+                    raise FileError(f"{file.path}: expected the pictures of {', '.join(empty)} in it, got some missing")
+                yield Episode(row["tasks"][0], columns, {key: row[key] for key in facts})
 
     def _locate(self, row: Mapping[str, Any]) -> str:
         """Return the name of the file that has an episode."""
@@ -126,8 +138,8 @@ class LeRobotFolder:
                 raise FileError(f"{path}: expected a list of episodes, got a damaged file ({error})") from error
         if len(rows) != self.info.get("total_episodes") or not rows:
             raise FileError(
-                f"{folder}: expected {self.info.get('total_episodes')} episodes as {INFO} says, got {len(rows)}; a file "
-                "is missing, or the dataset is empty"
+                f"{folder}: expected {self.info.get('total_episodes')} episodes as {INFO} says, got {len(rows)}: a "
+                "file is missing, or the dataset is empty"
             )
         if missing := [name for name in EPISODE_COLUMNS if name not in rows[0]]:
             raise FileError(f"{folder}: expected columns {', '.join(EPISODE_COLUMNS)}, got no {', '.join(missing)}")
@@ -148,8 +160,8 @@ class LeRobotFolder:
         if not isinstance(fps, int | float) or fps <= 0 or (np.abs(times - expected / fps) > TIME_TOLERANCE).any():
             rate = f"{(len(times) - 1) / times[-1]:g}" if times[-1] > 0 else "no"
             raise FileError(
-                f"{path}, episode {row['episode_index']}: expected {fps} frames a second as {INFO} says, got timestamps "
-                f"of {rate}"
+                f"{path}, episode {row['episode_index']}: expected {fps} frames a second as {INFO} says, got "
+                f"timestamps of {rate}"
             )
 
 
@@ -195,10 +207,22 @@ class _DataFile:
 def _read_column(column: Any, feature: Feature) -> Any:
     """Return an array [T] or [T, n], or T encoded pictures."""
     if feature.is_image:
-        return [each["bytes"] for each in column.to_pylist()]
+        return [each and each["bytes"] for each in column.to_pylist()]
     if feature.shape == (1,):
         return column.to_numpy()
     return column.combine_chunks().flatten().to_numpy(zero_copy_only=False).reshape(-1, *feature.shape)
+
+
+def check_file_name(name: str) -> str:
+    """Return the name of a file within the folder that is written, which a dataset gives.
+
+    Raises:
+        FileError: it leads elsewhere.
+    """
+    parts = PurePosixPath(name).parts
+    if not name.endswith(".parquet") or ".." in parts or parts[0] == "/":
+        raise FileError(f"meta/episodes: expected file as the name of a Parquet file in the new folder, got {name}")
+    return name
 
 
 def _read_json(path: Path, expected: str) -> dict[str, Any]:

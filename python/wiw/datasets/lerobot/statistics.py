@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Statistics of features as LeRobot computes them: min, max, mean, std, count and five quantiles.
 
-LeRobot looks at some frames of long episodes and some pixels of large pictures; so does this. Its quantiles are read off
-histograms of 5000 bins, these are exact. For a whole dataset LeRobot has no quantiles but an average or a bound of its
-episodes' (versions differ); these are those of all values together.
+LeRobot looks at some frames of long episodes and some pixels of large pictures; so does this. It reads quantiles off
+histograms of 5000 bins, here they are exact. For a whole dataset it has averages or bounds of the episodes' quantiles
+(versions differ), here they are those of all values together.
 """
 
 from __future__ import annotations
@@ -116,17 +116,18 @@ def _tally_pictures(feature: Feature, pictures: Sequence[bytes]) -> FeatureTally
 
 def _decode_thinned(encoded: bytes, feature: Feature) -> NDArray[Any]:
     """Return some pixels of a picture, [C, N]."""
-    image = cv2.imdecode(
-        np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED if feature.is_depth else cv2.IMREAD_COLOR
-    )
-    height, width, depth = feature.shape
-    if image is None or image.shape[:2] != (height, width) or (image.dtype == np.uint16) != feature.is_depth:
+    how = cv2.IMREAD_UNCHANGED if feature.is_depth else cv2.IMREAD_COLOR
+    image = cv2.imdecode(np.frombuffer(encoded, np.uint8), how)
+    height, width, channels = feature.shape
+    if image is None or image.shape[:2] != (height, width) or (image.dtype == np.uint8) == feature.is_depth:
+        kind = "depth" if feature.is_depth else "colour"
+        got = "something else" if image is None else f"{image.dtype} {list(image.shape)}"
         raise FileError(
-            f"expected {'16-bit depth' if feature.is_depth else 'colour'} pictures of {height} x {width}, got "
-            f"{'something else' if image is None else f'one of {image.shape}, {image.dtype}'}; `wiw data verify` finds it"
+            f"expected pictures of {kind} of {height} x {width}, got {got}; `wiw data verify` finds them in navigation "
+            "datasets"
         )
     step = max(1, max(height, width) // THINNED_PIXELS) if max(height, width) >= LARGE_PIXELS else 1
-    return image[::step, ::step].reshape(-1, depth).T[::-1]  # OpenCV decodes to BGR
+    return image[::step, ::step].reshape(-1, channels).T[::-1]  # OpenCV decodes to BGR
 
 
 def sample_frames(count: int) -> list[int]:
