@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folders import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -40,17 +42,6 @@ def collected(tmp_path_factory: pytest.TempPathFactory, two_rooms: str) -> Path:
     folder = tmp_path_factory.mktemp("navigation")
     collect_navigation(folder, two_rooms, passes=2, lossless=True, **SMALL)
     return folder
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def copy(source: Path, target: Path) -> Path:
-    for name, data in contents(source).items():
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        (target / name).write_bytes(data)
-    return target
 
 
 # -- what is written ---------------------------------------------------------------------------------------------------
@@ -238,7 +229,7 @@ def test_clips_are_all_windows_of_their_length(collected: Path) -> None:
 
 def test_a_clip_reads_nothing_but_its_row_group(collected: Path, tmp_path: Path) -> None:
     """All other row groups are overwritten: checksums would tell if a byte of them was read."""
-    copy(collected, tmp_path)
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
     data = NavigationData(tmp_path)
     path = tmp_path / data.segments[2]["file"]
     metadata = parquet.read_metadata(path)
@@ -342,7 +333,7 @@ def test_half_a_segment_is_recorded_again(collected: Path, tmp_path: Path, two_r
 def test_a_finished_dataset_is_left_alone_and_a_lost_file_is_made_anew(
     collected: Path, tmp_path: Path, two_rooms: str
 ) -> None:
-    copy(collected, tmp_path)
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
     times = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
     collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **SMALL)
     assert all(path.stat().st_mtime_ns == time for path, time in times.items())
@@ -427,7 +418,7 @@ def test_what_cannot_be_collected_is_refused(tmp_path: Path, two_rooms: str, ask
 
 
 def test_another_collection_is_not_mixed_in(collected: Path, tmp_path: Path, two_rooms: str) -> None:
-    copy(collected, tmp_path)
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
     with pytest.raises(ArgumentError, match=r"holds another collection: .*seed 3 there and 4 asked"):
         collect_navigation(tmp_path, two_rooms, passes=2, lossless=True, **{**SMALL, "seed": 4})
     (tmp_path / "manifest.json").write_text('{"tasks": [], "episodes": 3}')
@@ -476,7 +467,7 @@ def test_a_full_disk_is_told_and_loses_nothing(
 
 
 def test_a_damaged_dataset_is_told(collected: Path, tmp_path: Path) -> None:
-    copy(collected, tmp_path)
+    shutil.copytree(collected, tmp_path, dirs_exist_ok=True)
     (tmp_path / "segments.parquet").write_bytes(b"PAR1")
     with pytest.raises(FileError, match=r"segments\.parquet.*damaged"):
         NavigationData(tmp_path)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folders import contents
 
 import wiw
 from wiw import action
@@ -78,10 +79,6 @@ def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTr
     config = build_config(model.base, model.denoisers[0], generator)
     clips = NavigationData(data).clips(recipe.frames)
     return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 # -- every recipe ------------------------------------------------------------------------------------------------------

@@ -144,4 +144,4 @@ def _decode_metres(encoded: bytes) -> NDArray[np.float32]:
     image = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 2 or image.dtype != np.float32:
         raise FileError("expected depth as TIFF of one float32 a pixel, got something else; copy the dataset again")
-    return image
+    return np.asarray(image, np.float32)

@@ -36,12 +36,12 @@ class Distribution:
     """int64 [K]."""
 
     @classmethod
-    def of(cls, values: NDArray[Any]) -> Distribution:
+    def from_values(cls, values: NDArray[Any]) -> Distribution:
         """Count the values of an array of any shape; bytes and 16-bit numbers fast."""
         if values.dtype in (np.uint8, np.uint16):
-            counts = np.bincount(values.ravel())
-            (found,) = np.nonzero(counts)
-            return cls(found.astype(np.float64), counts[found])
+            every = np.bincount(values.ravel())
+            (levels,) = np.nonzero(every)
+            return cls(levels.astype(np.float64), every[levels])
         found, counts = np.unique(values.astype(np.float64), return_counts=True)
         return cls(found, counts)
 
@@ -106,12 +106,12 @@ def _tally_feature(feature: Feature, values: Any) -> FeatureTally:
     if feature.is_image:
         return _tally_pictures(feature, [values[index] for index in sample_frames(len(values))])
     rows = np.asarray(values).reshape(len(values), -1)
-    return FeatureTally(feature, tuple(Distribution.of(column) for column in rows.T), len(rows))
+    return FeatureTally(feature, tuple(Distribution.from_values(column) for column in rows.T), len(rows))
 
 
 def _tally_pictures(feature: Feature, pictures: Sequence[bytes]) -> FeatureTally:
     channels = np.concatenate([_decode_thinned(each, feature) for each in pictures], axis=1)
-    return FeatureTally(feature, tuple(Distribution.of(channel) for channel in channels), len(pictures))
+    return FeatureTally(feature, tuple(Distribution.from_values(channel) for channel in channels), len(pictures))
 
 
 def _decode_thinned(encoded: bytes, feature: Feature) -> NDArray[Any]:
