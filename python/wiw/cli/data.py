@@ -178,9 +178,9 @@ def export_data(
     $ wiw data export data --out data-lerobot --workers 4
     $ wiw data export demos --out demos-lerobot --fps 30
 
-    A segment of `wiw collect navigation` or a demonstration of `wiw collect manipulation` becomes an episode. Pictures
-    stay exactly as they are, depth has 16 bits; LeRobot's own tools make videos of them. `docs/lerobot.md` lists the
-    features. The new folder is there once all of it is written.
+    A segment of `wiw collect navigation` or a demonstration of `wiw collect manipulation` becomes an episode. Colour
+    and depth stay exactly as they are; LeRobot's own tools make videos of them. `docs/lerobot.md` lists the features.
+    The new folder is there once all of it is written.
 
     Args:
         folder: Finished collection.
