@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+import tiny_pipelines
 from wiw.datasets.navigation import META, NavigationData
 from wiw.datasets.navigation_files import (
     FORMAT,
@@ -115,3 +116,11 @@ def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTr
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def save_stock(folder: Path, name: str) -> Path:
+    """Write the tiny stock weights of a model below a folder, once."""
+    base = name.removesuffix("-action")
+    if not (folder / base).exists():
+        tiny_pipelines.save(base, folder / base)
+    return folder / base

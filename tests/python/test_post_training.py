@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import contents, make_trainer, save_dataset, tiny_recipe
+from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
@@ -58,15 +59,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("stock")
-
-    def get(name: str) -> Path:
-        base = name.removesuffix("-action")
-        if not (folder / base).exists():
-            tiny_pipelines.save(base, folder / base)
-        return folder / base
-
-    return get
+    return partial(save_stock, tmp_path_factory.mktemp("stock"))
 
 
 # -- every recipe ------------------------------------------------------------------------------------------------------

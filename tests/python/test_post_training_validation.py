@@ -9,6 +9,7 @@ import signal
 import sys
 import types
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +26,8 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import contents, make_trainer, save_dataset, tiny_recipe
+from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
 
-import tiny_pipelines
 from wiw.training.held_out_clips import imagine_with
 from wiw.training.post_training import validation
 from wiw.training.post_training.families import FAMILIES
@@ -49,15 +49,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("stock")
-
-    def get(name: str) -> Path:
-        base = name.removesuffix("-action")
-        if not (folder / base).exists():
-            tiny_pipelines.save(base, folder / base)
-        return folder / base
-
-    return get
+    return partial(save_stock, tmp_path_factory.mktemp("stock"))
 
 
 @pytest.fixture
