@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tiny navigation dataset, and tiny recipes on it."""
+"""A tiny navigation dataset, tiny recipes on it, and trainers of tiny networks."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from wiw.datasets.navigation import META
+import tiny_pipelines
+from wiw.datasets.navigation import META, NavigationData
 from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
@@ -20,17 +22,22 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.parquet_files import MANIFEST
+from wiw.training.post_training.families import find_family, load_generator
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
+from wiw.training.post_training.train import build_config
+from wiw.training.post_training.trainer import PostTrainer
 
 FRAMES = {"svd-action": 3, "ltx-action": 9}
 SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128)}
 SCENES = ("flat", "loft", "house")
 
 
-def save_dataset(folder: Path, frames: int = 12, projection: str = "equirectangular") -> Path:
+def save_dataset(
+    folder: Path, frames: int = 12, projection: str = "equirectangular", scenes: Sequence[str] = SCENES
+) -> Path:
     """Coloured panoramas that brighten ahead and roll with turns, in the files of `wiw collect navigation`."""
     folder.mkdir(parents=True, exist_ok=True)
-    segments = [_make_segment(scene, number, frames) for number, scene in enumerate(SCENES)]
+    segments = [_make_segment(scene, number, frames) for number, scene in enumerate(scenes)]
     schema = navigation_schema(False, {})
     write_frames(folder / "frames.parquet", schema, [build_table(each, schema) for each in segments])
     rows = [_list_segment(each, group) for group, each in enumerate(segments)]
@@ -95,3 +102,25 @@ def tiny_recipe(name: str, **changes: Any) -> PostTrainingRecipe:
     if load_recipe(name).lora:
         small["lora"] = 4
     return load_recipe(name, options={**small, **changes})
+
+
+def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
+    model, objective = find_family(name)
+    recipe = tiny_recipe(name, **changes)
+    options = {"guardrail": False} if name.startswith("cosmos") else {}
+    generator = load_generator(model, recipe, str(weights), options)
+    config = build_config(model.base, model.denoisers[0], generator)
+    clips = NavigationData(data).clips(recipe.frames)
+    return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def save_stock(folder: Path, name: str) -> Path:
+    """Write the tiny stock weights of a model below a folder, once."""
+    base = name.removesuffix("-action")
+    if not (folder / base).exists():
+        tiny_pipelines.save(base, folder / base)
+    return folder / base

@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 
 import wiw
 from wiw.errors import ArgumentError
-from wiw.experiments.fidelity import FidelityObserver, rank_agreement
+from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores
 from wiw.experiments.placebos import ShuffledPlacebo
 from wiw.loop.scheduler import run_episodes
+from wiw.metrics import rank_agreement
 from wiw.tasks.imagenav import ImageNav
 
 

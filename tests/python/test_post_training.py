@@ -10,18 +10,17 @@ import signal
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from folders import contents
 
 import wiw
 from wiw import action
 from wiw.cli.app import main
 from wiw.cli.train_video import VIDEO
-from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, TrainingError
 from wiw.types import Conditioning, Control
 
@@ -30,15 +29,15 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import save_dataset, tiny_recipe
+from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
-from wiw.training.post_training.families import FAMILIES, find_family, load_generator
+from wiw.training.post_training.families import FAMILIES, find_family
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
 from wiw.training.post_training.objective import to_image
 from wiw.training.post_training.recipe import load_recipe
-from wiw.training.post_training.train import build_config, post_train
+from wiw.training.post_training.train import post_train
 from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
 
 NAMES = sorted(FAMILIES)
@@ -60,25 +59,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory):
-    folder = tmp_path_factory.mktemp("stock")
-
-    def get(name: str) -> Path:
-        base = name.removesuffix("-action")
-        if not (folder / base).exists():
-            tiny_pipelines.save(base, folder / base)
-        return folder / base
-
-    return get
-
-
-def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
-    model, objective = find_family(name)
-    recipe = tiny_recipe(name, **changes)
-    options = {"guardrail": False} if name.startswith("cosmos") else {}
-    generator = load_generator(model, recipe, str(weights), options)
-    config = build_config(model.base, model.denoisers[0], generator)
-    clips = NavigationData(data).clips(recipe.frames)
-    return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
+    return partial(save_stock, tmp_path_factory.mktemp("stock"))
 
 
 # -- every recipe ------------------------------------------------------------------------------------------------------

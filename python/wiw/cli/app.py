@@ -13,6 +13,7 @@ import tyro
 import wiw
 from wiw.cli.blame import blame
 from wiw.cli.check_model import check_model
+from wiw.cli.collect_decisions import collect_decisions
 from wiw.cli.collect_manipulation import collect_manipulation
 from wiw.cli.collect_navigation import collect_navigation
 from wiw.cli.compare import compare
@@ -97,16 +98,18 @@ class Group:
 
 GROUPS: Mapping[str, Group] = {
     "collect": Group(
-        "Collect training data: navigation in scenes, or demonstrations of manipulation tasks.",
-        """Collect training data. To resume an interrupted collection, repeat the command.
+        "Collect data: navigation in scenes, demonstrations of manipulation tasks, or decisions.",
+        """Collect data for training, and decisions to validate on. Repeat an interrupted command to resume it.
 
   $ wiw collect navigation --scenes apartments:train:80 --out data --workers 4
   $ wiw collect manipulation --out demos --workers 4
+  $ wiw collect decisions --scenes apartments:val:20 --out decisions.parquet
 
 `wiw collect WHAT --help` explains each with examples.""",
         (
             (collect_navigation, "navigation", "Panoramas with depth, poses and actions along paths through scenes."),
             (collect_manipulation, "manipulation", "Demonstrations of manipulation tasks by scripted experts."),
+            (collect_decisions, "decisions", "Decisions between plans, with what each would truly lead to."),
         ),
         default="manipulation",
     ),

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
-from wiw.cli.train_video import VIDEO, VideoName, train_video
+from wiw.cli.train_video import VIDEO, TrackerName, VideoName, train_video
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
@@ -35,6 +35,9 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "option": (VIDEO, "reads no recipe"),
     "device": (VIDEO, "trains on the CPU"),
     "part": (VIDEO, "does not train on navigation datasets"),
+    "validation": (VIDEO, "is evaluated on --val, if at all"),
+    "decisions": (VIDEO, "is evaluated on --val, if at all"),
+    "tracker": (VIDEO, "reports to no tracker"),
 }
 """For each option that not all networks use: those that do, and why the others refuse it."""
 
@@ -52,6 +55,9 @@ def train(
     option: Options = (),
     device: Annotated[str | None, arg(metavar="NAME")] = None,
     part: Literal["train", "all"] | None = None,
+    validation: Annotated[Path | None, arg(metavar="DIR")] = None,
+    decisions: Annotated[Path | None, arg(metavar="FILE")] = None,
+    tracker: TrackerName | None = None,
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None,
     val: Annotated[str | None, arg(metavar="SPEC")] = None,
     categories: Annotated[tuple[str, ...], arg(metavar="NAME")] = (),
@@ -116,6 +122,12 @@ def train(
         device: Of torch, for video models. Default: the GPU if there is one.
         part: Part of the dataset for video models: train leaves out one in twenty scenes for validation. Default:
             train.
+        validation: Another dataset of `wiw collect navigation`, of other scenes, on which a video model is validated.
+            Default: the scenes that --part train leaves out.
+        decisions: File of `wiw collect decisions`, by which validation also measures how well a video model's order of
+            the plans agrees with the true one.
+        tracker: Program that draws a video model's loss and validation; needs its package. OUT.log/metrics.jsonl has
+            the same in any case.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
             Default: apartments:train:80; 160 of them for perception.
         val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single
@@ -144,11 +156,13 @@ def train(
     options |= {"places": places, "plays": plays, "workers": workers, "cache": cache, "minutes": minutes}
     options |= {"data": data, "weights": weights, "recipe": recipe, "option": option or None}
     options |= {"device": device, "part": part}
+    options |= {"validation": validation, "decisions": decisions, "tracker": tracker}
     _check_use(what, _drop_none(options))
     if what in VIDEO:
         _require_torch(what)
         numbers = _drop_none({"epochs": epochs, "seed": seed or None})
-        given = {"weights": weights, "device": device, "part": part or "train"}
+        given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train"}
+        given |= {"validation": validation, "decisions": decisions, "tracker": tracker}
         return train_video(what, out or Path(what), data, recipe, option, numbers, given)
     out = out or Path(f"{what}.safetensors")
     _require_torch(what)

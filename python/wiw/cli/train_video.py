@@ -20,6 +20,7 @@ VideoName = Literal[
     "wan2.2-a14b-action",
     "cosmos-predict2-action",
 ]
+TrackerName = Literal["trackio", "wandb", "tensorboard"]
 VIDEO: tuple[str, ...] = get_args(VideoName)
 """World models that are video generators trained to follow actions."""
 LINE_SECONDS = 60.0
@@ -44,7 +45,7 @@ def train_video(
         recipe: YAML file on top of the shipped recipe.
         pairs: KEY=VALUE of the recipe, on top of both.
         numbers: of the recipe that have flags of their own.
-        weights: which weights of the stock generator, on which device; part of the dataset.
+        weights: which weights of the stock generator, on which device; part of the dataset; what it is validated on.
 
     Raises:
         ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.
@@ -64,8 +65,14 @@ def train_video(
         chosen = choose_precision(chosen, weights.get("device"))
     began = time.monotonic()
     with announce_resume(), _Progress(chosen.batch) as progress:
-        card = post_train(name, data, out, recipe=chosen, on_step=progress, **weights)
-    print(f"{card['steps']:,} steps of {chosen.batch} clips, loss {card['loss']:.4f}, {time.monotonic() - began:.0f} s")
+        card = post_train(
+            name, data, out, recipe=chosen, on_step=progress, on_validation=progress.show_validation, **weights
+        )
+    taken = time.monotonic() - began
+    print(f"{card['trained_steps']:,} steps of {chosen.batch} clips, loss {card['loss']:.4f}, {taken:.0f} s")
+    if "validation" in card:
+        print(f"best        step {card['steps']:,}: {describe_validation(card['validation'])}")
+    print(f"log         {out}.log")
     print(f"checkpoint  {out}")
     shown = " ".join(f"--world-model-option {pair}" for pair in (f"checkpoint={out}", *_list_shape(name, card)))
     print(f"run it:     wiw run imagenav --world-model {name} {shown}")
@@ -95,6 +102,10 @@ class _Progress:
     def __exit__(self, *_: object) -> None:
         self._bars.__exit__()
 
+    def show_validation(self, step: int, found: Mapping[str, float]) -> None:
+        """Print what a validation found."""
+        print(f"validation: step {step:,}, {describe_validation(found)}", file=sys.stderr, flush=True)
+
     def __call__(self, step: int, steps: int, loss: float) -> None:
         now = time.monotonic()
         if self._first is None:  # the first step warms up, and comes after the weights were loaded
@@ -108,6 +119,16 @@ class _Progress:
             left = f", {(steps - step) / rate / 60:.0f} min left" if rate and step < steps else ""
             print(f"training: {text}{left}", file=sys.stderr, flush=True)
             self._said = now
+
+
+def describe_validation(found: Mapping[str, float]) -> str:
+    """Return the main figures of a validation."""
+    texts = [f"PSNR {found['psnr']:.2f} dB"] if "psnr" in found else []
+    if "gap" in found:
+        texts.append(f"control gap {found['gap']:.2f} dB, of displacements {found['gap/displacements']:.2f} dB")
+    if "rank" in found:
+        texts.append(f"rank agreement {found['rank']:.2f}")
+    return ", ".join(texts) or "no clip leads to another place"
 
 
 def _describe_memory() -> str:

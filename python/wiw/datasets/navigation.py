@@ -16,7 +16,7 @@ import json
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from hashlib import blake2b
+from hashlib import blake2b, sha256
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -93,6 +93,10 @@ class NavigationData(Sequence[NavigationSegment]):
     def frames(self) -> int:
         """Number of frames of all segments."""
         return sum(row["frames"] for row in self.segments)
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the files' checksums, which identifies the dataset."""
+        return sha256(json.dumps(self.meta["files"], sort_keys=True).encode()).hexdigest()
 
     def clips(self, length: int, stride: int = 1) -> Clips:
         """Return all windows of `length` frames that begin `stride` frames apart within a segment.

@@ -28,7 +28,7 @@ from wiw.loop.imagination import ModelInput, Request
 from wiw.loop.model_imaginer import ModelImaginer
 from wiw.loop.observers import Observer, ScoringBatch
 from wiw.loop.privileged import LiveEnvironments, Privileged
-from wiw.metrics import Lpips, psnr, ssim
+from wiw.metrics import Lpips, psnr, rank_agreement, ssim
 from wiw.policies.base import FrameSpec, Situation
 from wiw.registry import WORLD_MODELS
 from wiw.types import Decision, Fidelity, Key, Rollout
@@ -124,15 +124,6 @@ def _compare(imagined: Sequence[Rollout], scores: NDArray[np.float64], truth: _T
     return Fidelity(
         tuple(truth.rollouts), truth.scores, agreement, psnr=errors[:, 0], ssim=errors[:, 1], lpips=truth.distances
     )
-
-
-def rank_agreement(scores: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Return Kendall's tau-b of two scorings of the same plans; NaN where all scores of one of them are equal."""
-    from scipy.stats import kendalltau
-
-    if len(scores) < 2 or np.ptp(scores) == 0 or np.ptp(true) == 0:
-        return math.nan
-    return float(kendalltau(scores, true).statistic)
 
 
 def _errors(imagined: Rollout, true: Rollout) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from wiw.metrics.images import psnr, ssim
 from wiw.metrics.lpips import Lpips
 from wiw.metrics.navigation import mean_trajectory, path_efficiency, spl, success_rate
 from wiw.metrics.poses import pose_error
+from wiw.metrics.ranks import rank_agreement
 
 __all__ = [
     "Lpips",
@@ -18,6 +19,7 @@ __all__ = [
     "path_efficiency",
     "pose_error",
     "psnr",
+    "rank_agreement",
     "sharpness",
     "spl",
     "ssim",

@@ -65,7 +65,8 @@ def load_generator(
         "__doc__": stock.__doc__,
     }
     generator: type[VideoModel] = type(stock.__name__, (stock,), settings)
-    given: dict[str, Any] = {"frames": recipe.frames, "size": recipe.size, "precision": recipe.precision, **options}
+    given: dict[str, Any] = {"frames": recipe.frames, "size": recipe.size, "precision": recipe.precision}
+    given = {**model.defaults, **given, **options}
     if weights is not None:
         given["weights"] = weights
     return generator(**given)

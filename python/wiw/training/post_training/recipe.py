@@ -56,17 +56,24 @@ class PostTrainingRecipe:
     checkpointing: bool = True
     """Whether activations are computed again in the backward pass, which takes less memory."""
     seed: int = 0
+    held_out: float = 0.05
+    """Share of the scenes, chosen by a hash of their names, that are left out of training, for validation."""
+    validate_every: int | None = 500
+    """Steps between two validations; none if None."""
+    validate_clips: int = 8
+    """Held-out clips of a validation."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "size", tuple(self.size))
         counts = {"clips": self.clips or 1, "epochs": self.epochs, "batch": self.batch, "rows": self.rows}
+        counts |= {"validate_every": self.validate_every or 1, "validate_clips": self.validate_clips}
         for name, value in {**counts, "frames": self.frames - 1}.items():
             if value < 1:
                 raise ArgumentError(f"recipe: {name}: expected {2 if name == 'frames' else 1} or more, got {value}")
         for name in ("rate", "clip_norm", "shift"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
-        for name in ("warmup", "drop"):
+        for name in ("warmup", "drop", "held_out"):
             if not 0 <= getattr(self, name) < 1:
                 raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
         if self.lora < 0 or self.weight_decay < 0 or not 0 <= self.seed < 2**63:

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +12,16 @@ from typing import Any
 
 import wiw
 from wiw.datasets.navigation import NavigationData, Part
-from wiw.errors import ArgumentError, TrainingError
-from wiw.files import atomic_folder
+from wiw.errors import ArgumentError, FileError, TrainingError
+from wiw.files import atomic_file, atomic_folder
 from wiw.training.post_training.families import find_family, load_generator
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
+from wiw.training.post_training.sampling import TrainingSampler
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
+from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.trainer import PostTrainer, arrange_clips
+from wiw.training.post_training.training_log import TrainingLog
+from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
 from wiw.training.trainer import run_training
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements
@@ -28,8 +32,8 @@ from wiw.world_models.video.actions.injection import embedding_width
 from wiw.world_models.video.model import VideoModel
 from wiw.world_models.video.weights import is_path
 
-CARD = "training.json"
-"""Name of the file beside the weights that says on what and how they were trained."""
+LOG = "metrics.jsonl"
+"""Loss of each step and what validations found, in `OUT.log`."""
 
 
 def post_train(
@@ -43,13 +47,18 @@ def post_train(
     device: str | None = None,
     recipe: PostTrainingRecipe | None = None,
     part: Part = "train",
+    validation: str | Path | None = None,
+    decisions: str | Path | None = None,
+    tracker: str | None = None,
     seconds: float = 600.0,
     on_step: Callable[[int, int, float], None] = lambda *_: None,
+    on_validation: OnValidation = lambda *_: None,
 ) -> dict[str, Any]:
     """Train an action-conditioned model for navigation, or resume its training, and write its checkpoint.
 
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
-    SIGTERM or Ctrl-C. The same call resumes from it, and on the CPU ends with the same bytes.
+    SIGTERM or Ctrl-C. The same call resumes from it, and on the CPU ends with the same bytes. `OUT.log` has the loss
+    of each step and what validations found, with pictures; the checkpoint has the weights that were best in validation.
 
     Args:
         name: of the world model, such as "ltx-action".
@@ -62,15 +71,21 @@ def post_train(
         device: of torch; "cuda" where there is one, else "cpu".
         recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
         part: of the dataset: "train", which leaves a share of the scenes for validation, or "all".
+        validation: folder of another dataset whose clips it is validated on; the scenes left out if None. With all
+            scenes in training and no other dataset, there is no validation, and the checkpoint has the last weights.
+        decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
+        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        on_validation: called after each validation with the number of steps done and what was found.
 
     Returns:
         What the checkpoint's `training.json` says: model, data, recipe, steps and the loss at the end.
 
     Raises:
         ArgumentError: a model that is not trained here, a dataset of perspective views, too few clips, a recipe that
-            the model cannot have, or a state of a training with other data or numbers.
+            the model cannot have, a state of a training with other data or numbers, or validation on scenes that are
+            trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: `out` holds something, or the dataset is missing or damaged.
         WeightsError, DependencyError, DeviceMemoryError: see `wiw.world_models.video.model.VideoModel`.
@@ -81,48 +96,105 @@ def post_train(
     device = devices.device(device)
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
-    dataset = NavigationData(data, part)
+    dataset = NavigationData(data, part, recipe.held_out)
     _require_panoramas(dataset)
     arrange_clips(len(dataset.clips(recipe.frames)), recipe)
+    held_out = find_held_out(data, part, validation, recipe)
     options = {"revision": revision, "variant": variant, "device": device, **_extra_options(name)}
     generator = load_generator(model, recipe, None if weights is None else _resolve(str(weights)), options)
     recipe = replace(recipe, frames=generator.frames, size=generator.size)
+    checked = None if held_out is None else choose_validation_set(dataset, held_out, decisions, recipe)
     card = {"model": name, **describe_training(generator, dataset, part, recipe)}
+    card |= {"validated_on": checked.identity if checked else None}
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
+    folder = out.with_name(f"{out.name}.log")
+    if not state.path.exists():
+        shutil.rmtree(folder, ignore_errors=True)  # of an earlier training under this name
     with devices.memory_guard(f"training {name} on {generator.device}", "; ".join(list_remedies(recipe))):
         config = build_config(model.base, model.denoisers[0], generator)
         objective, clips = objective_class(generator, recipe), dataset.clips(recipe.frames)
         trainer = PostTrainer(objective, config, model.denoisers, clips, recipe)
-        run_steps(trainer, state, on_step)
-    card |= {"steps": trainer.step_count, "loss": trainer.mean_loss}
-    write_checkpoint(out, trainer, card)
+        trackers = [] if tracker is None else [open_tracker(tracker, out.name, folder, recipe.describe())]
+        validated = ValidatedTrainer(
+            trainer,
+            TrainingSampler(trainer) if checked else None,
+            checked,
+            TrainingLog(folder / LOG, trackers),
+            folder,
+            lambda best, found: write_checkpoint(best, trainer, {**card, **found}, lambda _: True),
+            lambda: state.save_if_due(validated, recipe.epochs, validated.step_count),
+            on_validation,
+        )
+        run_steps(validated, state, on_step)
+    card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
+    card = publish_checkpoint(out, validated, card)
     state.remove()
     return card
 
 
-def run_steps(trainer: PostTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]) -> None:
-    """Train from the start, or from the state that is kept, to the end.
+def find_held_out(
+    data: str | Path, part: Part, validation: str | Path | None, recipe: PostTrainingRecipe
+) -> NavigationData | None:
+    """Return what a training is validated on: another dataset, or the scenes left out of its own; None for nothing."""
+    if recipe.validate_every is None:
+        return None
+    if validation is not None:
+        return NavigationData(validation)
+    return NavigationData(data, "held-out", recipe.held_out) if part == "train" else None
+
+
+def run_steps(
+    trainer: ValidatedTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]
+) -> None:
+    """Train from the start, or from the state that is kept, to the end, and validate what came out.
 
     Raises:
         TrainingError: the loss is not finite; the state before is kept.
         ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
     """
-    recipe, phases = trainer.recipe, len(trainer.places)
+    inner = trainer.trainer
+    recipe, phases = inner.recipe, len(inner.places)
     with state.watch():
         try:
             run_training(
                 lambda: trainer,
                 recipe,
-                trainer.steps_per_epoch,
+                inner.steps_per_epoch,
                 None,
                 lambda progress: recipe.scale_rate(progress * phases % 1),  # each denoiser has a schedule of its own
-                lambda step, steps, _: on_step(step, steps, trainer.mean_loss),
+                lambda step, steps, _: on_step(step, steps, inner.mean_loss),
                 state,
             )
+            trainer.validate()
         except TrainingError:
             if trainer.step_count:
                 state.save(trainer, recipe.epochs, trainer.step_count)
             raise
+        finally:
+            trainer.finish()
+
+
+def publish_checkpoint(out: Path, trainer: ValidatedTrainer, card: Mapping[str, Any]) -> dict[str, Any]:
+    """Put the best weights in validation, or the last ones without it, where they belong; return their card.
+
+    Raises:
+        FileError: `out` holds something, or cannot be written.
+    """
+    if not trainer.best.exists():
+        found = {**card, "steps": trainer.step_count}
+        write_checkpoint(out, trainer.trainer, found)
+        return found
+    own = json.loads((trainer.best / CARD).read_text(encoding="utf-8"))
+    found = {**card, "steps": own["steps"], "validation": own["validation"]}
+    with atomic_file(trainer.best / CARD) as draft:
+        draft.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    try:
+        trainer.best.rename(out)
+    except OSError as error:
+        raise FileError(
+            f"{out}: cannot be written ({error.strerror}); the best weights are in {trainer.best}"
+        ) from error
+    return found
 
 
 def describe_training(
@@ -144,15 +216,18 @@ def identify_weights(generator: VideoModel) -> dict[str, str]:
     return {key: str(described[key]) for key in ("commit", "digest") if key in described}
 
 
-def write_checkpoint(out: Path, trainer: PostTrainer, card: Mapping[str, Any]) -> None:
+def write_checkpoint(
+    out: Path, trainer: PostTrainer, card: Mapping[str, Any], replace: Callable[[Path], bool] = lambda _: False
+) -> None:
     """Write what world models load, and how it was made, as a folder that is there whole or not at all.
+
+    `replace` says whether a folder that holds something may be replaced.
 
     Raises:
         FileError: `out` holds something, or cannot be written.
     """
-    with atomic_folder(out) as draft:
-        encoders = {place: encoder.eval() for place, encoder in trainer.encoders.items()}
-        action_checkpoint.save(draft, encoders, trainer.objective.pipeline, lora=bool(trainer.recipe.lora))
+    with atomic_folder(out, replace) as draft:
+        action_checkpoint.save(draft, trainer.encoders, trainer.objective.pipeline, lora=bool(trainer.recipe.lora))
         (draft / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
@@ -169,8 +244,7 @@ def build_config(base: str, place: str, generator: VideoModel) -> ActionConfig:
 
 def describe_dataset(data: NavigationData, part: str) -> dict[str, Any]:
     """Return what identifies a dataset: a digest of its files' checksums, which part, how many segments."""
-    files = json.dumps(data.meta["files"], sort_keys=True)
-    return {"sha256": hashlib.sha256(files.encode()).hexdigest(), "part": part, "segments": len(data)}
+    return {"sha256": data.digest(), "part": part, "segments": len(data)}
 
 
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:

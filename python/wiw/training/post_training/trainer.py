@@ -60,8 +60,8 @@ class PostTrainer(ResumableTrainer):
         self.mean_loss = float("nan")
         self._active: str | None = None
         self.order = arrange_clips(len(clips), recipe)
-        self._ids = np.zeros(len(config.vocabulary), np.int64)
-        self._ids[list(config.ids)] = list(config.ids.values())
+        self.action_ids = np.zeros(len(config.vocabulary), np.int64)
+        self.action_ids[list(config.ids)] = list(config.ids.values())
         with _seed_torch(_mix_seed(recipe.seed, "weights"), objective.device):
             self.encoders = {place: ActionEncoder(config).to(objective.device) for place in self.places}
             for place in self.places:
@@ -134,7 +134,7 @@ class PostTrainer(ResumableTrainer):
         self.optimizer.load_state_dict(state["optimizer"])
 
     def _compute_losses(self, place: str, clips: Sequence[NavigationSegment], random: torch.Generator) -> Tensor:
-        batch = load_clips(clips, self.recipe.size, self._ids).to(self.objective.device)
+        batch = load_clips(clips, self.recipe.size, self.action_ids).to(self.objective.device)
         dropped = (torch.rand(len(clips), generator=random) < self.recipe.drop).to(self.objective.device)
         encoded = self.objective.encode(batch.frames, random)
         vectors = self.encoders[place](batch.actions, dropped)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The record of a training, a JSON object a line: loss and rate of each step, and what validations found."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import FileError
+from wiw.files import atomic_file
+from wiw.training.post_training.trackers import Tracker
+
+
+class TrainingLog:
+    """A file of JSON lines, and whatever trackers are told the same.
+
+    Args:
+        path: of the file.
+        trackers: told every line's numbers.
+    """
+
+    def __init__(self, path: Path, trackers: Sequence[Tracker] = ()) -> None:
+        self.path, self._trackers = path, trackers
+        self._began = time.monotonic()
+
+    def rewind(self, step: int) -> None:
+        """Drop what was written after a step: the training resumes there, and writes it again.
+
+        Raises:
+            FileError: the file cannot be read or written.
+        """
+        kept = [json.dumps(line) for line in self.read() if line["step"] <= step]
+        with atomic_file(self.path) as draft:
+            draft.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def read(self) -> list[dict[str, Any]]:
+        """Return the lines, without one that a killed process has left unfinished.
+
+        Raises:
+            FileError: the file cannot be read, or is of another kind.
+        """
+        if not self.path.exists():
+            return []
+        try:
+            whole, newline, _ = self.path.read_text(encoding="utf-8").rpartition("\n")
+            return [json.loads(line) for line in whole.splitlines()] if newline else []
+        except (OSError, ValueError) as error:
+            raise FileError(f"{self.path}: expected a JSON object a line, got {error}; delete it") from error
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """Add a line of numbers.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        line = {"step": step, "seconds": round(time.monotonic() - self._began, 3), **values}
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(line) + "\n")
+        except OSError as error:
+            raise FileError(f"{self.path}: cannot be written ({error.strerror}); make room") from error
+        for tracker in self._trackers:
+            tracker.log(dict(values), step=step)
+
+    def finish(self) -> None:
+        """Tell the trackers that the training has ended."""
+        for tracker in self._trackers:
+            tracker.finish()

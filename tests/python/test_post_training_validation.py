@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Validation while training: what it finds, that training does not notice it, and that the best weights are kept."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import types
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.datasets.decisions import Decisions, save_decisions
+from wiw.datasets.navigation import NavigationData
+from wiw.errors import ArgumentError, DependencyError, FileError
+
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
+pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+
+import torch
+from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
+
+from wiw.training.held_out_clips import imagine_with
+from wiw.training.post_training import validation
+from wiw.training.post_training.families import FAMILIES
+from wiw.training.post_training.sampling import TrainingSampler
+from wiw.training.post_training.trackers import open_tracker
+from wiw.training.post_training.train import post_train, write_checkpoint
+from wiw.training.post_training.training_log import TrainingLog
+
+NAMES = sorted(FAMILIES)
+SPLIT = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}
+"""Of the three scenes, trains on "house"."""
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_dataset(tmp_path_factory.mktemp("validation") / "data")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory):
+    return partial(save_stock, tmp_path_factory.mktemp("stock"))
+
+
+@pytest.fixture
+def train(data: Path, weights: Any):
+    def train(out: Path, **options: Any) -> dict[str, Any]:
+        recipe = tiny_recipe("ltx-action", **{"epochs": 5, **SPLIT, **options.pop("numbers", {})})
+        given = {"weights": weights("ltx-action"), "device": "cpu", "recipe": recipe, "seconds": 0, **options}
+        return post_train("ltx-action", data, out, **given)
+
+    return train
+
+
+def read_log(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (out.with_name(f"{out.name}.log") / "metrics.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_does_not_notice_that_it_is_sampled(name: str, data: Path, weights: Any) -> None:
+    """The same weights to the last bit, and the same random state."""
+    changes = {"epochs": 4, "rows": 4}
+    plain, sampled = (make_trainer(name, data, weights(name), **changes) for _ in range(2))
+    sampler = TrainingSampler(sampled)
+    frames = plain.recipe.frames
+    images = np.full((2, *sampled.recipe.size, 3), 90, np.uint8)
+    plans, wanted = np.ones((2, frames - 1), np.int8), np.tile([1, frames - 1], (2, 1))
+    before = torch.random.get_rng_state()
+    for _ in range(plain.steps_per_epoch * 2):
+        plain.train_step(1e-3)
+        shown = sampler(images, plans, np.arange(2, dtype=np.uint64), wanted)
+        sampled.train_step(1e-3)
+    assert shown.shape == (2, 2, *sampled.recipe.size, 3)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert all(torch.equal(value, sampled.trained[key]) for key, value in plain.trained.items())
+    modes = [
+        [layer.training for layer in getattr(trainer.objective.pipeline, place).modules()]
+        for trainer in (plain, sampled)
+        for place in trainer.places
+    ]
+    assert modes[: len(modes) // 2] == modes[len(modes) // 2 :]
+
+
+def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(data: Path, weights: Any, tmp_path: Path) -> None:
+    name = "ltx-action"
+    trainer = make_trainer(name, data, weights(name))
+    trainer.train_step(1e-2)
+    write_checkpoint(tmp_path / "out", trainer, {})
+    recipe = trainer.recipe
+    model = wiw.world_model(
+        name, checkpoint=str(tmp_path / "out"), device="cpu", size=recipe.size, frames=recipe.frames
+    )
+    images = np.random.default_rng(0).integers(0, 255, (2, *recipe.size, 3)).astype(np.uint8)
+    plans, wanted = np.array([[1, 2, 1, 1], [3, 3, 1, 2]], np.int8), np.array([[1, 4], [2, 3]])
+    asked = images, plans, np.arange(2, dtype=np.uint64), wanted
+    np.testing.assert_array_equal(TrainingSampler(trainer)(*asked), imagine_with(model)(*asked))
+
+
+def test_the_checkpoint_has_the_weights_that_were_best(train: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    scores = {0: 50.0, 2: 11.0, 4: 13.0, 5: 12.0}
+    measured = []
+
+    def measure(self: Any, imagine: Any, seed: int, between: Any) -> Any:
+        measured.append(list(scores)[len(measured)])
+        return {"psnr": scores[measured[-1]]}, np.zeros((8, 8, 3), np.uint8)
+
+    monkeypatch.setattr(validation.ValidationSet, "measure", measure)
+    told: list[tuple[int, float]] = []
+    card = train(tmp_path / "out", on_validation=lambda step, found: told.append((step, found["psnr"])))
+    assert measured == [0, 2, 4, 5] and told == list(scores.items())
+    assert card["steps"] == 4 and card["validation"] == {"psnr": 13.0} and card["trained_steps"] == 5
+    assert json.loads((tmp_path / "out" / "training.json").read_text()) == card
+    monkeypatch.undo()
+    shorter = train(tmp_path / "four", numbers={"epochs": 4, "validate_every": None, "schedule": "constant"})
+    assert shorter["steps"] == 4 and "validation" not in shorter
+    log = read_log(tmp_path / "out")
+    assert [line["step"] for line in log if "loss" in line] == [1, 2, 3, 4, 5]
+    assert {line["step"]: line["validation/psnr"] for line in log if "loss" not in line} == scores
+    assert (tmp_path / "out.log" / "step-0000004.png").exists() and not (tmp_path / "out.log" / "best").exists()
+
+
+def test_validation_is_on_held_out_scenes(data: Path, train: Any, tmp_path: Path) -> None:
+    card = train(tmp_path / "out", numbers={"epochs": 2})
+    assert card["validated_on"]["scenes"] == ["flat", "loft"]
+    assert {row["scene"] for row in NavigationData(data, "train", 0.76).segments} == {"house"}
+    names = {"psnr", "psnr/1", "psnr/4", "psnr/8", "ssim/1", "ssim/4", "ssim/8", "gap", "gap/displacements"}
+    assert names <= set(card["validation"]) and card["steps"] == 2
+    assert all(np.isfinite(value) for value in card["validation"].values())
+    with pytest.raises(ArgumentError, match=r"no scene of .* is held out; collect more scenes"):
+        train(tmp_path / "none", numbers={"held_out": 0.0})
+    with pytest.raises(ArgumentError, match="scenes that are not trained on, got house"):
+        train(tmp_path / "same", validation=data)
+
+
+def test_another_dataset_may_be_validated_on(data: Path, train: Any, tmp_path: Path) -> None:
+    other = save_dataset(tmp_path / "other", scenes=("attic", "barn"))
+    card = train(tmp_path / "out", part="all", validation=other, numbers={"epochs": 1})
+    assert card["validated_on"]["scenes"] == ["attic", "barn"]
+    assert "validation" not in train(tmp_path / "alone", part="all", numbers={"epochs": 1})
+
+
+def test_rank_agreement_is_measured_on_stored_decisions(train: Any, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    seen = rng.integers(0, 255, (2, 5, 32, 64, 3)).astype(np.uint8)
+    plans = np.array([[[1, 1, 0], [2, 1, 1], [3, 1, 0]]] * 2, np.int8)
+    stored = Decisions(("a", "b"), seen[:, 0], seen[:, 1], plans, seen[:, 2:], rng.random((2, 3)))
+    save_decisions(tmp_path / "d.parquet", stored)
+    card = train(tmp_path / "out", decisions=tmp_path / "d.parquet", numbers={"epochs": 1})
+    assert -1 <= card["validation"]["rank"] <= 1 and card["validation"]["regret"] >= 0
+    assert len(card["validated_on"]["decisions"]) == 64
+    save_decisions(tmp_path / "long.parquet", replace(stored, plans=np.ones((2, 3, 9), np.int8)))
+    with pytest.raises(ArgumentError, match="at most 8 actions"):
+        train(tmp_path / "other", decisions=tmp_path / "long.parquet")
+
+
+def test_a_training_that_is_stopped_while_it_validates_ends_with_the_same_bytes(
+    train: Any, tmp_path: Path, monkeypatch: Any
+) -> None:
+    train(tmp_path / "whole")
+    stock, calls = TrainingSampler.__call__, []
+
+    def stop(self: Any, *asked: Any) -> Any:
+        calls.append(len(calls))
+        if len(calls) == 5:  # in the validation after step 4
+            os.kill(os.getpid(), signal.SIGINT)
+        return stock(self, *asked)
+
+    monkeypatch.setattr(TrainingSampler, "__call__", stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "stopped")
+    monkeypatch.undo()
+    assert torch.load(tmp_path / "stopped.checkpoint", weights_only=True)["step"] == 4
+    train(tmp_path / "stopped")
+    assert contents(tmp_path / "whole") == contents(tmp_path / "stopped")
+    logs = [[{**line, "seconds": 0} for line in read_log(tmp_path / name)] for name in ("whole", "stopped")]
+    assert logs[0] == logs[1]
+
+
+def test_a_log_forgets_what_comes_later_and_half_a_line(tmp_path: Path) -> None:
+    log = TrainingLog(tmp_path / "a" / "metrics.jsonl")
+    assert log.read() == []
+    for step in (1, 2, 3):
+        log.write(step, {"loss": step / 2})
+    with log.path.open("a") as file:
+        file.write('{"step": 4, "lo')
+    assert [line["step"] for line in log.read()] == [1, 2, 3]
+    log.rewind(2)
+    assert [line["loss"] for line in log.read()] == [0.5, 1.0] and log.path.read_text().endswith("}\n")
+    log.path.write_text("loss\n")
+    with pytest.raises(FileError, match="a JSON object a line"):
+        log.read()
+
+
+# -- trackers ----------------------------------------------------------------------------------------------------------
+
+
+class _Run:
+    def __init__(self, told: list[Any], project: str) -> None:
+        self.told, self.project = told, project
+
+    def log(self, values: dict[str, float], step: int | None = None) -> None:
+        self.told.append((step, values))
+
+    def finish(self) -> None:
+        self.told.append("finished")
+
+
+@pytest.mark.parametrize("name", ["trackio", "wandb"])
+def test_trackers_are_told_what_the_log_is(name: str, train: Any, tmp_path: Path, monkeypatch: Any) -> None:
+    """A stand-in for the package, called by accelerate's own tracker."""
+    told: list[Any] = []
+    package = types.ModuleType(name)
+    package.__spec__ = types.SimpleNamespace()  # type: ignore[assignment]
+    package.init = lambda project, **_: _Run(told, project)  # type: ignore[attr-defined]
+    package.config = types.SimpleNamespace(update=lambda values, **_: told.append(values))  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, name, package)
+    train(tmp_path / "out", tracker=name, numbers={"epochs": 2})
+    config, *rest, end = told
+    assert config["rate"] == 1e-5 and config["size"] == "[64, 128]" and end == "finished"
+    log = [{**line} for line in read_log(tmp_path / "out")]
+    assert rest == [(line.pop("step"), {k: v for k, v in line.items() if k != "seconds"}) for line in log]
+
+
+def test_tensorboard_is_told_what_the_log_is(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    tracker = open_tracker("tensorboard", "ltx", tmp_path, {"rate": 1e-3, "lora": None})
+    tracker.log({"loss": 0.5, "validation/psnr": 20.0}, step=3)
+    tracker.finish()
+    events = EventAccumulator(str(tmp_path / "ltx")).Reload()
+    assert [(each.step, each.value) for each in events.Scalars("loss")] == [(3, 0.5)]
+
+
+def test_trackers_that_are_not_there_are_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    with pytest.raises(ArgumentError, match="one of trackio, wandb, tensorboard, got 'mlflow'"):
+        open_tracker("mlflow", "run", tmp_path, {})
+    monkeypatch.setattr("wiw.training.post_training.trackers.find_spec", lambda name: None if name == "wandb" else 1)
+    with pytest.raises(DependencyError, match="needs wandb, which is not installed: pip install wandb"):
+        open_tracker("wandb", "run", tmp_path, {})
