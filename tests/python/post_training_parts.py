@@ -114,10 +114,6 @@ def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTr
     return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
 
 
-def contents(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 def save_stock(folder: Path, name: str) -> Path:
     """Write the tiny stock weights of a model below a folder, once."""
     base = name.removesuffix("-action")

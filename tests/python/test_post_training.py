@@ -29,7 +29,8 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
+from folders import contents
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder

@@ -26,7 +26,8 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import contents, make_trainer, save_dataset, save_stock, tiny_recipe
+from folders import contents
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
 
 from wiw.training.held_out_clips import imagine_with
 from wiw.training.post_training import validation
