@@ -39,7 +39,7 @@ from wiw.training.post_training.training_log import TrainingLog
 
 NAMES = sorted(FAMILIES)
 SPLIT = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}
-"""Of the three scenes, trains on "house"."""
+"""Share of the three scenes that leaves "house" for training."""
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 

@@ -28,9 +28,8 @@ def collect_decisions(
 
     A decision has an observation, a goal that is in sight of it, and plans that lead apart: turns to one of 16
     headings, then steps ahead as far as it is free. A model scores each plan by how near the panorama that it imagines
-    at the end looks to that of the goal; the oracle scores the true one. Validation while training, and `wiw study
-    data-scaling`, report how well both orders agree, and how much further from the goal the model's choice ends than
-    the best plan.
+    at the end looks to that of the goal; the oracle scores the true one. Validation while training reports
+    how well both orders agree, and how much further from the goal the model's choice ends than the best plan.
 
     Args:
         scenes: Scenes, which may be of any split: apartments:val:20, a mesh or a Gazebo world.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model's imagination is worth on stored decisions: which plan it chooses, and what the choice costs.
+"""The worth of a model's imagination on stored decisions: which plan it chooses, and what the choice costs.
 
 A plan's score is how near what it leads to looks to the goal (PSNR). The oracle scores true pictures, a model the ones
 that it imagines.

@@ -109,7 +109,7 @@ def resize_frames(frames: Frames, size: tuple[int, int]) -> Frames:
 
 @dataclass(frozen=True)
 class ClipErrors:
-    """What was imagined, compared with what was seen: N clips at S numbers of actions."""
+    """Errors of imagined frames against what was seen: N clips at S numbers of actions."""
 
     scenes: tuple[str, ...]
     """[N]."""

@@ -32,7 +32,7 @@ class Feature:
     shape: tuple[int, ...] = (1,)
     """[height, width, channels] of images, [n] of vectors, [1] of numbers."""
     names: Sequence[str] | None = None
-    """Of the axes of an image, or of the entries of a vector."""
+    """Names of the axes of an image, or of the entries of a vector."""
     info: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -91,4 +91,4 @@ class Episode:
     columns: Mapping[str, Any]
     """T values by feature, `INDICES` left out: an array [T, ...], or encoded pictures."""
     facts: Mapping[str, Any]
-    """What `meta/episodes` says about it beyond LeRobot's own columns."""
+    """Values of `meta/episodes` beyond LeRobot's own columns."""

@@ -29,7 +29,7 @@ FRONT, DEPTH = "observation.images.front", "observation.images.front_depth"
 TIFF_DEFLATE = 8
 POSE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "gripper_open")
 FACTS = ("kind", "variation", "seed", "episode", "success", "places", "file")
-"""Of an episode, beside its frames; kind is the task that wiw knows it by."""
+"""Facts of an episode, beside its frames; kind is the task that wiw knows it by."""
 
 
 def describe_features(size: int, depth: bool) -> dict[str, Feature]:

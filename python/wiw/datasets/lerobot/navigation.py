@@ -36,9 +36,9 @@ FPS = 5
 INSTRUCTION = "walk to the next waypoint"
 COLOR, DEPTH = "observation.images.rgb", "observation.images.depth"
 FACTS = ("scene", "pass", "island", "segment", "seed", "height", "ending", "file")
-"""Of an episode, beside its frames."""
+"""Facts of an episode, beside its frames."""
 FRAME_FACTS = ("wiw", "split", "camera", "color", "depth", "actions")
-"""Of `meta.json`: what files of frames repeat."""
+"""Entries of `meta.json` that files of frames repeat."""
 
 
 def describe_features(meta: Mapping[str, Any]) -> dict[str, Feature]:

@@ -42,7 +42,7 @@ class LeRobotFolder:
             folder / SOURCE,
             "a dataset that `wiw data export` has written: others lack poses, cameras and scenes or tables",
         )
-        """What the dataset was exported from."""
+        """Description of the collection that the dataset was exported from."""
         self._episodes = self._read_episode_rows()
         self._starts: dict[str, int] = {}
         """First frame of each file, among all frames."""

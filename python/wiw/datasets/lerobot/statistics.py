@@ -21,7 +21,7 @@ from wiw.errors import FileError
 
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 LARGE_PIXELS, THINNED_PIXELS = 300, 150
-"""Of the longer side: from where on a picture is thinned, and about what is left of it."""
+"""Pixels of the longer side from which on a picture is thinned, and about how many are left."""
 MERGED_AT_ONCE = 256
 """Episodes: a merge sorts all that came before again, so that it is not done for each."""
 

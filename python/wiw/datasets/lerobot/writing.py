@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,6 @@ from wiw.datasets.lerobot.statistics import DatasetTally, FeatureTally, tally_ep
 from wiw.datasets.parquet_files import build_schema, image_values, write_row_groups
 from wiw.errors import ArgumentError
 from wiw.files import atomic_folder
-
-Progress = Callable[[int, int], None]
-"""Called with the number of episodes that are done, and of how many."""
 
 
 def write_dataset(

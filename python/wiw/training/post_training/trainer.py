@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from wiw.datasets.navigation import Clips
 from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.errors import ArgumentError, TrainingError
 from wiw.training.checkpoint import ResumableTrainer
+from wiw.training.held_out_clips import resize_frames
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.objective import Objective
 from wiw.training.post_training.recipe import PostTrainingRecipe
@@ -216,16 +216,9 @@ def load_clips(clips: Sequence[NavigationSegment], size: tuple[int, int], ids: N
     Raises:
         FileError: a picture is damaged.
     """
-    height, width = size
-    frames = np.stack([[_resize(frame, height, width) for frame in clip.images] for clip in clips])
+    frames = np.stack([resize_frames(clip.images, size) for clip in clips])
     pixels = torch.from_numpy(frames).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
     return ClipBatch(pixels, torch.from_numpy(np.stack([ids[clip.actions] for clip in clips])))
-
-
-def _resize(frame: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    if frame.shape[:2] == (height, width):
-        return frame
-    return np.asarray(cv2.resize(frame, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def describe_clip(clips: Clips, index: int) -> str:

@@ -27,7 +27,7 @@ from wiw.training.post_training.training_log import TrainingLog
 CARD = "training.json"
 """Name of the file beside the weights that says on what and how they were trained."""
 CRITERION = "psnr"
-"""What the best weights have the most of: mean PSNR of frames from another place than the observation."""
+"""Measure that the best weights have the most of: mean PSNR of frames from another place than the observation."""
 PREFIX = "validation/"
 SHOWN = 4
 """Clips in a picture."""
@@ -40,7 +40,7 @@ OnValidation = Callable[[int, Mapping[str, float]], None]
 
 @dataclass(frozen=True)
 class ValidationSet:
-    """What a model in training is measured on."""
+    """Clips and decisions that a model in training is measured on."""
 
     clips: HeldOutClips
     decisions: Decisions | None
