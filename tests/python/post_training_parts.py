@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tiny navigation dataset, and tiny recipes on it."""
+"""A tiny navigation dataset, tiny recipes on it, and trainers of tiny weights."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 
-FRAMES = {"svd-action": 3, "ltx-action": 9}
-SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128)}
+FRAMES = {"svd-action": 3, "ltx-action": 9, "nwm-action": 6}
+SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128), "nwm-action": (48, 48)}
 SCENES = ("flat", "loft", "house")
 
 
@@ -95,3 +95,29 @@ def tiny_recipe(name: str, **changes: Any) -> PostTrainingRecipe:
     if load_recipe(name).lora:
         small["lora"] = 4
     return load_recipe(name, options={**small, **changes})
+
+
+def save_weights(name: str, folder: Path) -> Path:
+    """Tiny random weights of what a model is trained from, saved once."""
+    import tiny_pipelines
+    from tiny_nwm import TinyNWM
+
+    base = name.removesuffix("-action")
+    if not (folder / base).exists():
+        if base == "nwm":
+            TinyNWM().save_pretrained(folder / base)
+        else:
+            tiny_pipelines.save(base, folder / base)
+    return folder / base
+
+
+def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> Any:
+    """A trainer at its first step."""
+    from wiw.training.post_training.corpora import open_corpus
+    from wiw.training.post_training.families import PretrainedWeights, find_family
+    from wiw.training.post_training.trainer import PostTrainer
+
+    family = find_family(name)
+    corpus, recipe = family.fit(open_corpus(data, "all"), tiny_recipe(name, **changes))
+    loaded = family.load(corpus, recipe, PretrainedWeights(str(weights), device="cpu"))
+    return PostTrainer(loaded.model, corpus.clips(loaded.recipe.frames), loaded.recipe)
