@@ -27,7 +27,7 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "plays": (ON_PLAYS, "does not train on plays"),
     "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
     "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
-    "cache": ((*ON_SCENES, *ON_PLAYS), "caches no training data"),
+    "cache": ((*ON_SCENES, *ON_PLAYS, *VIDEO), "caches no training data"),
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
     "data": (VIDEO, "trains on other data"),
     "weights": (VIDEO, "begins with random weights"),
@@ -133,7 +133,8 @@ def train(
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
         workers: Processes that prepare training data from scenes or plays. Default: 2.
-        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks.
+        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks. Of clips as
+            a video model's frozen networks encode them, for later epochs and other trainings. Default: none.
     """
     from wiw.scenes.store import folder
 
@@ -151,7 +152,7 @@ def train(
     if what in VIDEO:
         _require_torch(what)
         numbers = _drop_none({"epochs": epochs, "seed": seed or None})
-        given = {"weights": weights, "device": device, "part": part or "train"}
+        given = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
         return train_video(what, out or Path(what), data, recipe, option, numbers, given)
     out = out or Path(f"{what}.safetensors")
     _require_torch(what)

@@ -48,7 +48,7 @@ def train_video(
         recipe: YAML file on top of the shipped recipe.
         pairs: KEY=VALUE of the recipe, on top of both.
         numbers: of the recipe that have flags of their own.
-        weights: which pretrained weights, on which device; part of the data.
+        weights: which pretrained weights, on which device; part of the data; folder of encoded clips.
 
     Raises:
         ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.

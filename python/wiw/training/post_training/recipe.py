@@ -16,6 +16,7 @@ from wiw.errors import ArgumentError, FileError
 FOLDER = Path(__file__).parents[2] / "configs" / "post-training"
 Schedule = Literal["constant", "linear", "cosine"]
 Precision = Literal["bfloat16", "float32"]
+OptimizerName = Literal["adamw", "adamw8bit"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,6 +56,10 @@ class PostTrainingRecipe:
     clip_norm: float = 1.0
     """Largest norm of the gradient."""
     weight_decay: float = 0.01
+    optimizer: OptimizerName = "adamw"
+    """AdamW; "adamw8bit" keeps its moments in 8 bits, 2 bytes a parameter instead of 8."""
+    ema: float = 0.0
+    """Decay a step of averaged weights, which the checkpoint then has; 0 averages nothing."""
     precision: Precision = "bfloat16"
     """Precision of matrix products and of frozen weights; trained weights are float32."""
     checkpointing: bool = True
@@ -71,7 +76,7 @@ class PostTrainingRecipe:
         for name in ("rate", "clip_norm", "shift"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
-        for name in ("warmup", "drop", "mirror", "still"):
+        for name in ("warmup", "drop", "mirror", "still", "ema"):
             if not 0 <= getattr(self, name) < 1:
                 raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
         if self.lora < 0 or self.weight_decay < 0 or not 0 <= self.seed < 2**63:

@@ -14,6 +14,7 @@ from wiw.errors import ArgumentError, TrainingError
 from wiw.files import atomic_folder
 from wiw.training.post_training.corpora import Corpus, CorpusPart, open_corpus
 from wiw.training.post_training.families import Loaded, PretrainedWeights, find_family
+from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.trainer import PostTrainer, arrange_clips
@@ -39,6 +40,7 @@ def post_train(
     device: str | None = None,
     recipe: PostTrainingRecipe | None = None,
     part: CorpusPart = "train",
+    cache: str | Path | None = None,
     seconds: float = 600.0,
     on_step: Callable[[int, int, float], None] = lambda *_: None,
 ) -> dict[str, Any]:
@@ -58,6 +60,7 @@ def post_train(
         device: of torch; "cuda" where there is one, else "cpu".
         recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
         part: of the data: "train", which leaves a share of scenes or demonstrations for validation, or "all".
+        cache: folder where encoded clips are kept, for later epochs and other trainings on the same data; none if None.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
 
@@ -83,7 +86,8 @@ def post_train(
         recipe = loaded.recipe
         card = {"model": name, **describe_training(loaded, corpus)}
         state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
-        trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe)
+        latents = None if cache is None else open_cache(Path(cache), loaded, corpus)
+        trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe, latents)
         run_steps(trainer, state, on_step)
     card |= {"steps": trainer.step_count, "loss": trainer.mean_loss}
     card["run"] = {
@@ -140,8 +144,16 @@ def write_checkpoint(out: Path, trainer: PostTrainer, card: Mapping[str, Any]) -
         FileError: `out` holds something, or cannot be written.
     """
     with atomic_folder(out) as draft:
-        trainer.model.write(draft)
+        with trainer.use_averages():
+            trainer.model.write(draft)
         (draft / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+
+
+def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
+    """Return the cache of a corpus's clips as a model's frozen networks encode them."""
+    recipe = loaded.recipe
+    shape = {"frames": recipe.frames, "size": recipe.size, "versions": loading.versions()}
+    return LatentCache(folder, {"data": corpus.describe(), "latents": loaded.model.describe_latents(), **shape})
 
 
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
@@ -155,7 +167,9 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     remedies = [f"rows=1 (now {recipe.rows})"] if recipe.rows > 1 else []
     remedies += ["precision=bfloat16"] if recipe.precision == "float32" else []
     remedies += [] if recipe.checkpointing else ["checkpointing=true"]
-    remedies += [] if recipe.lora else ["lora=32, for the Wan models"]
+    remedies += ["optimizer=adamw8bit"] if recipe.optimizer == "adamw" and not recipe.lora else []
+    remedies += ["ema=0"] if recipe.ema else []
+    remedies += [] if recipe.lora else ["lora=32, for the Wan and LTX models"]
     return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
 
 

@@ -12,12 +12,16 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch.utils._pytree import tree_map_only
 
 from wiw.errors import ArgumentError, TrainingError
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.clips import ClipBatch, load_clips, mirror_clip
 from wiw.training.post_training.corpora import CorpusClips
+from wiw.training.post_training.latent_cache import LatentCache
+from wiw.training.post_training.optimizers import create_optimizer
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.training.post_training.trainable import Encoded, TrainableModel
 
@@ -31,18 +35,28 @@ class PostTrainer(ResumableTrainer):
         model: what is trained.
         clips: what is trained on.
         recipe: of the training.
+        cache: where encoded clips are kept; they are encoded each time if None.
+
+    Raises:
+        ArgumentError: there are fewer clips than one step takes.
+        DependencyError: the recipe's optimiser is not installed.
     """
 
-    def __init__(self, model: TrainableModel, clips: CorpusClips, recipe: PostTrainingRecipe) -> None:
-        self.model, self.recipe, self._clips = model, recipe, clips
+    def __init__(
+        self,
+        model: TrainableModel,
+        clips: CorpusClips,
+        recipe: PostTrainingRecipe,
+        cache: LatentCache | None = None,
+    ) -> None:
+        self.model, self.recipe, self._clips, self._cache = model, recipe, clips, cache
         self.mean_loss = float("nan")
         self.order = arrange_clips(len(clips), recipe)
         self.trained: dict[str, nn.Parameter] = {}
         for place in model.places:
             self.trained |= model.list_trained(place)
-        self.optimizer = torch.optim.AdamW(
-            list(self.trained.values()), lr=recipe.rate, weight_decay=recipe.weight_decay
-        )
+        self.optimizer = create_optimizer(list(self.trained.values()), recipe)
+        self.averages = {name: value.detach().clone() for name, value in self.trained.items()} if recipe.ema else {}
 
     @property
     def steps_per_epoch(self) -> int:
@@ -73,19 +87,19 @@ class PostTrainer(ResumableTrainer):
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.optimizer.step()
+        self._average_weights(place)
         self.mean_loss = total if not self.step_count else 0.98 * self.mean_loss + 0.02 * total
         self.step_count += 1
         return total
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of steps, the mean loss, the trained weights and the optimiser's state, in main memory."""
-        optimizer = self.optimizer.state_dict()
-        moments = {key: {name: value.cpu() for name, value in each.items()} for key, each in optimizer["state"].items()}
+        """Return the number of steps, the mean loss, weights, averages and the optimiser's state, in main memory."""
         return {
             "count": self.step_count,
             "loss": self.mean_loss,
             "weights": {name: value.detach().cpu() for name, value in self.trained.items()},
-            "optimizer": {**optimizer, "state": moments},
+            "averages": {name: value.cpu() for name, value in self.averages.items()},
+            "optimizer": tree_map_only(Tensor, Tensor.cpu, self.optimizer.state_dict()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -94,7 +108,33 @@ class PostTrainer(ResumableTrainer):
         with torch.no_grad():
             for name, value in self.trained.items():
                 value.copy_(state["weights"][name])
+            for name, average in self.averages.items():
+                average.copy_(state["averages"][name])
         self.optimizer.load_state_dict(state["optimizer"])
+
+    @contextmanager
+    def use_averages(self) -> Iterator[None]:
+        """Exchange the weights for their averages, where there are any, as long as the context lasts."""
+        self._exchange_averages()
+        try:
+            yield
+        finally:
+            self._exchange_averages()
+
+    @torch.no_grad()
+    def _exchange_averages(self) -> None:
+        for name, average in self.averages.items():
+            kept = self.trained[name].clone()
+            self.trained[name].copy_(average)
+            average.copy_(kept)
+
+    @torch.no_grad()
+    def _average_weights(self, place: str) -> None:
+        """Move the averages of what is trained at a place towards its weights."""
+        if self.averages:
+            names = list(self.model.list_trained(place))
+            averages, weights = ([each[name] for name in names] for each in (self.averages, self.trained))
+            get_ema_multi_avg_fn(self.recipe.ema)(averages, weights, None)
 
     def _add_gradients(self, place: str, rows: NDArray[np.int64], first: int) -> float:
         """Add the gradients of some clips of a batch, from its clip `first` on; return their part of its mean loss."""
@@ -117,8 +157,12 @@ class PostTrainer(ResumableTrainer):
         return encoded, torch.cat([actions for _, actions in found])
 
     def _encode_clip(self, index: int, mirror: bool) -> tuple[Encoded, Tensor]:
-        clip = self._load_clip(index, mirror)
-        return self.model.encode(clip), clip.actions
+        def make() -> tuple[Encoded, Tensor]:
+            clip = self._load_clip(index, mirror)
+            encoded = self.model.encode(clip)
+            return {name: value.contiguous() for name, value in encoded.items()}, clip.actions  # as a cache has them
+
+        return make() if self._cache is None else self._cache.encode(index, mirror, make, self.model.device)
 
     def _load_clip(self, index: int, mirror: bool) -> ClipBatch:
         clip = self._clips[index]
