@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 import tiny_pipelines
-from wiw.datasets.navigation import META, NavigationData
+from tiny_nwm import TinyNWM
+from wiw.datasets.navigation import META
 from wiw.datasets.navigation_files import (
     FORMAT,
     SEGMENTS,
@@ -22,13 +23,13 @@ from wiw.datasets.navigation_files import (
 )
 from wiw.datasets.navigation_segment import NavigationSegment, encode_color
 from wiw.datasets.parquet_files import MANIFEST
-from wiw.training.post_training.families import find_family, load_generator
+from wiw.training.post_training.corpora import open_corpus
+from wiw.training.post_training.families import PretrainedWeights, find_family
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
-from wiw.training.post_training.train import build_config
 from wiw.training.post_training.trainer import PostTrainer
 
-FRAMES = {"svd-action": 3, "ltx-action": 9}
-SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128)}
+FRAMES = {"svd-action": 3, "ltx-action": 9, "nwm-action": 6}
+SIZES = {"svd-action": (64, 128), "ltx-action": (64, 128), "nwm-action": (48, 48)}
 SCENES = ("flat", "loft", "house")
 
 
@@ -104,19 +105,20 @@ def tiny_recipe(name: str, **changes: Any) -> PostTrainingRecipe:
     return load_recipe(name, options={**small, **changes})
 
 
-def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
-    model, objective = find_family(name)
-    recipe = tiny_recipe(name, **changes)
-    options = {"guardrail": False} if name.startswith("cosmos") else {}
-    generator = load_generator(model, recipe, str(weights), options)
-    config = build_config(model.base, model.denoisers[0], generator)
-    clips = NavigationData(data).clips(recipe.frames)
-    return PostTrainer(objective(generator, recipe), config, model.denoisers, clips, recipe)
-
-
 def save_stock(folder: Path, name: str) -> Path:
-    """Write the tiny stock weights of a model below a folder, once."""
+    """Write tiny random weights of what a model is trained from below a folder, once."""
     base = name.removesuffix("-action")
     if not (folder / base).exists():
-        tiny_pipelines.save(base, folder / base)
+        if base == "nwm":
+            TinyNWM().save_pretrained(folder / base)
+        else:
+            tiny_pipelines.save(base, folder / base)
     return folder / base
+
+
+def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTrainer:
+    """A trainer at its first step."""
+    family = find_family(name)
+    corpus, recipe = family.fit(open_corpus(data, "all"), tiny_recipe(name, **changes))
+    loaded = family.load(corpus, recipe, PretrainedWeights(str(weights), device="cpu"))
+    return PostTrainer(loaded.model, corpus.clips(loaded.recipe.frames), loaded.recipe)

@@ -20,7 +20,7 @@ import pytest
 import wiw
 from wiw import action
 from wiw.cli.app import main
-from wiw.cli.train_video import VIDEO
+from wiw.cli.train_video import RUN_AS, VIDEO
 from wiw.errors import ArgumentError, TrainingError
 from wiw.types import Conditioning, Control
 
@@ -34,14 +34,18 @@ from post_training_parts import make_trainer, save_dataset, save_stock, tiny_rec
 
 import tiny_pipelines
 from wiw.training.post_training.clip_order import ClipOrder
-from wiw.training.post_training.families import FAMILIES, find_family
+from wiw.training.post_training.clips import load_clips
+from wiw.training.post_training.conditioned_generator import add_lora
+from wiw.training.post_training.families import FAMILIES, VideoFamily, find_family
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
+from wiw.training.post_training.nwm import TrainableNWM
 from wiw.training.post_training.objective import to_image
 from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import post_train
-from wiw.training.post_training.trainer import PostTrainer, add_lora, load_clips
+from wiw.training.post_training.trainer import PostTrainer
 
 NAMES = sorted(FAMILIES)
+GENERATORS = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 STEPS = {name: 6 if name in ("svd-action", "wan2.2-a14b-action") else 12 for name in NAMES}
 
 
@@ -72,22 +76,22 @@ def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, wei
     trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0)
 
     def measure(place: str) -> float:
-        clips = [trainer._clips[int(row)] for row in trainer.order.select(0)]
+        clips = np.tile(trainer.order.select(0), 4)
         with torch.no_grad():
-            return float(trainer._compute_losses(place, clips * 4, torch.Generator().manual_seed(9)).mean())
+            return float(trainer._compute_losses(place, clips, torch.Generator().manual_seed(9)).mean())
 
-    before = {place: measure(place) for place in trainer.places}
+    before = {place: measure(place) for place in trainer.model.places}
     for _ in range(STEPS[name] * trainer.steps_per_epoch):
         trainer.train_step(3e-3)
-    for place in trainer.places:
+    for place in trainer.model.places:
         assert measure(place) < 0.95 * before[place], (place, before[place], measure(place))
 
 
 @pytest.mark.parametrize("name", ["ltx-action", "wan2.2-5b-action", "cosmos-predict2-action"])
 def test_the_first_frame_is_given_and_out_of_the_loss(name: str, data: Path, weights: Any) -> None:
     trainer = make_trainer(name, data, weights(name), checkpointing=False)
-    objective, clips = trainer.objective, torch.rand(2, 3, trainer.recipe.frames, *trainer.recipe.size) * 2 - 1
-    encoded = dict(objective.encode(clips, torch.Generator().manual_seed(0)))
+    objective, clips = trainer.model.objective, torch.rand(2, 3, trainer.recipe.frames, *trainer.recipe.size) * 2 - 1
+    encoded = dict(objective.sample(objective.encode(clips), torch.Generator().manual_seed(0)))
 
     def measure() -> torch.Tensor:
         with torch.no_grad():
@@ -126,7 +130,7 @@ def test_each_recipe_resumes_exactly(name: str, data: Path, weights: Any) -> Non
 def test_actions_are_those_of_the_clips_and_dropped_in_a_share(data: Path, weights: Any) -> None:
     trainer = make_trainer("ltx-action", data, weights("ltx-action"), drop=0.5, rows=4)
     told: list[tuple[torch.Tensor, torch.Tensor]] = []
-    trainer.encoders["transformer"].register_forward_pre_hook(lambda _, args: told.append(args))
+    trainer.model.encoders["transformer"].register_forward_pre_hook(lambda _, args: told.append(args))
     for _ in range(6):
         trainer.train_step(1e-3)
     assert 0.2 < float(torch.cat([dropped for _, dropped in told]).float().mean()) < 0.8
@@ -140,7 +144,7 @@ def test_each_expert_is_trained_on_its_side_of_the_boundary(data: Path, weights:
     trainer = make_trainer(name, data, weights(name))
     like = torch.zeros(2000, 1, 1, 1, 1)
     random = torch.Generator().manual_seed(0)
-    high, low = (trainer.objective.draw_levels(place, like, random) for place in ("transformer", "transformer_2"))
+    high, low = (trainer.model.objective.draw_levels(place, like, random) for place in ("transformer", "transformer_2"))
     assert high.min() >= 0.9 and low.max() <= 0.9 and low.min() < 0.1
     assert [trainer.locate(step) for step in range(4)] == [
         ("transformer", 0),
@@ -159,45 +163,45 @@ def test_half_precision_trains_weights_in_float32(name: str, data: Path, weights
     trainer = make_trainer(name, data, weights(name), precision="bfloat16")
     assert np.isfinite(trainer.train_step(1e-3)) and np.isfinite(trainer.train_step(1e-3))
     assert {value.dtype for value in trainer.trained.values()} == {torch.float32}
-    frozen = {
-        value.dtype
-        for place in trainer.places
-        for value in getattr(trainer.objective.pipeline, place).parameters()
-        if not value.requires_grad
-    }
-    assert not trainer.recipe.lora or torch.bfloat16 in frozen
+    if trainer.recipe.lora:
+        denoiser = trainer.model.find_denoiser(trainer.model.places[0])
+        assert torch.bfloat16 in {value.dtype for value in denoiser.parameters() if not value.requires_grad}
+
+
+def list_networks(trainer: PostTrainer) -> dict[str, torch.nn.Module]:
+    """All networks of a model, also those that are not trained, by their place."""
+    if isinstance(trainer.model, TrainableNWM):
+        return {"cdit": trainer.model.network, "codec": trainer.model.codec}
+    components = trainer.model.objective.pipeline.components
+    return {place: network for place, network in components.items() if isinstance(network, torch.nn.Module)}
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_gradients_reach_what_is_trained_and_nothing_else(name: str, data: Path, weights: Any) -> None:
     trainer = make_trainer(name, data, weights(name), drop=0.0)
-    pipeline, lora = trainer.objective.pipeline, trainer.recipe.lora
-    before = {
-        f"{place}.{key}": value.detach().clone()
-        for place, network in pipeline.components.items()
-        if isinstance(network, torch.nn.Module)
-        for key, value in network.named_parameters()
-    }
+
+    def read_weights() -> dict[str, torch.Tensor]:
+        return {
+            f"{place}.{key}": value.detach().clone()
+            for place, network in list_networks(trainer).items()
+            for key, value in network.named_parameters()
+        }
+
+    before = read_weights()
     for _ in range(2 * trainer.steps_per_epoch):
         trainer.train_step(1e-2)
-    moved = set()
-    for place, network in pipeline.components.items():
-        if isinstance(network, torch.nn.Module):
-            for key, value in network.named_parameters():
-                if not torch.equal(value, before[f"{place}.{key}"]):
-                    moved.add(f"{place}.{key}")
+    moved = {key for key, value in read_weights().items() if not torch.equal(value, before[key])}
     expected = {key for key in trainer.trained if not key.startswith("encoder.")}
     assert moved <= expected and expected
-    assert all((".actions." in key) == bool(lora) for key in expected)
+    assert all((".actions." in key) == bool(trainer.recipe.lora) for key in expected)
     still = {key for key in expected - moved if not key.endswith(".bias")}  # a key's bias has no effect on attention
     assert len(still) <= 0.1 * len(expected), sorted(still)
-    for place in trainer.places:
-        encoder = trainer.encoders[place]
+    for encoder in getattr(trainer.model, "encoders", {}).values():
         assert all(torch.isfinite(value).all() for value in encoder.parameters())
         assert encoder.mlp[-1].weight.abs().max() > 1e-3
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", GENERATORS)
 def test_denoisers_are_called_as_world_models_call_them(
     name: str, data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,16 +212,14 @@ def test_denoisers_are_called_as_world_models_call_them(
     monkeypatch.setattr(
         Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
     )
+    monkeypatch.setattr("wiw.training.post_training.svd.LOG_GIVEN", (-4.0, 0.0))  # about the noise of the pipeline
     trainer = make_trainer(name, data, weights(name), checkpointing=False, rows=1, drop=0.0)
-    clip = trainer._clips[0]
-    trained = _record(
-        trainer, lambda: trainer._compute_losses(trainer.places[0], [clip], torch.Generator().manual_seed(0))
-    )
-    generator = trainer.objective.generator
+    clip, place, rows = trainer._clips[0], trainer.model.places[0], np.zeros(1, np.int64)
+    trained = _record(trainer, lambda: trainer._compute_losses(place, rows, torch.Generator().manual_seed(0)))
+    generator = trainer.model.objective.generator
     control = Control(clip.actions[1:], action.to_trajectory(clip.actions[1:]), action.to_viewpoints(clip.actions[1:]))
     generator.guidance = 1.0
-    observed = load_clips([clip], generator.size, np.arange(5)).frames[0, :, 0]
-    image = np.asarray(to_image(observed))[None]
+    image = load_clips([clip], generator.size).frames[:, 0].numpy()
     with torch.no_grad():
         inferred = _record(trainer, lambda: generator.make_clips(image, [control], np.zeros(1, np.uint64)))
     assert trained.keys() | {"attention_kwargs"} == inferred.keys() | {"attention_kwargs"}
@@ -234,7 +236,7 @@ def test_denoisers_are_called_as_world_models_call_them(
 def _record(trainer: PostTrainer, call: Any) -> dict[str, Any]:
     """The arguments of the first call of a denoiser."""
     calls: list[dict[str, Any]] = []
-    denoiser = getattr(trainer.objective.pipeline, trainer.places[0])
+    denoiser = trainer.model.find_denoiser(trainer.model.places[0])
 
     def note(_: Any, args: Any, kwargs: Any) -> None:
         positional = dict(zip(("sample", "timestep"), args, strict=False))
@@ -292,7 +294,7 @@ def _predict_perfectly(name: str, latents: torch.Tensor) -> Any:
     return predict
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", GENERATORS)
 def test_what_has_no_loss_in_training_generates_the_clip(
     name: str, data: Path, weights: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -304,14 +306,14 @@ def test_what_has_no_loss_in_training_generates_the_clip(
         Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
     )
     trainer = make_trainer(name, data, weights(name), checkpointing=False, drop=0.0)
-    objective, generator = trainer.objective, trainer.objective.generator
-    clip = load_clips([trainer._clips[0]], generator.size, np.arange(5)).frames
-    encoded = objective.encode(clip, torch.Generator().manual_seed(0))
-    for place in trainer.places:
+    objective, generator = trainer.model.objective, trainer.model.objective.generator
+    clip = load_clips([trainer._clips[0]], generator.size).pixels
+    encoded = objective.sample(objective.encode(clip), torch.Generator().manual_seed(0))
+    for place in trainer.model.places:
         monkeypatch.setattr(getattr(objective.pipeline, place), "forward", _predict_perfectly(name, encoded["latents"]))
     with torch.no_grad():
         losses = [
-            objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.places
+            objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.model.places
         ]
     assert float(torch.cat(losses).max()) < 1e-6
     plan = trainer._clips[0].actions[1:]
@@ -329,21 +331,22 @@ def test_what_has_no_loss_in_training_generates_the_clip(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_checkpoint_runs_as_a_world_model(name: str, data: Path, weights: Any, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    card = post_train(name, data, out, weights=weights(name), device="cpu", recipe=tiny_recipe(name), part="all")
-    assert card["steps"] == 2 * len(find_family(name)[0].denoisers) and np.isfinite(card["loss"])
+    out, family, recipe = tmp_path / "out", find_family(name), tiny_recipe(name)
+    card = post_train(name, data, out, weights=weights(name), device="cpu", recipe=recipe, part="all")
+    assert card["steps"] == (4 if name == "wan2.2-a14b-action" else 2) and np.isfinite(card["loss"])
     assert not (tmp_path / "out.checkpoint").exists()
-    options = {"guardrail": False} if name.startswith("cosmos") else {}
-    recipe = tiny_recipe(name)
+    options: dict[str, Any] = {"guardrail": False} if name.startswith("cosmos") else {}
+    if isinstance(family, VideoFamily):
+        options |= {"size": recipe.size, "frames": recipe.frames}
     model = wiw.world_model(
-        name, checkpoint=str(out), device="cpu", size=recipe.size, frames=recipe.frames, steps=2, **options
+        family.world_model, **{family.checkpoint_option: str(out)}, device="cpu", steps=2, **options
     )
     plan = action.pad([action.TURN_LEFT], recipe.frames - 1)
     views = action.to_trajectory(plan), action.to_viewpoints(plan)
     control = Control(plan, *views, ids=action.with_null(plan), length=1)
-    image = np.full((1, *recipe.size, 3), 90, np.uint8)
+    image = np.full((1, *model.accepts.size, 3), 90, np.uint8)
     frames = model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64))
-    assert frames.shape == (1, recipe.frames, *recipe.size, 3)
+    assert frames.shape == (1, recipe.frames, *model.accepts.size, 3)
     np.testing.assert_array_equal(frames[:, 0], image)
     assert json.loads((out / "training.json").read_text())["model"] == name
 
@@ -355,6 +358,8 @@ import sys, os, signal, torch
 sys.path[:0] = {path!r}
 torch.set_num_threads(1)
 from post_training_parts import tiny_recipe
+from wiw.training.post_training.nwm import TrainableNWM
+from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import post_train
 stop, number = {stop}, {number}
 def on_step(step, steps, loss):
@@ -481,9 +486,10 @@ def test_levels_of_a_shifted_schedule_stay_on_their_side() -> None:
 
 def test_shipped_recipes_are_those_of_the_world_models() -> None:
     for name in NAMES:
-        recipe, (model, _) = load_recipe(name), find_family(name)
-        assert recipe.frames == model.accepts.frames and recipe.size == (576, 1024)
-        assert recipe.drop == 0.1 and recipe.epochs == 1 and recipe.clips == 40_000
+        recipe, family = load_recipe(name), find_family(name)
+        assert recipe.size is None and recipe.epochs == 1 and recipe.clips == 40_000
+        if isinstance(family, VideoFamily):
+            assert recipe.frames == family.model.accepts.frames and recipe.drop == 0.1
 
 
 def test_rates_follow_the_schedule() -> None:
@@ -510,8 +516,8 @@ def test_recipes_that_make_no_sense_are_refused(options: dict[str, Any], said: s
 
 
 def test_what_cannot_be_trained_is_refused(data: Path, weights: Any, tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match="'nwm-action' is not trained here; expected one of"):
-        post_train("nwm-action", data, tmp_path / "out")
+    with pytest.raises(ArgumentError, match=r"'nwm' is not trained here; expected one of .*, nwm-action"):
+        post_train("nwm", data, tmp_path / "out")
     front = save_dataset(tmp_path / "front", projection="perspective")
     options: dict[str, Any] = {"weights": weights("ltx-action"), "device": "cpu", "part": "all"}
     recipe = tiny_recipe("ltx-action")
@@ -554,10 +560,10 @@ def test_the_command_trains(data: Path, weights: Any, tmp_path: Path, capsys: py
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["ltx-action"], "ltx-action trains on a navigation dataset"),
+        (["ltx-action"], "ltx-action trains on a dataset; give a folder"),
         (["ltx-action", "--minutes", "3"], "--minutes: ltx-action has no time limit"),
         (["ltx-action", "--scenes", "house.glb"], "--scenes: ltx-action does not train on scenes"),
-        (["warpnet", "--data", "data"], "--data: warpnet does not train on navigation datasets"),
+        (["warpnet", "--data", "data"], "--data: warpnet trains on other data"),
         (["ltx-action", "--data", "nowhere"], "meta.json is missing"),
         (["ltx-action", "--data", "nowhere", "--option", "lr=1"], "no recipe has 'lr'"),
     ],
@@ -569,3 +575,4 @@ def test_the_command_refuses(arguments: list[str], said: str, capsys: pytest.Cap
 
 def test_the_command_names_all_that_is_trained() -> None:
     assert set(VIDEO) == set(FAMILIES)
+    assert all(RUN_AS.get(name, name) == family.world_model for name, family in FAMILIES.items())

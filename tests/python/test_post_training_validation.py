@@ -31,13 +31,13 @@ from post_training_parts import make_trainer, save_dataset, save_stock, tiny_rec
 
 from wiw.training.held_out_clips import imagine_with
 from wiw.training.post_training import validation
-from wiw.training.post_training.families import FAMILIES
-from wiw.training.post_training.sampling import TrainingSampler
+from wiw.training.post_training.families import FAMILIES, VideoFamily
+from wiw.training.post_training.sampling import TrainingSampler, create_sampler
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.train import post_train, write_checkpoint
 from wiw.training.post_training.training_log import TrainingLog
 
-NAMES = sorted(FAMILIES)
+NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 SPLIT = {"held_out": 0.76, "validate_every": 2, "validate_clips": 3}
 """Share of the three scenes that leaves "house" for training."""
 pytestmark = pytest.mark.usefixtures("one_torch_thread")
@@ -72,7 +72,7 @@ def test_training_does_not_notice_that_it_is_sampled(name: str, data: Path, weig
     """The same weights to the last bit, and the same random state."""
     changes = {"epochs": 4, "rows": 4}
     plain, sampled = (make_trainer(name, data, weights(name), **changes) for _ in range(2))
-    sampler = TrainingSampler(sampled)
+    sampler = create_sampler(sampled)
     frames = plain.recipe.frames
     images = np.full((2, *sampled.recipe.size, 3), 90, np.uint8)
     plans, wanted = np.ones((2, frames - 1), np.int8), np.tile([1, frames - 1], (2, 1))
@@ -85,9 +85,9 @@ def test_training_does_not_notice_that_it_is_sampled(name: str, data: Path, weig
     assert torch.equal(torch.random.get_rng_state(), before)
     assert all(torch.equal(value, sampled.trained[key]) for key, value in plain.trained.items())
     modes = [
-        [layer.training for layer in getattr(trainer.objective.pipeline, place).modules()]
+        [layer.training for layer in getattr(trainer.model.objective.pipeline, place).modules()]
         for trainer in (plain, sampled)
-        for place in trainer.places
+        for place in trainer.model.places
     ]
     assert modes[: len(modes) // 2] == modes[len(modes) // 2 :]
 
@@ -104,7 +104,7 @@ def test_what_is_sampled_in_training_is_what_the_checkpoint_imagines(data: Path,
     images = np.random.default_rng(0).integers(0, 255, (2, *recipe.size, 3)).astype(np.uint8)
     plans, wanted = np.array([[1, 2, 1, 1], [3, 3, 1, 2]], np.int8), np.array([[1, 4], [2, 3]])
     asked = images, plans, np.arange(2, dtype=np.uint64), wanted
-    np.testing.assert_array_equal(TrainingSampler(trainer)(*asked), imagine_with(model)(*asked))
+    np.testing.assert_array_equal(create_sampler(trainer)(*asked), imagine_with(model)(*asked))
 
 
 def test_the_checkpoint_has_the_weights_that_were_best(train: Any, tmp_path: Path, monkeypatch: Any) -> None:
@@ -249,3 +249,26 @@ def test_trackers_that_are_not_there_are_refused(tmp_path: Path, monkeypatch: An
     monkeypatch.setattr("wiw.training.post_training.trackers.find_spec", lambda name: None if name == "wandb" else 1)
     with pytest.raises(DependencyError, match="needs wandb, which is not installed: pip install wandb"):
         open_tracker("wandb", "run", tmp_path, {})
+
+
+def test_validation_of_a_model_that_has_none_is_refused(data: Path, weights: Any, tmp_path: Path) -> None:
+    given = {"weights": weights("nwm-action"), "device": "cpu", "recipe": tiny_recipe("nwm-action")}
+    with pytest.raises(ArgumentError, match="nwm-action: only models that follow primitives in panoramas"):
+        post_train("nwm-action", data, tmp_path / "out", validation=data, **given)
+
+
+def test_averaged_weights_are_what_is_validated(data: Path, weights: Any) -> None:
+    name = "ltx-action"
+    trainer = make_trainer(name, data, weights(name), ema=0.5)
+    trainer.train_step(1e-1)
+    sampler = create_sampler(trainer)
+    shape = (1, *trainer.recipe.clip_size, 3)
+    asked = np.full(shape, 90, np.uint8), np.ones((1, 4), np.int8), np.zeros(1, np.uint64), np.array([[4]])
+    shown = sampler(*asked)
+    with trainer.use_averages():
+        averages = {key: value.detach().clone() for key, value in trainer.trained.items()}
+    with torch.no_grad():
+        for key, value in trainer.trained.items():
+            value.copy_(averages[key])
+            trainer.averages[key].copy_(averages[key])
+    np.testing.assert_array_equal(sampler(*asked), shown)

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
-from wiw.cli.train_video import VIDEO, TrackerName, VideoName, train_video
+from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, train_video
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
@@ -27,14 +27,14 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "plays": (ON_PLAYS, "does not train on plays"),
     "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
     "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
-    "cache": ((*ON_SCENES, *ON_PLAYS), "caches no training data"),
+    "cache": ((*ON_SCENES, *ON_PLAYS, *VIDEO), "caches no training data"),
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
-    "data": (VIDEO, "does not train on navigation datasets"),
+    "data": (VIDEO, "trains on other data"),
     "weights": (VIDEO, "begins with random weights"),
     "recipe": (VIDEO, "reads no recipe"),
     "option": (VIDEO, "reads no recipe"),
     "device": (VIDEO, "trains on the CPU"),
-    "part": (VIDEO, "does not train on navigation datasets"),
+    "part": (VIDEO, "trains on other data"),
     "validation": (VIDEO, "is evaluated on --val, if at all"),
     "decisions": (VIDEO, "is evaluated on --val, if at all"),
     "tracker": (VIDEO, "reports to no tracker"),
@@ -81,8 +81,9 @@ def train(
     simulated play at the tables of the manipulation tasks, and on demonstrations if there are any.
     diffuser: the 3D diffusion policy of manipulation. Trained on demonstrations.
     svd-action, ltx-action, wan2.1-action, wan2.2-5b-action, wan2.2-a14b-action, cosmos-predict2-action: pretrained
-    video generators, post-trained to follow actions of navigation. Trained on a dataset of `wiw collect navigation`, on
-    a GPU; docs/post-training.md explains recipes and needs.
+    video generators, post-trained to follow actions of navigation or poses of a gripper. Trained on a dataset of `wiw
+    collect navigation` or `wiw collect manipulation`, on a GPU; docs/post-training.md explains recipes and needs.
+    nwm-action: Navigation World Models, post-trained on front views of a navigation dataset.
 
     $ wiw train recogniser --out recogniser.safetensors
     $ wiw train recogniser --scenes house.glb --val other.glb --categories chair bed --out house.safetensors
@@ -96,6 +97,8 @@ def train(
     $ wiw train ltx-action --data data --out runs/ltx
     $ wiw train wan2.1-action --data data --weights /models/wan2.1 --option clips=1600 --option lora=16 --out runs/wan
     $ wiw run imagenav --world-model ltx-action --world-model-option checkpoint=runs/ltx
+    $ wiw train nwm-action --data data --out runs/nwm
+    $ wiw train svd-action --data demos --out runs/svd-arm
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
     it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, diffuser takes
@@ -113,15 +116,15 @@ def train(
         what: recogniser, warpnet, perception, armnet, diffuser or a video model.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new folder. Default:
             WHAT.
-        data: Dataset of `wiw collect navigation`, of panoramas, for video models.
+        data: Dataset for video models: a folder of `wiw collect navigation`, or of `wiw collect manipulation`.
         weights: Pretrained weights that a video model begins with: a folder as save_pretrained writes it, or a name on
             the Hugging Face hub. Default: those of the world model.
         recipe: YAML file with numbers of a video model's recipe, on top of the shipped ones.
         option: Number of a video model's recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
             `wiw.training.post_training.recipe.PostTrainingRecipe`.
         device: Of torch, for video models. Default: the GPU if there is one.
-        part: Part of the dataset for video models: train leaves out one in twenty scenes for validation. Default:
-            train.
+        part: Part of the dataset for video models: train leaves out one in twenty scenes, or demonstrations, for
+            validation. Default: train.
         validation: Another dataset of `wiw collect navigation`, of other scenes, on which a video model is validated.
             Default: the scenes that --part train leaves out.
         decisions: File of `wiw collect decisions`, by which validation also measures how well a video model's order of
@@ -142,7 +145,8 @@ def train(
         plays: Simulated plays of armnet, of eight gripper poses each. Default: 2000.
         seed: Seed of the training data and of the weights.
         workers: Processes that prepare training data from scenes or plays. Default: 2.
-        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks.
+        cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks. Of clips as
+            a video model's frozen networks encode them, for later epochs and other trainings. Default: none.
     """
     from wiw.scenes.store import folder
 
@@ -161,7 +165,7 @@ def train(
     if what in VIDEO:
         _require_torch(what)
         numbers = _drop_none({"epochs": epochs, "seed": seed or None})
-        given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train"}
+        given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
         given |= {"validation": validation, "decisions": decisions, "tracker": tracker}
         return train_video(what, out or Path(what), data, recipe, option, numbers, given)
     out = out or Path(f"{what}.safetensors")
@@ -225,7 +229,7 @@ def _require_torch(what: str) -> None:
         from wiw.registry import WORLD_MODELS
         from wiw.world_models import devices
 
-        devices.require(WORLD_MODELS.find(what).requires)
+        devices.require(WORLD_MODELS.find(RUN_AS.get(what, what)).requires)
 
 
 def _train_recogniser(

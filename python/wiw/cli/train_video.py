@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw train NAME-action`: post-training of video generators."""
+"""`wiw train NAME-action`: post-training of video generators and of NWM."""
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -19,10 +20,13 @@ VideoName = Literal[
     "wan2.2-5b-action",
     "wan2.2-a14b-action",
     "cosmos-predict2-action",
+    "nwm-action",
 ]
 TrackerName = Literal["trackio", "wandb", "tensorboard"]
 VIDEO: tuple[str, ...] = get_args(VideoName)
-"""World models that are video generators trained to follow actions."""
+"""Pretrained models that are trained to follow actions."""
+RUN_AS: Mapping[str, str] = {"nwm-action": "nwm"}
+"""World models that have another name than they are trained by."""
 LINE_SECONDS = 60.0
 """Time between two lines of progress where the output is no terminal."""
 
@@ -36,16 +40,17 @@ def train_video(
     numbers: Mapping[str, Any],
     weights: Mapping[str, Any],
 ) -> int:
-    """Post-train a video generator and print where its checkpoint is.
+    """Post-train a model and print where its checkpoint is.
 
     Args:
-        name: of the world model.
+        name: of the model.
         out: folder of the checkpoint.
         data: folder of the dataset.
         recipe: YAML file on top of the shipped recipe.
         pairs: KEY=VALUE of the recipe, on top of both.
         numbers: of the recipe that have flags of their own.
-        weights: which weights of the stock generator, on which device; part of the dataset; what it is validated on.
+        weights: which pretrained weights, on which device; part of the data; what it is validated on; folder of encoded
+            clips.
 
     Raises:
         ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.
@@ -57,7 +62,8 @@ def train_video(
 
     if data is None:
         raise ArgumentError(
-            f"{name} trains on a navigation dataset; give a folder of `wiw collect navigation` by --data"
+            f"{name} trains on a dataset; give a folder of `wiw collect navigation` or `wiw collect manipulation` by "
+            "--data"
         )
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
     chosen = load_recipe(name, recipe, options)
@@ -74,17 +80,16 @@ def train_video(
         print(f"best        step {card['steps']:,}: {describe_validation(card['validation'])}")
     print(f"log         {out}.log")
     print(f"checkpoint  {out}")
-    shown = " ".join(f"--world-model-option {pair}" for pair in (f"checkpoint={out}", *_list_shape(name, card)))
-    print(f"run it:     wiw run imagenav --world-model {name} {shown}")
+    print(f"run it:     {_write_command(out, card['run'])}")
     return 0
 
 
-def _list_shape(name: str, card: Mapping[str, Any]) -> list[str]:
-    """Return size and frames of the clips as options of the world model, where they are not its own."""
-    from wiw.training.post_training.recipe import load_recipe
-
-    usual = load_recipe(name).describe()
-    return [f"'{key}={card['recipe'][key]}'" for key in ("size", "frames") if card["recipe"][key] != usual[key]]
+def _write_command(out: Path, run: Mapping[str, Any]) -> str:
+    """Return the command that runs a checkpoint."""
+    options = {run["checkpoint"]: out, **run["options"]}
+    pairs = [shlex.quote(f"{key}={value}") for key, value in options.items()]
+    shown = " ".join(f"--world-model-option {pair}" for pair in pairs)
+    return f"wiw run {run['task']} --world-model {run['world_model']} {shown}"
 
 
 class _Progress:

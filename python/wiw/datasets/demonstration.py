@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,17 @@ from wiw.errors import FileError
 
 DEPTH_UNITS = 5000
 """A metre."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Facts about a demonstration that are known without its pictures."""
+
+    task: str
+    seed: int
+    """Of the table."""
+    ended: NDArray[np.bool_]
+    """bool [T]: whether an action ends in this frame."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,15 @@ class Demonstration:
         Raises:
             FileError: one of them is damaged.
         """
-        return decode_pictures(self.encoded_images, cv2.IMREAD_COLOR)[..., ::-1]
+        return self.decode(range(len(self.encoded_images)))
+
+    def decode(self, frames: Iterable[int]) -> NDArray[np.uint8]:
+        """Return the front views in some frames, uint8 [T, H, W, 3].
+
+        Raises:
+            FileError: one of them is damaged.
+        """
+        return decode_pictures([self.encoded_images[frame] for frame in frames], cv2.IMREAD_COLOR)[..., ::-1]
 
     @cached_property
     def depths(self) -> NDArray[np.float32] | None:

@@ -13,6 +13,7 @@ import json
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration
+from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration, Outline
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.datasets.shards import Shard, require_pyarrow
 from wiw.errors import ArgumentError, FileError
@@ -87,6 +88,21 @@ class Demonstrations(Sequence[Demonstration]):
 
     def __iter__(self) -> Iterator[Demonstration]:
         return (shard[index] for shard in self.files for index in range(len(shard)))
+
+    def read_outlines(self) -> list[Outline]:
+        """Return the outline of each demonstration; pictures are not read.
+
+        Raises:
+            FileError: a file is damaged.
+        """
+        return [shard.read_outline(index) for shard in self.files for index in range(len(shard))]
+
+    def digest(self) -> str:
+        """Return the SHA-256 of the collection's options, of which each demonstration is a function, and its files'
+        sizes.
+        """
+        sizes = {shard.path.name: shard.path.stat().st_size for shard in self.files}
+        return sha256(json.dumps([self.config, sizes], sort_keys=True).encode()).hexdigest()
 
     @property
     def failed(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from wiw.datasets import parquet_files
-from wiw.datasets.demonstration import Demonstration
+from wiw.datasets.demonstration import Demonstration, Outline
 from wiw.datasets.parquet_files import RowGroupFile, build_schema, image_type, image_values, write_row_groups
 
 FORMAT = 1
@@ -81,6 +81,18 @@ class Shard(RowGroupFile):
         rows = self.read(index).to_pydict()
         try:
             return _demonstration(rows)
+        except (LookupError, TypeError, ValueError) as error:
+            raise self.build_damage_error(error) from error
+
+    def read_outline(self, index: int) -> Outline:
+        """Return when the actions of a demonstration end, and at which table; its pictures are not read.
+
+        Raises:
+            FileError: the file is damaged.
+        """
+        rows = self.read(index, ["task", "seed", "ended"]).to_pydict()
+        try:
+            return Outline(rows["task"][0], rows["seed"][0], np.array(rows["ended"], np.bool_))
         except (LookupError, TypeError, ValueError) as error:
             raise self.build_damage_error(error) from error
 

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from wiw.training.post_training.noise import draw_logit_normal
-from wiw.training.post_training.objective import Encoded, FlowObjective
+from wiw.training.post_training.objective import FlowObjective, Sampled
 from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.trainable import Encoded
 from wiw.world_models.video.model import VideoModel
 
 GIVEN_SIGMA = 1e-4
@@ -38,20 +39,27 @@ class CosmosObjective(FlowObjective):
         self._fps = self.read_arguments(1)["fps"]
 
     @torch.no_grad()
-    def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
+    def encode(self, clips: Tensor) -> Encoded:
         """Return the latents, and that of each first frame, shown for the whole clip as the pipeline does."""
         still = clips[:, :, :1].expand(-1, -1, clips.shape[2], -1, -1)
-        return {
-            "latents": self._encode(clips, random),
-            "first": self._encode(still, random)[:, :, :1],
-            "size": torch.tensor(clips.shape[-2:]),
-        }
+        first = {name: value[:, :, :1] for name, value in self.encode_distribution(still, "first").items()}
+        return {**self.encode_distribution(clips, "latents"), **first}
+
+    def sample(self, encoded: Encoded, random: torch.Generator) -> Sampled:
+        """Draw both from their distributions, normalised."""
+        config, scale = self.pipeline.vae.config, self.pipeline.scheduler.config.sigma_data
+        drawn = {name: self.draw_latents(encoded, name, random) for name in ("latents", "first")}
+        mean, std = (
+            torch.tensor(each, device=self.device).view(1, -1, 1, 1, 1)
+            for each in (config.latents_mean, config.latents_std)
+        )
+        return {name: (latents - mean) / std * scale for name, latents in drawn.items()}
 
     def draw_levels(self, place: str, latents: Tensor, random: torch.Generator) -> Tensor:
         """Draw logit-normal levels."""
         return draw_logit_normal(len(latents), random)
 
-    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, encoded: Encoded) -> Tensor:
+    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, sampled: Sampled) -> Tensor:
         """Call the transformer with latents [B, C, L, h, w], a time per latent frame, and which frame is given."""
         rows, _, frames, height, width = noisy.shape
         times = levels[:, None, None, None, None].repeat(1, 1, frames, 1, 1)
@@ -64,17 +72,6 @@ class CosmosObjective(FlowObjective):
             encoder_hidden_states=self._words.expand(rows, -1, -1),
             fps=self._fps,
             condition_mask=given.to(denoiser.dtype),
-            padding_mask=noisy.new_zeros(1, 1, *encoded["size"].tolist(), dtype=denoiser.dtype),
+            padding_mask=noisy.new_zeros(1, 1, *self.generator.size, dtype=denoiser.dtype),
             return_dict=False,
         )[0]
-
-    def _encode(self, clips: Tensor, random: torch.Generator) -> Tensor:
-        """Return normalised latents, float32, drawn from the autoencoder's distribution."""
-        vae = self.pipeline.vae
-        found = vae.encode(clips.to(vae.dtype)).latent_dist
-        latents = found.mean.float() + found.std.float() * self.draw_normal(found.mean, random)
-        mean, std = (
-            torch.tensor(each, device=latents.device).view(1, -1, 1, 1, 1)
-            for each in (vae.config.latents_mean, vae.config.latents_std)
-        )
-        return (latents - mean) / std * self.pipeline.scheduler.config.sigma_data

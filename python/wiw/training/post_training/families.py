@@ -1,36 +1,183 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The action-conditioned models that are trained here, each with its loss, and the generators they begin with."""
+"""The models that are trained here: what corpora they learn from, and how each is made ready for training."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+from wiw.action import PoseGrid
 from wiw.errors import ArgumentError
 from wiw.suggestions import did_you_mean
+from wiw.training.post_training.conditioned_generator import ConditionedGenerator, build_config, identify_weights
+from wiw.training.post_training.corpora import Corpus, NavigationCorpus
 from wiw.training.post_training.cosmos import CosmosObjective
 from wiw.training.post_training.ltx import LTXObjective
+from wiw.training.post_training.nwm import TrainableNWM
 from wiw.training.post_training.objective import Objective
 from wiw.training.post_training.recipe import PostTrainingRecipe
 from wiw.training.post_training.svd import SVDObjective
+from wiw.training.post_training.trainable import TrainableModel
+from wiw.training.post_training.trainer import seed_weights
 from wiw.training.post_training.wan import WanObjective
+from wiw.types import GRIPPER_POSES
+from wiw.world_models import devices
+from wiw.world_models.base import Requirements
+from wiw.world_models.nwm.model import NWM
 from wiw.world_models.video.actions import variants
-from wiw.world_models.video.actions.model import ActionConditioned
+from wiw.world_models.video.actions.model import PANORAMA, ActionConditioned
 from wiw.world_models.video.model import VideoModel
+from wiw.world_models.video.weights import is_path
 
-FAMILIES: Mapping[str, tuple[type[ActionConditioned], type[Objective]]] = {
-    "svd-action": (variants.SVDAction, SVDObjective),
-    "ltx-action": (variants.LTXAction, LTXObjective),
-    "wan2.1-action": (variants.Wan21Action, WanObjective),
-    "wan2.2-5b-action": (variants.Wan22SmallAction, WanObjective),
-    "wan2.2-a14b-action": (variants.Wan22Action, WanObjective),
-    "cosmos-predict2-action": (variants.CosmosPredict2Action, CosmosObjective),
+
+@dataclass(frozen=True)
+class PretrainedWeights:
+    """Where a training's first weights come from, and on which device it runs."""
+
+    weights: str | None = None
+    """A folder or a name on the hub; the model's usual ones if None."""
+    revision: str | None = None
+    variant: str | None = None
+    """Of the weight files, such as "fp16"."""
+    device: str | None = None
+
+    def resolve_folder(self) -> str | None:
+        """Return a folder with its whole path, which the checkpoint names; a name on the hub as it is."""
+        if self.weights is None:
+            return None
+        folder = Path(self.weights).expanduser()
+        return str(folder.resolve()) if folder.is_dir() or is_path(self.weights) else self.weights
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A model ready for training."""
+
+    model: TrainableModel
+    recipe: PostTrainingRecipe
+    """With frames and size as the model takes them."""
+    identity: dict[str, str]
+    """What identifies its first weights."""
+
+
+class Family(ABC):
+    """A model that is trained here."""
+
+    world_model: str
+    """Name of the world model that runs what is trained."""
+    checkpoint_option: str
+    """Option of that world model which names the folder."""
+
+    @abstractmethod
+    def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
+        """Return a corpus in the views that the model sees, and the recipe with the size of its frames there.
+
+        Raises:
+            ArgumentError: the model cannot be trained on such a corpus; says which it can be trained on.
+        """
+
+    def list_options(self, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
+        """Return options that the world model has to be run with, where they are not its own."""
+        return {}
+
+    @abstractmethod
+    def load(self, corpus: Corpus, recipe: PostTrainingRecipe, source: PretrainedWeights) -> Loaded:
+        """Load the pretrained weights and make what is trained ready.
+
+        Raises:
+            WeightsError, DependencyError, DeviceMemoryError: see the world model.
+            ArgumentError: a recipe that the model cannot have.
+        """
+
+
+@dataclass(frozen=True)
+class VideoFamily(Family):
+    """A stock video generator that is trained to follow actions: primitives in panoramas, or poses in front views."""
+
+    world_model: str
+    model: type[ActionConditioned]
+    objective: type[Objective]
+    checkpoint_option = "checkpoint"
+
+    def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
+        """Return both as they are, but for the size where the recipe leaves it open."""
+        if corpus.space != GRIPPER_POSES and corpus.view != "panorama":
+            raise ArgumentError(
+                f"{self.world_model}: models that follow primitives see panoramas, but this dataset has {corpus.view} "
+                "views; collect without --perspective"
+            )
+        if corpus.space == GRIPPER_POSES and recipe.mirror:
+            raise ArgumentError("recipe: mirror: the mirror image of an arm is another arm; expected 0 for poses")
+        return corpus, replace(recipe, size=recipe.size or self._find_size(corpus))
+
+    def list_options(self, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
+        """Return size and frames of the clips."""
+        trained = {"size": list(recipe.size or ()), "frames": recipe.frames}
+        usual = {"size": list(self._find_size(corpus)), "frames": self.model.accepts.frames}
+        return {name: value for name, value in trained.items() if value != usual[name]}
+
+    def _find_size(self, corpus: Corpus) -> tuple[int, int]:
+        return self.model.front_size if corpus.space == GRIPPER_POSES else PANORAMA
+
+    def load(self, corpus: Corpus, recipe: PostTrainingRecipe, source: PretrainedWeights) -> Loaded:
+        """Load the generator and add encoders of the corpus's actions; see `Family.load`."""
+        devices.require(Requirements(("peft",), "diffusers"))
+        generator = load_generator(self.model, recipe, source)
+        recipe = replace(recipe, frames=generator.frames, size=generator.size)
+        objective = self.objective(generator, recipe)
+        with seed_weights(recipe, objective.device):
+            config = build_config(self.model.base, self.model.denoisers[0], generator, **describe_actions(corpus))
+            model = ConditionedGenerator(objective, config, self.model.denoisers)
+        return Loaded(model, recipe, identify_weights(generator))
+
+
+class NWMFamily(Family):
+    """Navigation World Models, which follows motions between front views by itself."""
+
+    world_model = "nwm"
+    checkpoint_option = "weights"
+
+    def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
+        """Return front views; they are cut out of panoramas as the loop does."""
+        if not isinstance(corpus, NavigationCorpus):
+            raise ArgumentError(
+                "nwm-action follows an agent that moves, but in this dataset a gripper does; expected a dataset of "
+                "`wiw collect navigation`, or a video model (NAME-action)"
+            )
+        size = recipe.size or NWM.accepts.size
+        return corpus.show_front(size), replace(recipe, size=size)
+
+    def load(self, corpus: Corpus, recipe: PostTrainingRecipe, source: PretrainedWeights) -> Loaded:
+        """Load the CDiT and its codec; see `Family.load`."""
+        from wiw.world_models.nwm import weights
+
+        devices.require(NWM.requires)
+        if source.variant is not None:
+            raise ArgumentError(f"nwm-action: its weights have no variants, got variant={source.variant}")
+        path = weights.fetch(source.resolve_folder() or NWM.weights, NWM.file, source.revision)
+        network, codec = weights.load_cdit(path), weights.load_codec(weights.codec_beside(path), None)
+        identity = {"digest": weights.digest(network, codec)}
+        model = TrainableNWM(network, codec, recipe, NWM.spacing, devices.device(source.device))
+        return Loaded(model, recipe, identity)
+
+
+FAMILIES: Mapping[str, Family] = {
+    "svd-action": VideoFamily("svd-action", variants.SVDAction, SVDObjective),
+    "ltx-action": VideoFamily("ltx-action", variants.LTXAction, LTXObjective),
+    "wan2.1-action": VideoFamily("wan2.1-action", variants.Wan21Action, WanObjective),
+    "wan2.2-5b-action": VideoFamily("wan2.2-5b-action", variants.Wan22SmallAction, WanObjective),
+    "wan2.2-a14b-action": VideoFamily("wan2.2-a14b-action", variants.Wan22Action, WanObjective),
+    "cosmos-predict2-action": VideoFamily("cosmos-predict2-action", variants.CosmosPredict2Action, CosmosObjective),
+    "nwm-action": NWMFamily(),
 }
-"""World model and loss, by the model's name."""
+"""What is trained here, by its name on the command line."""
 
 
-def find_family(name: str) -> tuple[type[ActionConditioned], type[Objective]]:
-    """Return world model and loss of an action-conditioned model.
+def find_family(name: str) -> Family:
+    """Return a model that is trained here.
 
     Raises:
         ArgumentError: it is not trained here.
@@ -43,16 +190,13 @@ def find_family(name: str) -> tuple[type[ActionConditioned], type[Objective]]:
     return FAMILIES[name]
 
 
-def load_generator(
-    model: type[ActionConditioned], recipe: PostTrainingRecipe, weights: str | None, options: Mapping[str, Any]
-) -> VideoModel:
+def load_generator(model: type[ActionConditioned], recipe: PostTrainingRecipe, source: PretrainedWeights) -> VideoModel:
     """Load the stock generator, its frozen networks in the recipe's precision and what is trained whole in float32.
 
     Args:
         model: the world model that is to be trained.
-        recipe: of the training.
-        weights: of the generator, a folder or a name on the hub; the generator's usual ones if None.
-        options: others of the generator, such as device and revision.
+        recipe: of the training, with a size.
+        source: of the generator's weights.
 
     Raises:
         WeightsError, DependencyError, DeviceMemoryError, ArgumentError: see `VideoModel`.
@@ -66,7 +210,17 @@ def load_generator(
     }
     generator: type[VideoModel] = type(stock.__name__, (stock,), settings)
     given: dict[str, Any] = {"frames": recipe.frames, "size": recipe.size, "precision": recipe.precision}
-    given = {**model.defaults, **given, **options}
-    if weights is not None:
-        given["weights"] = weights
+    given = {**model.defaults, **given}
+    given |= {"revision": source.revision, "variant": source.variant, "device": source.device}
+    if model is variants.CosmosPredict2Action:
+        given["guardrail"] = False  # its filter has nothing to look at where nothing is shown
+    if source.weights is not None:
+        given["weights"] = source.resolve_folder()
     return generator(**given)
+
+
+def describe_actions(corpus: Corpus) -> dict[str, Any]:
+    """Return the fields of `ActionConfig` about a corpus's actions; poses lie in the workspace of `PoseGrid`."""
+    if corpus.space == GRIPPER_POSES:
+        return {"kind": GRIPPER_POSES, "low": PoseGrid.low, "high": PoseGrid.high}
+    return {}

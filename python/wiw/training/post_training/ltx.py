@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from wiw.training.post_training.noise import draw_token_shifted
-from wiw.training.post_training.objective import Encoded, FlowObjective, require
+from wiw.training.post_training.objective import FlowObjective, Sampled, require
 from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.trainable import Encoded
 from wiw.world_models.video.model import VideoModel
 
 FRAME_RATE = 25
@@ -37,15 +38,23 @@ class LTXObjective(FlowObjective):
         self.release_text_encoder()
 
     @torch.no_grad()
-    def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
+    def encode(self, clips: Tensor) -> Encoded:
         """Return the latents, and those of the first frames alone, as the pipeline encodes an observation."""
-        return {"latents": self._encode(clips, random), "first": self._encode(clips[:, :, :1], random)}
+        first = self.encode_distribution(clips[:, :, :1], "first")
+        return {**self.encode_distribution(clips, "latents"), **first}
+
+    def sample(self, encoded: Encoded, random: torch.Generator) -> Sampled:
+        """Draw both from their distributions, normalised."""
+        vae = self.pipeline.vae
+        drawn = {name: self.draw_latents(encoded, name, random) for name in ("latents", "first")}
+        mean, std = (each.view(1, -1, 1, 1, 1).to(drawn["first"]) for each in (vae.latents_mean, vae.latents_std))
+        return {name: (latents - mean) / std for name, latents in drawn.items()}
 
     def draw_levels(self, place: str, latents: Tensor, random: torch.Generator) -> Tensor:
         """Draw logit-normal levels, the noisier the more tokens there are."""
         return draw_token_shifted(len(latents), latents[0, 0].numel(), random)
 
-    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, encoded: Encoded) -> Tensor:
+    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, sampled: Sampled) -> Tensor:
         """Call the transformer with tokens [B, L h w, C]."""
         rows, _, frames, height, width = noisy.shape
         times = levels[:, None].expand(rows, frames * height * width).clone()
@@ -66,11 +75,3 @@ class LTXObjective(FlowObjective):
             return_dict=False,
         )[0]
         return tokens.transpose(1, 2).unflatten(2, (frames, height, width))
-
-    def _encode(self, frames: Tensor, random: torch.Generator) -> Tensor:
-        """Return normalised latents, float32, drawn from the autoencoder's distribution."""
-        vae = self.pipeline.vae
-        found = vae.encode(frames.to(vae.dtype)).latent_dist
-        latents = found.mean.float() + found.std.float() * self.draw_normal(found.mean, random)
-        mean, std = (each.view(1, -1, 1, 1, 1).to(latents) for each in (vae.latents_mean, vae.latents_std))
-        return (latents - mean) / std

@@ -19,10 +19,11 @@ from torch import Tensor
 
 from wiw.errors import ArgumentError
 from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.trainable import Encoded
 from wiw.types import Control
 from wiw.world_models.video.model import VideoModel
 
-Encoded = Mapping[str, Tensor]
+Sampled = Mapping[str, Tensor]
 """Clips as the denoiser sees them: "latents" [B, C, L, h, w] and what is given to it beside the noisy clip."""
 
 
@@ -40,11 +41,15 @@ class Objective(ABC):
         self.device = torch.device(str(generator.device))
 
     @abstractmethod
-    def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
-        """Return clips, float32 [B, 3, N, H, W] from -1 to 1, as the denoiser sees them; without gradients."""
+    def encode(self, clips: Tensor) -> Encoded:
+        """Return what the frozen networks say of clips, float32 [B, 3, N, H, W] from -1 to 1; without gradients."""
 
     @abstractmethod
-    def compute_losses(self, place: str, encoded: Encoded, random: torch.Generator) -> Tensor:
+    def sample(self, encoded: Encoded, random: torch.Generator) -> Sampled:
+        """Return encoded clips as the denoiser sees them, with what is drawn anew each time; without gradients."""
+
+    @abstractmethod
+    def compute_losses(self, place: str, sampled: Sampled, random: torch.Generator) -> Tensor:
         """Return the loss of each clip, float32 [B], for the denoiser at this place in the pipeline.
 
         `random` is a generator on the CPU, so that draws are the same on all devices.
@@ -64,6 +69,17 @@ class Objective(ABC):
     def draw_normal(self, like: Tensor, random: torch.Generator) -> Tensor:
         """Return standard normal noise, float32, of the shape and on the device of `like`."""
         return torch.randn(like.shape, generator=random).to(like.device)
+
+    def draw_latents(self, encoded: Encoded, name: str, random: torch.Generator) -> Tensor:
+        """Draw latents, float32, from the autoencoder's distribution that `encode_distribution` returned."""
+        mean, std = encoded[f"{name}_mean"].float(), encoded[f"{name}_std"].float()
+        return mean + std * self.draw_normal(mean, random)
+
+    def encode_distribution(self, frames: Tensor, name: str) -> dict[str, Tensor]:
+        """Return mean and standard deviation of the latents of frames, in the autoencoder's precision."""
+        vae = self.pipeline.vae
+        found = vae.encode(frames.to(vae.dtype)).latent_dist
+        return {f"{name}_mean": found.mean, f"{name}_std": found.std}
 
     def read_arguments(self, images: int) -> dict[str, Any]:
         """Return what the world model hands its pipeline for so many rows without words."""
@@ -85,24 +101,24 @@ class FlowObjective(Objective):
         """Return noise levels, float32 [B] from 0 to 1, for latents [B, C, L, h, w]."""
 
     @abstractmethod
-    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, encoded: Encoded) -> Tensor:
+    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, sampled: Sampled) -> Tensor:
         """Return what the denoiser predicts, [B, C, L, h, w]."""
 
     def weigh(self, levels: Tensor) -> Tensor:
         """Return how much each level counts, [B]: alike unless a subclass says otherwise."""
         return torch.ones_like(levels)
 
-    def compute_losses(self, place: str, encoded: Encoded, random: torch.Generator) -> Tensor:
+    def compute_losses(self, place: str, sampled: Sampled, random: torch.Generator) -> Tensor:
         """Return the mean squared error of the predicted flow, weighted, for each clip."""
-        latents = encoded["latents"]
+        latents = sampled["latents"]
         levels = self.draw_levels(place, latents, random).to(latents.device)
         noise = self.draw_normal(latents, random)
         share = levels[:, None, None, None, None]
         noisy = torch.lerp(latents, noise, share)
         if self.keeps_first:
-            noisy = torch.cat([encoded["first"], noisy[:, :, 1:]], dim=2)
+            noisy = torch.cat([sampled["first"], noisy[:, :, 1:]], dim=2)
         with self.autocast():
-            predicted = self.predict(getattr(self.pipeline, place), noisy, levels, encoded)
+            predicted = self.predict(getattr(self.pipeline, place), noisy, levels, sampled)
         errors = (predicted.float() - (noise - latents)).square()
         if self.keeps_first:
             errors = errors[:, :, 1:]

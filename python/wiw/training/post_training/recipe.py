@@ -16,6 +16,7 @@ from wiw.errors import ArgumentError, FileError
 FOLDER = Path(__file__).parents[2] / "configs" / "post-training"
 Schedule = Literal["constant", "linear", "cosine"]
 Precision = Literal["bfloat16", "float32"]
+OptimizerName = Literal["adamw", "adamw8bit"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,8 +29,8 @@ class PostTrainingRecipe:
 
     frames: int
     """Frames of a clip."""
-    size: tuple[int, int] = (576, 1024)
-    """Height and width in pixels that clips are brought to."""
+    size: tuple[int, int] | None = None
+    """Height and width in pixels that clips are brought to; those of the world model if None."""
     rate: float
     """Peak learning rate."""
     schedule: Schedule = "constant"
@@ -48,9 +49,17 @@ class PostTrainingRecipe:
     """How far noise levels are moved towards noise, where the model's schedule has a shift."""
     drop: float = 0.1
     """Share of clips whose actions are replaced by the null token."""
+    mirror: float = 0.0
+    """Share of clips whose left and right are exchanged, in frames and primitives."""
+    still: float = 0.0
+    """NWM: share of clips whose context is its last frame, repeated, as at the first decision of an episode."""
     clip_norm: float = 1.0
     """Largest norm of the gradient."""
     weight_decay: float = 0.01
+    optimizer: OptimizerName = "adamw"
+    """AdamW; "adamw8bit" keeps its moments in 8 bits, 2 bytes a parameter instead of 8."""
+    ema: float = 0.0
+    """Decay a step of averaged weights, which the checkpoint then has; 0 averages nothing."""
     precision: Precision = "bfloat16"
     """Precision of matrix products and of frozen weights; trained weights are float32."""
     checkpointing: bool = True
@@ -64,7 +73,8 @@ class PostTrainingRecipe:
     """Held-out clips of a validation."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "size", tuple(self.size))
+        if self.size is not None:
+            object.__setattr__(self, "size", tuple(self.size))
         counts = {"clips": self.clips or 1, "epochs": self.epochs, "batch": self.batch, "rows": self.rows}
         counts |= {"validate_every": self.validate_every or 1, "validate_clips": self.validate_clips}
         for name, value in {**counts, "frames": self.frames - 1}.items():
@@ -73,15 +83,21 @@ class PostTrainingRecipe:
         for name in ("rate", "clip_norm", "shift"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
-        for name in ("warmup", "drop", "held_out"):
+        for name in ("warmup", "drop", "mirror", "still", "ema", "held_out"):
             if not 0 <= getattr(self, name) < 1:
                 raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
         if self.lora < 0 or self.weight_decay < 0 or not 0 <= self.seed < 2**63:
             raise ArgumentError("recipe: expected lora and weight_decay of 0 or more, and a seed from 0 to 2**63 - 1")
-        if len(self.size) != 2 or min(self.size) < 8:
+        if self.size is not None and (len(self.size) != 2 or min(self.size) < 8):
             raise ArgumentError(f"recipe: size: expected height and width in pixels, got {self.size}")
         if self.batch % self.rows:
             raise ArgumentError(f"recipe: rows: expected a divisor of batch ({self.batch}), got {self.rows}")
+
+    @property
+    def clip_size(self) -> tuple[int, int]:
+        """Height and width of clips, once it is known which model they are for."""
+        assert self.size is not None, "the family fills it in"
+        return self.size
 
     def scale_rate(self, progress: float) -> float:
         """Return the factor of the learning rate after a share of the steps, 0 to 1."""
@@ -97,7 +113,7 @@ class PostTrainingRecipe:
 
     def describe(self) -> dict[str, Any]:
         """Return the recipe as JSON values."""
-        return {**asdict(self), "size": list(self.size)}
+        return {**asdict(self), "size": None if self.size is None else list(self.size)}
 
 
 def load_recipe(
@@ -156,13 +172,14 @@ def _fits(value: Any, kind: Any) -> bool:
         return isinstance(value, allowed) and (kind is bool or not isinstance(value, bool))
     if kind == int | None:
         return value is None or _fits(value, int)
-    if kind == tuple[int, int]:
-        return isinstance(value, list | tuple) and all(_fits(side, int) for side in value)
+    if kind == tuple[int, int] | None:
+        return value is None or (isinstance(value, list | tuple) and all(_fits(side, int) for side in value))
     return value in get_args(kind)
 
 
 def _describe(kind: Any) -> str:
-    names = {int: "a whole number", float: "a number", bool: "true or false", tuple[int, int]: "[height, width]"}
+    names: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false"}
+    names |= {tuple[int, int] | None: "[height, width] or null"}
     if kind in names:
         return names[kind]
     return "a whole number or null" if kind == int | None else f"one of {', '.join(get_args(kind))}"

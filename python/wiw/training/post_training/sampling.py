@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from copy import deepcopy
 
 import numpy as np
@@ -13,23 +13,46 @@ from numpy.typing import NDArray
 from torch import nn
 
 from wiw import action
+from wiw.errors import ArgumentError
 from wiw.training.held_out_clips import Frames, make_control
+from wiw.training.post_training.conditioned_generator import ConditionedGenerator
 from wiw.training.post_training.trainer import PostTrainer
 from wiw.world_models.video.actions.conditioning import ActionConditioning
 
 
-class TrainingSampler:
-    """Imagine frames with the networks of a trainer; see `wiw.training.held_out_clips.Imagine`.
+def create_sampler(trainer: PostTrainer) -> TrainingSampler:
+    """Return a sampler with the networks of a trainer.
 
-    Training goes on as if nothing had been imagined: modes, random states, the scheduler and where networks lie are as
-    before.
+    Raises:
+        ArgumentError: its model does not follow primitives.
+    """
+    model = trainer.model
+    if not isinstance(model, ConditionedGenerator) or model.action_ids is None:
+        raise ArgumentError(f"expected a video generator in training to follow primitives, got {type(model).__name__}")
+    return TrainingSampler(model, model.action_ids.cpu().numpy(), trainer.use_averages)
+
+
+class TrainingSampler:
+    """Imagine frames with networks in training; see `wiw.training.held_out_clips.Imagine`.
+
+    Training goes on as if nothing had been imagined: weights, modes, random states, the scheduler and where networks
+    lie are as before.
+
+    Args:
+        model: in training.
+        action_ids: int64 [A], the encoder's id of each primitive.
+        use_averages: a context in which the networks have their averaged weights.
     """
 
-    def __init__(self, trainer: PostTrainer) -> None:
-        self._trainer, self._generator = trainer, trainer.objective.generator
-        self._conditioning = ActionConditioning(
-            trainer.encoders, trainer.objective.pipeline, str(trainer.objective.device)
-        )
+    def __init__(
+        self,
+        model: ConditionedGenerator,
+        action_ids: NDArray[np.int64],
+        use_averages: Callable[[], AbstractContextManager[None]],
+    ) -> None:
+        self._objective, self._generator = model.objective, model.objective.generator
+        self._action_ids, self._use_averages = action_ids, use_averages
+        self._conditioning = ActionConditioning(model.encoders, model.objective.pipeline, str(model.device))
 
     def __call__(
         self, images: Frames, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
@@ -38,12 +61,10 @@ class TrainingSampler:
         length = self._generator.frames - 1
         controls = [make_control(plan, length, int(own.max())) for plan, own in zip(plans, wanted, strict=True)]
         clips = []
-        with self._evaluating(), torch.inference_mode():
+        with self._use_averages(), self._evaluating(), torch.inference_mode():
             for rows in self._generator.batches(len(images)):
-                actions = np.stack(
-                    [self._trainer.action_ids[action.with_null(each.actions)] for each in controls[rows]]
-                )
-                with self._trainer.objective.autocast(), self._conditioning.apply(actions):
+                actions = np.stack([self._action_ids[action.with_null(each.actions)] for each in controls[rows]])
+                with self._objective.autocast(), self._conditioning.apply(actions):
                     clips.append(self._generator.make_clips(images[rows], controls[rows], seeds[rows]))
         frames = np.rint(np.concatenate(clips) * 255).astype(np.uint8)
         return frames[np.arange(len(images))[:, None], wanted]
@@ -51,7 +72,7 @@ class TrainingSampler:
     @contextmanager
     def _evaluating(self) -> Iterator[None]:
         """Put all networks into evaluation mode, on the device, as long as the context lasts."""
-        pipeline, device = self._trainer.objective.pipeline, self._trainer.objective.device
+        pipeline, device = self._objective.pipeline, self._objective.device
         parts = [each for each in pipeline.components.values() if isinstance(each, nn.Module)]
         networks = [each for each in parts if next(each.parameters(), None) is not None]
         modes = {id(layer): layer.training for network in networks for layer in network.modules()}

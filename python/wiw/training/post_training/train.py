@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train a video generator to follow actions, on a navigation dataset, and write a checkpoint that world models load."""
+"""Train a pretrained model to follow actions, on a corpus, and write a checkpoint that world models load."""
 
 from __future__ import annotations
 
@@ -11,29 +11,28 @@ from pathlib import Path
 from typing import Any
 
 import wiw
-from wiw.datasets.navigation import NavigationData, Part
+from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
-from wiw.training.post_training.families import find_family, load_generator
+from wiw.training.post_training.corpora import Corpus, CorpusPart, NavigationCorpus, open_corpus
+from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
+from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
-from wiw.training.post_training.sampling import TrainingSampler
+from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.trackers import open_tracker
 from wiw.training.post_training.trainer import PostTrainer, arrange_clips
 from wiw.training.post_training.training_log import TrainingLog
 from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
 from wiw.training.trainer import run_training
+from wiw.types import GRIPPER_POSES, PRIMITIVES
 from wiw.world_models import devices
-from wiw.world_models.base import Requirements
 from wiw.world_models.video import loading
-from wiw.world_models.video.actions import checkpoint as action_checkpoint
-from wiw.world_models.video.actions.config import ActionConfig
-from wiw.world_models.video.actions.injection import embedding_width
-from wiw.world_models.video.model import VideoModel
-from wiw.world_models.video.weights import is_path
 
 LOG = "metrics.jsonl"
 """Loss of each step and what validations found, in `OUT.log`."""
+TASKS: Mapping[str, str] = {PRIMITIVES: "imagenav", GRIPPER_POSES: "manipulation"}
+"""A task for the actions of each space."""
 
 
 def post_train(
@@ -46,78 +45,76 @@ def post_train(
     variant: str | None = None,
     device: str | None = None,
     recipe: PostTrainingRecipe | None = None,
-    part: Part = "train",
+    part: CorpusPart = "train",
     validation: str | Path | None = None,
     decisions: str | Path | None = None,
     tracker: str | None = None,
+    cache: str | Path | None = None,
     seconds: float = 600.0,
     on_step: Callable[[int, int, float], None] = lambda *_: None,
     on_validation: OnValidation = lambda *_: None,
 ) -> dict[str, Any]:
-    """Train an action-conditioned model for navigation, or resume its training, and write its checkpoint.
+    """Train a model on navigation or manipulation, or resume its training, and write its checkpoint.
 
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
     SIGTERM or Ctrl-C. The same call resumes from it, and on the CPU ends with the same bytes. `OUT.log` has the loss
     of each step and what validations found, with pictures; the checkpoint has the weights that were best in validation.
 
     Args:
-        name: of the world model, such as "ltx-action".
-        data: folder of `wiw collect navigation`, of panoramas.
-        out: folder of the checkpoint, new or empty; `wiw.world_model(name, checkpoint=out)` loads it.
-        weights: of the stock generator, a folder as `save_pretrained` writes it or a name on the hub; its usual ones
-            if None.
+        name: such as "ltx-action".
+        data: folder of `wiw collect navigation` or `wiw collect manipulation`.
+        out: folder of the checkpoint, new or empty; `wiw.world_model(name, checkpoint=out)` loads it, for NWM
+            `wiw.world_model("nwm", weights=out)`.
+        weights: pretrained, a folder as the world model takes it or a name on the hub; its usual ones if None.
         revision: of the weights on the hub.
         variant: of the weight files, such as "fp16".
         device: of torch; "cuda" where there is one, else "cpu".
         recipe: the numbers; the shipped recipe if None, in float32 where there is no GPU.
-        part: of the dataset: "train", which leaves a share of the scenes for validation, or "all".
+        part: of the data: "train", which leaves a share of scenes or demonstrations for validation, or "all".
         validation: folder of another dataset whose clips it is validated on; the scenes left out if None. With all
             scenes in training and no other dataset, there is no validation, and the checkpoint has the last weights.
         decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
         tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        cache: folder where encoded clips are kept, for later epochs and other trainings on the same data; none if None.
         seconds: least time between two writes of the state.
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
         on_validation: called after each validation with the number of steps done and what was found.
 
     Returns:
-        What the checkpoint's `training.json` says: model, data, recipe, steps and the loss at the end.
+        What the checkpoint's `training.json` says: model, data, recipe, steps, the loss at the end, how it is run.
 
     Raises:
-        ArgumentError: a model that is not trained here, a dataset of perspective views, too few clips, a recipe that
-            the model cannot have, a state of a training with other data or numbers, or validation on scenes that are
-            trained on or not there.
+        ArgumentError: a model that is not trained here or not on such data, too few clips, a recipe that the model
+            cannot have, a state of a training with other data or numbers, or validation that the model does not have,
+            on scenes that are trained on or not there.
         TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
         FileError: `out` holds something, or the dataset is missing or damaged.
-        WeightsError, DependencyError, DeviceMemoryError: see `wiw.world_models.video.model.VideoModel`.
+        WeightsError, DependencyError, DeviceMemoryError: see the world model.
     """
     out = Path(out)
-    model, objective_class = find_family(name)
-    devices.require(Requirements(("peft",), "diffusers"))
-    device = devices.device(device)
+    family, device = find_family(name), devices.device(device)
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
-    dataset = NavigationData(data, part, recipe.held_out)
-    _require_panoramas(dataset)
-    arrange_clips(len(dataset.clips(recipe.frames)), recipe)
-    held_out = find_held_out(data, part, validation, recipe)
-    options = {"revision": revision, "variant": variant, "device": device, **_extra_options(name)}
-    generator = load_generator(model, recipe, None if weights is None else _resolve(str(weights)), options)
-    recipe = replace(recipe, frames=generator.frames, size=generator.size)
-    checked = None if held_out is None else choose_validation_set(dataset, held_out, decisions, recipe)
-    card = {"model": name, **describe_training(generator, dataset, part, recipe)}
-    card |= {"validated_on": checked.identity if checked else None}
-    state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
-    folder = out.with_name(f"{out.name}.log")
-    if not state.path.exists():
-        shutil.rmtree(folder, ignore_errors=True)  # of an earlier training under this name
-    with devices.memory_guard(f"training {name} on {generator.device}", "; ".join(list_remedies(recipe))):
-        config = build_config(model.base, model.denoisers[0], generator)
-        objective, clips = objective_class(generator, recipe), dataset.clips(recipe.frames)
-        trainer = PostTrainer(objective, config, model.denoisers, clips, recipe)
+    corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
+    arrange_clips(len(corpus.clips(recipe.frames)), recipe)
+    split = find_held_out(name, corpus, validation, decisions, recipe)
+    source = PretrainedWeights(None if weights is None else str(weights), revision, variant, device)
+    with devices.memory_guard(f"training {name} on {device}", "; ".join(list_remedies(recipe))):
+        loaded = family.load(corpus, recipe, source)
+        recipe = loaded.recipe
+        checked = None if split is None else choose_validation_set(*split, decisions, recipe)
+        card = {"model": name, **describe_training(loaded, corpus)}
+        card |= {"validated_on": checked.identity if checked else None}
+        state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
+        latents = None if cache is None else open_cache(Path(cache), loaded, corpus)
+        trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe, latents)
+        folder = out.with_name(f"{out.name}.log")
+        if not state.path.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of an earlier training under this name
         trackers = [] if tracker is None else [open_tracker(tracker, out.name, folder, recipe.describe())]
         validated = ValidatedTrainer(
             trainer,
-            TrainingSampler(trainer) if checked else None,
+            create_sampler(trainer) if checked else None,
             checked,
             TrainingLog(folder / LOG, trackers),
             folder,
@@ -127,20 +124,40 @@ def post_train(
         )
         run_steps(validated, state, on_step)
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
+    card |= {"run": describe_run(family, corpus, recipe)}
     card = publish_checkpoint(out, validated, card)
     state.remove()
     return card
 
 
 def find_held_out(
-    data: str | Path, part: Part, validation: str | Path | None, recipe: PostTrainingRecipe
-) -> NavigationData | None:
-    """Return what a training is validated on: another dataset, or the scenes left out of its own; None for nothing."""
+    name: str,
+    corpus: Corpus,
+    validation: str | Path | None,
+    decisions: str | Path | None,
+    recipe: PostTrainingRecipe,
+) -> tuple[NavigationData, NavigationData] | None:
+    """Return what is trained on, and what it is validated on: another dataset, or the scenes that it leaves out.
+
+    None where there is no validation.
+
+    Raises:
+        ArgumentError: validation is asked for, of a model that does not follow primitives in panoramas.
+    """
+    if not isinstance(corpus, NavigationCorpus) or corpus.view != "panorama":
+        if validation is not None or decisions is not None:
+            raise ArgumentError(
+                f"{name}: only models that follow primitives in panoramas are validated while they train; leave "
+                "validation and decisions out"
+            )
+        return None
     if recipe.validate_every is None:
         return None
     if validation is not None:
-        return NavigationData(validation)
-    return NavigationData(data, "held-out", recipe.held_out) if part == "train" else None
+        return corpus.data, NavigationData(validation)
+    if corpus.part != "train":
+        return None
+    return corpus.data, NavigationData(corpus.data.folder, "held-out", recipe.held_out)
 
 
 def run_steps(
@@ -153,7 +170,7 @@ def run_steps(
         ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
     """
     inner = trainer.trainer
-    recipe, phases = inner.recipe, len(inner.places)
+    recipe, phases = inner.recipe, len(inner.model.places)
     with state.watch():
         try:
             run_training(
@@ -161,7 +178,7 @@ def run_steps(
                 recipe,
                 inner.steps_per_epoch,
                 None,
-                lambda progress: recipe.scale_rate(progress * phases % 1),  # each denoiser has a schedule of its own
+                lambda progress: recipe.scale_rate(progress * phases % 1),  # each network has a schedule of its own
                 lambda step, steps, _: on_step(step, steps, inner.mean_loss),
                 state,
             )
@@ -197,23 +214,25 @@ def publish_checkpoint(out: Path, trainer: ValidatedTrainer, card: Mapping[str, 
     return found
 
 
-def describe_training(
-    generator: VideoModel, data: NavigationData, part: str, recipe: PostTrainingRecipe
-) -> dict[str, Any]:
-    """Return what the outcome of a training depends on, as JSON values."""
+def describe_run(family: Family, corpus: Corpus, recipe: PostTrainingRecipe) -> dict[str, Any]:
+    """Return the task, the world model and its options by which a checkpoint is run."""
     return {
-        "wiw": wiw.__version__,
-        "weights": identify_weights(generator),
-        "data": describe_dataset(data, part),
-        "recipe": recipe.describe(),
-        "versions": loading.versions(),
+        "task": TASKS[corpus.space],
+        "world_model": family.world_model,
+        "checkpoint": family.checkpoint_option,
+        "options": family.list_options(corpus, recipe),
     }
 
 
-def identify_weights(generator: VideoModel) -> dict[str, str]:
-    """Return the hub's commit of a generator's weights, or the digest of their folder."""
-    described = generator.describe()
-    return {key: str(described[key]) for key in ("commit", "digest") if key in described}
+def describe_training(loaded: Loaded, corpus: Corpus) -> dict[str, Any]:
+    """Return what the outcome of a training depends on, as JSON values."""
+    return {
+        "wiw": wiw.__version__,
+        "weights": loaded.identity,
+        "data": corpus.describe(),
+        "recipe": loaded.recipe.describe(),
+        "versions": loading.versions(),
+    }
 
 
 def write_checkpoint(
@@ -227,24 +246,16 @@ def write_checkpoint(
         FileError: `out` holds something, or cannot be written.
     """
     with atomic_folder(out, replace) as draft:
-        action_checkpoint.save(draft, trainer.encoders, trainer.objective.pipeline, lora=bool(trainer.recipe.lora))
+        with trainer.use_averages():
+            trainer.model.write(draft)
         (draft / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
 
 
-def build_config(base: str, place: str, generator: VideoModel) -> ActionConfig:
-    """Return the configuration of encoders for primitives, for the denoisers of a generator."""
-    return ActionConfig(
-        base=base,
-        weights=generator.weights,
-        revision=identify_weights(generator).get("commit"),
-        width=embedding_width(getattr(generator.pipeline, place)),
-        stride=generator.stride,
-    )
-
-
-def describe_dataset(data: NavigationData, part: str) -> dict[str, Any]:
-    """Return what identifies a dataset: a digest of its files' checksums, which part, how many segments."""
-    return {"sha256": data.digest(), "part": part, "segments": len(data)}
+def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
+    """Return the cache of a corpus's clips as a model's frozen networks encode them."""
+    recipe = loaded.recipe
+    shape = {"frames": recipe.frames, "size": recipe.size, "versions": loading.versions()}
+    return LatentCache(folder, {"data": corpus.describe(), "latents": loaded.model.describe_latents(), **shape})
 
 
 def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrainingRecipe:
@@ -254,34 +265,16 @@ def choose_precision(recipe: PostTrainingRecipe, device: str | None) -> PostTrai
 
 def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     """List the numbers of a recipe that need less memory than the present ones, the mildest first."""
-    height, width = recipe.size
+    height, width = recipe.size or (0, 0)
     remedies = [f"rows=1 (now {recipe.rows})"] if recipe.rows > 1 else []
     remedies += ["precision=bfloat16"] if recipe.precision == "float32" else []
     remedies += [] if recipe.checkpointing else ["checkpointing=true"]
-    remedies += [] if recipe.lora else ["lora=32, for the Wan models"]
+    remedies += ["optimizer=adamw8bit"] if recipe.optimizer == "adamw" and not recipe.lora else []
+    remedies += ["ema=0"] if recipe.ema else []
+    remedies += [] if recipe.lora else ["lora=32, for the Wan and LTX models"]
     return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]
-
-
-def _resolve(weights: str) -> str:
-    """Return a folder with its whole path, which the checkpoint names; a name on the hub as it is."""
-    folder = Path(weights).expanduser()
-    return str(folder.resolve()) if folder.is_dir() or is_path(weights) else weights
-
-
-def _extra_options(name: str) -> dict[str, Any]:
-    """Return options without a default; the filter of Cosmos-Predict2 has nothing to look at where none is shown."""
-    return {"guardrail": False} if name == "cosmos-predict2-action" else {}
 
 
 def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ArgumentError(f"{out} holds something already; name a folder that is new or empty")
-
-
-def _require_panoramas(data: NavigationData) -> None:
-    camera = data.meta.get("camera", {}).get("projection")
-    if camera != "equirectangular":
-        raise ArgumentError(
-            f"{data.folder}: models that follow primitives see panoramas, but this dataset has {camera} views; collect "
-            "without --perspective"
-        )

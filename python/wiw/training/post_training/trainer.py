@@ -1,87 +1,72 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the denoisers of one generator and the encoders that tell them each frame's action."""
+"""Train the networks of one model, step by step."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
+from torch.utils._pytree import tree_map_only
 
-from wiw.datasets.navigation import Clips
-from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.errors import ArgumentError, TrainingError
 from wiw.training.checkpoint import ResumableTrainer
-from wiw.training.held_out_clips import resize_frames
 from wiw.training.post_training.clip_order import ClipOrder
-from wiw.training.post_training.objective import Objective
+from wiw.training.post_training.clips import ClipBatch, load_clips, mirror_clip
+from wiw.training.post_training.corpora import CorpusClips
+from wiw.training.post_training.latent_cache import LatentCache
+from wiw.training.post_training.optimizers import create_optimizer
 from wiw.training.post_training.recipe import PostTrainingRecipe
-from wiw.world_models.video.actions.checkpoint import ADAPTER, supports_lora
-from wiw.world_models.video.actions.config import ActionConfig
-from wiw.world_models.video.actions.encoder import ActionEncoder
-from wiw.world_models.video.actions.injection import Injection
-
-LORA_LAYERS = ("to_q", "to_k", "to_v", "to_out.0", "ffn.net.0.proj", "ffn.net.2")
-"""Layers that a LoRA is put on: attention and feed-forward (paper's repository for Wan, DiffSynth-Studio)."""
+from wiw.training.post_training.trainable import Encoded, TrainableModel
 
 
 class PostTrainer(ResumableTrainer):
     """Train step by step: step k is a function of the recipe, the clips and the state after step k - 1.
 
-    Denoisers are trained one after the other, each over all epochs: a model of two experts has two such phases.
+    Networks are trained one after the other, each over all epochs: a model of two experts has two such phases.
 
     Args:
-        objective: loss of the generator, whose pipeline holds the denoisers.
-        config: of the action encoders.
-        places: of the denoisers in the pipeline.
+        model: what is trained.
         clips: what is trained on.
         recipe: of the training.
+        cache: where encoded clips are kept; they are encoded each time if None.
 
     Raises:
-        ArgumentError: a LoRA that a pipeline does not load, or for layers that a denoiser does not have.
+        ArgumentError: there are fewer clips than one step takes.
+        DependencyError: the recipe's optimiser is not installed.
     """
 
     def __init__(
         self,
-        objective: Objective,
-        config: ActionConfig,
-        places: Sequence[str],
-        clips: Clips,
+        model: TrainableModel,
+        clips: CorpusClips,
         recipe: PostTrainingRecipe,
+        cache: LatentCache | None = None,
     ) -> None:
-        self.objective, self.recipe, self._clips = objective, recipe, clips
-        self.places = tuple(places)
+        self.model, self.recipe, self._clips, self._cache = model, recipe, clips, cache
         self.mean_loss = float("nan")
-        self._active: str | None = None
         self.order = arrange_clips(len(clips), recipe)
-        self.action_ids = np.zeros(len(config.vocabulary), np.int64)
-        self.action_ids[list(config.ids)] = list(config.ids.values())
-        with _seed_torch(_mix_seed(recipe.seed, "weights"), objective.device):
-            self.encoders = {place: ActionEncoder(config).to(objective.device) for place in self.places}
-            for place in self.places:
-                prepare_denoiser(objective.pipeline, place, recipe)
-        self._injections = {place: Injection(getattr(objective.pipeline, place)) for place in self.places}
-        self._freeze_rest()
-        self.trained = self._list_trained()
-        self.optimizer = torch.optim.AdamW(
-            list(self.trained.values()), lr=recipe.rate, weight_decay=recipe.weight_decay
-        )
+        self.trained: dict[str, nn.Parameter] = {}
+        for place in model.places:
+            self.trained |= model.list_trained(place)
+        self.optimizer = create_optimizer(list(self.trained.values()), recipe)
+        self.averages = {name: value.detach().clone() for name, value in self.trained.items()} if recipe.ema else {}
 
     @property
     def steps_per_epoch(self) -> int:
-        """Steps in an epoch of each denoiser, times the number of denoisers."""
-        return self.order.steps_per_epoch * len(self.places)
+        """Steps in an epoch of each network, times the number of networks."""
+        return self.order.steps_per_epoch * len(self.model.places)
 
     def locate(self, step: int) -> tuple[str, int]:
-        """Return the denoiser that a step trains, by its place, and the number of its own steps before it."""
-        each = self.order.steps_per_epoch * self.recipe.epochs
-        return self.places[min(step // each, len(self.places) - 1)], step % each
+        """Return the network that a step trains, by its place, and the number of its own steps before it."""
+        each, places = self.order.steps_per_epoch * self.recipe.epochs, self.model.places
+        return places[min(step // each, len(places) - 1)], step % each
 
     def train_step(self, learning_rate: float) -> float:
         """Train on one batch and return its loss.
@@ -91,38 +76,30 @@ class PostTrainer(ResumableTrainer):
             FileError: a clip cannot be read.
         """
         place, own_step = self.locate(self.step_count)
-        self._activate(place)
+        self.model.activate(place)
         batch = self.order.select(own_step)
         self.optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for first in range(0, self.recipe.batch, self.recipe.rows):
-            rows = batch[first : first + self.recipe.rows]
-            with _seed_torch(
-                _mix_seed(self.recipe.seed, "step", self.step_count, first), self.objective.device
-            ) as random:
-                losses = self._compute_losses(place, [self._clips[int(row)] for row in rows], random)
-                loss = losses.sum() / self.recipe.batch
-                self._require_finite(losses, rows, "loss")
-                loss.backward()
-            total += float(loss.detach())
+            total += self._add_gradients(place, batch[first : first + self.recipe.rows], first)
         norm = nn.utils.clip_grad_norm_(list(self.trained.values()), self.recipe.clip_norm)
         self._require_finite(norm[None], batch, "gradient")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.optimizer.step()
+        self._average_weights(place)
         self.mean_loss = total if not self.step_count else 0.98 * self.mean_loss + 0.02 * total
         self.step_count += 1
         return total
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of steps, the mean loss, the trained weights and the optimiser's state, in main memory."""
-        optimizer = self.optimizer.state_dict()
-        moments = {key: {name: value.cpu() for name, value in each.items()} for key, each in optimizer["state"].items()}
+        """Return the number of steps, the mean loss, weights, averages and the optimiser's state, in main memory."""
         return {
             "count": self.step_count,
             "loss": self.mean_loss,
             "weights": {name: value.detach().cpu() for name, value in self.trained.items()},
-            "optimizer": {**optimizer, "state": moments},
+            "averages": {name: value.cpu() for name, value in self.averages.items()},
+            "optimizer": tree_map_only(Tensor, Tensor.cpu, self.optimizer.state_dict()),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -131,58 +108,80 @@ class PostTrainer(ResumableTrainer):
         with torch.no_grad():
             for name, value in self.trained.items():
                 value.copy_(state["weights"][name])
+            for name, average in self.averages.items():
+                average.copy_(state["averages"][name])
         self.optimizer.load_state_dict(state["optimizer"])
 
-    def _compute_losses(self, place: str, clips: Sequence[NavigationSegment], random: torch.Generator) -> Tensor:
-        batch = load_clips(clips, self.recipe.size, self.action_ids).to(self.objective.device)
-        dropped = (torch.rand(len(clips), generator=random) < self.recipe.drop).to(self.objective.device)
-        encoded = self.objective.encode(batch.frames, random)
-        vectors = self.encoders[place](batch.actions, dropped)
-        with self._injections[place].inject(vectors):
-            return self.objective.compute_losses(place, encoded, random)
+    @contextmanager
+    def use_averages(self) -> Iterator[None]:
+        """Exchange the weights for their averages, where there are any, as long as the context lasts."""
+        self._exchange_averages()
+        try:
+            yield
+        finally:
+            self._exchange_averages()
+
+    @torch.no_grad()
+    def _exchange_averages(self) -> None:
+        for name, average in self.averages.items():
+            kept = self.trained[name].clone()
+            self.trained[name].copy_(average)
+            average.copy_(kept)
+
+    @torch.no_grad()
+    def _average_weights(self, place: str) -> None:
+        """Move the averages of what is trained at a place towards its weights."""
+        if self.averages:
+            names = list(self.model.list_trained(place))
+            averages, weights = ([each[name] for name in names] for each in (self.averages, self.trained))
+            get_ema_multi_avg_fn(self.recipe.ema)(averages, weights, None)
+
+    def _add_gradients(self, place: str, rows: NDArray[np.int64], first: int) -> float:
+        """Add the gradients of some clips of a batch, from its clip `first` on; return their part of its mean loss."""
+        with _seed_torch(_mix_seed(self.recipe.seed, "step", self.step_count, first), self.model.device) as random:
+            losses = self._compute_losses(place, rows, random)
+            self._require_finite(losses, rows, "loss")
+            loss = losses.sum() / self.recipe.batch
+            loss.backward()
+        return float(loss.detach())
+
+    def _compute_losses(self, place: str, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
+        mirrored = torch.rand(len(rows), generator=random) < self.recipe.mirror
+        encoded, actions = self._encode_clips(rows, mirrored.tolist())
+        return self.model.compute_losses(place, encoded, actions, random)
+
+    def _encode_clips(self, rows: NDArray[np.int64], mirrored: Sequence[bool]) -> tuple[Encoded, Tensor]:
+        """Return clips as the networks see them, each encoded by itself, and their actions."""
+        found = [self._encode_clip(int(row), mirror) for row, mirror in zip(rows, mirrored, strict=True)]
+        encoded = {name: torch.cat([each[name] for each, _ in found]) for name in found[0][0]}
+        return encoded, torch.cat([actions for _, actions in found])
+
+    def _encode_clip(self, index: int, mirror: bool) -> tuple[Encoded, Tensor]:
+        def make() -> tuple[Encoded, Tensor]:
+            clip = self._load_clip(index, mirror)
+            encoded = self.model.encode(clip)
+            return {name: value.contiguous() for name, value in encoded.items()}, clip.actions  # as a cache has them
+
+        return make() if self._cache is None else self._cache.encode(index, mirror, make, self.model.device)
+
+    def _load_clip(self, index: int, mirror: bool) -> ClipBatch:
+        clip = self._clips[index]
+        return load_clips([mirror_clip(clip) if mirror else clip], self.recipe.clip_size).to(self.model.device)
 
     def _require_finite(self, values: Tensor, rows: NDArray[np.int64], what: str) -> None:
         if bool(torch.isfinite(values).all()):
             return
         self.optimizer.zero_grad(set_to_none=True)
-        names = [describe_clip(self._clips, int(row)) for row in rows]
+        names = [self._clips.describe(int(row)) for row in rows]
         raise TrainingError(
             f"step {self.step_count + 1}: the {what} is not finite on a batch of {'; '.join(names)}. The state before "
             "this step is kept. Look at these clips (`wiw data verify`), or begin anew with a lower rate or "
             "precision=float32"
         )
 
-    def _activate(self, place: str) -> None:
-        """Keep on the device only the denoiser that is trained."""
-        if self._active != place:
-            for each in self.places:
-                getattr(self.objective.pipeline, each).to(self.objective.device if each == place else "cpu")
-            self._active = place
-
-    def _freeze_rest(self) -> None:
-        """Let no gradient reach what is not trained."""
-        trained = {
-            id(value)
-            for place in self.places
-            for name, value in getattr(self.objective.pipeline, place).named_parameters()
-            if not self.recipe.lora or f".{ADAPTER}." in name
-        }
-        for network in self.objective.pipeline.components.values():
-            if isinstance(network, nn.Module):
-                for value in network.parameters():
-                    value.requires_grad_(id(value) in trained)
-
-    def _list_trained(self) -> dict[str, nn.Parameter]:
-        found: dict[str, nn.Parameter] = {}
-        for place in self.places:
-            found |= {f"encoder.{place}.{name}": value for name, value in self.encoders[place].named_parameters()}
-            denoiser = getattr(self.objective.pipeline, place)
-            found |= {f"{place}.{name}": value for name, value in denoiser.named_parameters() if value.requires_grad}
-        return found
-
 
 def arrange_clips(total: int, recipe: PostTrainingRecipe) -> ClipOrder:
-    """Return the order of a dataset's clips.
+    """Return the order of a corpus's clips.
 
     Raises:
         ArgumentError: there are fewer clips than one step takes.
@@ -196,74 +195,9 @@ def arrange_clips(total: int, recipe: PostTrainingRecipe) -> ClipOrder:
     return order
 
 
-@dataclass(frozen=True)
-class ClipBatch:
-    """Clips as tensors."""
-
-    frames: Tensor
-    """float32 [B, 3, N, H, W] from -1 to 1."""
-    actions: Tensor
-    """int64 [B, N]: the action that led to each frame, in the encoder's ids."""
-
-    def to(self, device: torch.device) -> ClipBatch:
-        """Return the clips on a device."""
-        return ClipBatch(self.frames.to(device), self.actions.to(device))
-
-
-def load_clips(clips: Sequence[NavigationSegment], size: tuple[int, int], ids: NDArray[np.int64]) -> ClipBatch:
-    """Decode clips and bring them to a size (height, width); `ids` maps wiw's actions to the encoder's.
-
-    Raises:
-        FileError: a picture is damaged.
-    """
-    frames = np.stack([resize_frames(clip.images, size) for clip in clips])
-    pixels = torch.from_numpy(frames).permute(0, 4, 1, 2, 3).float() / 127.5 - 1
-    return ClipBatch(pixels, torch.from_numpy(np.stack([ids[clip.actions] for clip in clips])))
-
-
-def describe_clip(clips: Clips, index: int) -> str:
-    """Return where a clip is in its dataset."""
-    segment, start = clips.locate(index)
-    clip = clips[index]
-    return f"clip {index} (scene {clip.scene}, segment {segment} of the dataset, from frame {start})"
-
-
-def prepare_denoiser(pipeline: Any, place: str, recipe: PostTrainingRecipe) -> None:
-    """Make a denoiser ready for training: a LoRA on it if the recipe has one, and gradient checkpointing.
-
-    Raises:
-        ArgumentError: the pipeline loads no LoRA, or the denoiser lacks layers that it is meant for.
-    """
-    denoiser = getattr(pipeline, place)
-    if recipe.lora:
-        add_lora(pipeline, place, recipe.lora)
-    denoiser.train()
-    if recipe.checkpointing:
-        denoiser.enable_gradient_checkpointing()
-
-
-def add_lora(pipeline: Any, place: str, rank: int, layers: Sequence[str] = LORA_LAYERS) -> None:
-    """Put a LoRA in float32 on the layers of a denoiser whose names end in one of `layers`.
-
-    Raises:
-        ArgumentError: the pipeline loads no LoRA, or one of `layers` covers nothing.
-    """
-    from diffusers.training_utils import cast_training_params
-    from peft import LoraConfig
-
-    if not supports_lora(pipeline):
-        raise ArgumentError(f"lora: {type(pipeline).__name__} takes no LoRA; train the whole denoiser with lora=0")
-    denoiser = getattr(pipeline, place)
-    names = [name for name, _ in denoiser.named_modules()]
-    empty = [layer for layer in layers if not any(name.endswith(f".{layer}") for name in names)]
-    if empty:
-        raise ArgumentError(
-            f"lora: {type(denoiser).__name__} has no layers {', '.join(empty)}, so that a LoRA of them would cover "
-            "nothing; train the whole denoiser with lora=0"
-        )
-    denoiser.requires_grad_(False)
-    denoiser.add_adapter(LoraConfig(r=rank, lora_alpha=rank, target_modules=list(layers)), adapter_name=ADAPTER)
-    cast_training_params(denoiser, torch.float32)
+def seed_weights(recipe: PostTrainingRecipe, device: torch.device) -> Any:
+    """Return a context in which random weights are drawn from the recipe's seed."""
+    return _seed_torch(_mix_seed(recipe.seed, "weights"), device)
 
 
 def _mix_seed(seed: int, *parts: object) -> int:

@@ -88,8 +88,8 @@ def choose_validation_set(
                 f"{decisions}: expected plans of at most {recipe.frames - 1} actions, those of a clip, got "
                 f"{stored.plans.shape[-1]}; collect others with --actions {recipe.frames - 1}"
             )
-        stored = resize_decisions(stored, recipe.size)
-    clips = select_clips(held_out.clips(recipe.frames), recipe.validate_clips, recipe.seed, recipe.size)
+        stored = resize_decisions(stored, recipe.clip_size)
+    clips = select_clips(held_out.clips(recipe.frames), recipe.validate_clips, recipe.seed, recipe.clip_size)
     identity: dict[str, Any] = {"data": held_out.digest(), "scenes": sorted(set(clips.scenes))}
     if decisions is not None:
         identity["decisions"] = digest_decisions(decisions)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from wiw.training.post_training.noise import draw_shifted_uniform, weigh_by_bell
-from wiw.training.post_training.objective import Encoded, FlowObjective, to_image
+from wiw.training.post_training.objective import FlowObjective, Sampled, to_image
 from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.trainable import Encoded
 from wiw.world_models.video.model import VideoModel
 
 MAX_WORDS = 512
@@ -37,7 +38,7 @@ class WanObjective(FlowObjective):
         self.release_text_encoder()
 
     @torch.no_grad()
-    def encode(self, clips: Tensor, random: torch.Generator) -> Encoded:
+    def encode(self, clips: Tensor) -> Encoded:
         """Return the latents, and of each first frame what the pipeline gives the denoiser."""
         observations = clips[:, :, 0]
         given = torch.cat([self._condition(each[None], clips.shape[2]) for each in observations])
@@ -46,6 +47,10 @@ class WanObjective(FlowObjective):
             encoded["pictures"] = torch.cat(
                 [self.pipeline.encode_image(to_image(each), self.device) for each in observations]
             )
+        return encoded
+
+    def sample(self, encoded: Encoded, random: torch.Generator) -> Sampled:
+        """Return the latents as they are: nothing of them is drawn."""
         return encoded
 
     def draw_levels(self, place: str, latents: Tensor, random: torch.Generator) -> Tensor:
@@ -63,13 +68,13 @@ class WanObjective(FlowObjective):
         """Return the weights of DiffSynth-Studio's recipes."""
         return weigh_by_bell(levels, self.recipe.shift)
 
-    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, encoded: Encoded) -> Tensor:
+    def predict(self, denoiser: Any, noisy: Tensor, levels: Tensor, sampled: Sampled) -> Tensor:
         """Call the transformer with latents [B, C, L, h, w]."""
         words = self._words.to(denoiser.dtype).expand(len(noisy), -1, -1)
-        pictures = encoded.get("pictures")
+        pictures = sampled.get("pictures")
         times = levels * self.pipeline.scheduler.config.num_train_timesteps
         if not self.keeps_first:
-            noisy = torch.cat([noisy, encoded["given"]], dim=1)
+            noisy = torch.cat([noisy, sampled["given"]], dim=1)
         return denoiser(
             hidden_states=noisy.to(denoiser.dtype),
             timestep=self._spread(times, noisy, denoiser) if self.keeps_first else times,

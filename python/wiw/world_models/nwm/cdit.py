@@ -14,6 +14,7 @@ import torch
 from diffusers.models.embeddings import get_timestep_embedding
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
 
 FREQUENCIES = 256
 """Sines and cosines that a number is embedded as."""
@@ -61,6 +62,9 @@ class CDiT(nn.Module):
     linearly with the context. Diffusion time, motion and time shift are one vector that modulates every block.
     """
 
+    checkpointing = False
+    """Whether training computes the activations of each block again in the backward pass, which takes less memory."""
+
     def __init__(self, size: Architecture) -> None:
         super().__init__()
         self.size = size
@@ -90,7 +94,10 @@ class CDiT(nn.Module):
         )
         condition = self.t_embedder(time) + self.y_embedder(motion) + self.time_embedder(shift)
         for block in self.blocks:
-            x = block(x, seen, condition)
+            if self.checkpointing and self.training:
+                x = checkpoint(block, x, seen, condition, use_reentrant=False)
+            else:
+                x = block(x, seen, condition)
         return self._image(self.final_layer(x, condition))
 
     def _image(self, x: Tensor) -> Tensor:

@@ -11,11 +11,14 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.utils.torch_utils import randn_tensor
 from torch import Generator, Tensor
 
+TIMES = 1000
+"""Diffusion times of the training."""
+
 
 def scheduler(steps: int) -> DDPMScheduler:
-    """Return the chain of `steps` out of 1000 diffusion times, the first and the last among them."""
+    """Return the chain of `steps` out of `TIMES` diffusion times, the first and the last among them."""
     chain = DDPMScheduler(
-        num_train_timesteps=1000,
+        num_train_timesteps=TIMES,
         beta_start=1e-4,
         beta_end=0.02,
         beta_schedule="linear",

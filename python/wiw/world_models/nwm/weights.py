@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+from safetensors.torch import save_file
 from torch import Tensor
 
 from wiw.errors import WeightsError
@@ -18,21 +19,24 @@ from wiw.world_models.nwm.cdit import Architecture, CDiT
 from wiw.world_models.video.weights import explained, is_path
 
 CODEC = "stabilityai/sd-vae-ft-ema"
+TRAINED = "cdit.safetensors"
+"""Name of the file that `save` writes."""
 
 
 def fetch(weights: str, file: str, revision: str | None) -> Path:
-    """Return the checkpoint on this machine: a file, `file` in a folder, or in a hub repository.
+    """Return the checkpoint on this machine: a file, `file` or what `save` wrote in a folder, or in a hub repository.
 
     Raises:
         WeightsError: there is none; says what to do.
     """
     local = Path(weights).expanduser()
-    found = local / file if local.is_dir() else local
-    if found.is_file():
-        return found
+    for found in (local / file, local / TRAINED, local):
+        if found.is_file():
+            return found
     if local.is_dir() or is_path(weights):
         raise WeightsError(
-            f"no file {found}; `hf download facebook/nwm {file}` fetches it (CC BY-NC 4.0: research only)"
+            f"no file {local / file if local.is_dir() else local}; `hf download facebook/nwm {file}` fetches it (CC "
+            "BY-NC 4.0: research only)"
         )
     from huggingface_hub import hf_hub_download
 
@@ -69,6 +73,13 @@ def load_cdit(path: Path) -> CDiT:
         raise WeightsError(f"{path}: no weights of a CDiT of {size}: {_difference(expected, found)}", "unfit")
     network.load_state_dict(state, assign=True)
     return network.float().eval().requires_grad_(False)
+
+
+def save(folder: Path, network: CDiT, codec: Any) -> None:
+    """Write a network and its codec into a folder, which is then a checkpoint of its own."""
+    state = {name: value.detach().contiguous().cpu() for name, value in network.state_dict().items()}
+    save_file(state, folder / TRAINED)
+    codec.save_pretrained(folder / "vae")
 
 
 def load_codec(vae: str, revision: str | None) -> Any:

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Averaged weights, 8-bit Adam and the cache of latents in post-training."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.errors import DependencyError
+
+pytest.importorskip("diffusers", reason="no diffusers: pip install 'wiw[diffusers]'")
+pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
+pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
+
+import torch
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
+from safetensors.torch import load_file
+
+from wiw.training.post_training.latent_cache import LatentCache
+from wiw.training.post_training.train import list_remedies, post_train
+from wiw.training.post_training.trainer import PostTrainer
+
+NAMES = ("svd-action", "ltx-action", "wan2.1-action", "cosmos-predict2-action", "nwm-action")
+"""One of each way of encoding clips."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_dataset(tmp_path_factory.mktemp("post") / "data")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory):
+    return partial(save_stock, tmp_path_factory.mktemp("stock"))
+
+
+def require_equal(first: PostTrainer, second: PostTrainer) -> None:
+    assert first.mean_loss == second.mean_loss
+    assert all(torch.equal(value, second.trained[name]) for name, value in first.trained.items())
+    assert all(torch.equal(value, second.averages[name]) for name, value in first.averages.items())
+
+
+def test_averages_are_their_formula_and_resume_exactly(data: Path, weights: Any) -> None:
+    options: dict[str, Any] = {"epochs": 6, "ema": 0.7}
+    whole = make_trainer("ltx-action", data, weights("ltx-action"), **options)
+    expected = {name: value.detach().double() for name, value in whole.trained.items()}
+    state = io.BytesIO()
+    for step in range(6):
+        whole.train_step(1e-2)
+        expected = {name: 0.7 * value + 0.3 * whole.trained[name].detach() for name, value in expected.items()}
+        if step == 2:
+            torch.save(whole.state_dict(), state)
+    for name, value in expected.items():
+        torch.testing.assert_close(whole.averages[name].double(), value, rtol=1e-5, atol=1e-7)
+    resumed = make_trainer("ltx-action", data, weights("ltx-action"), **options)
+    state.seek(0)
+    resumed.load_state_dict(torch.load(state, weights_only=True))
+    for _ in range(3):
+        resumed.train_step(1e-2)
+    require_equal(whole, resumed)
+
+
+def test_only_the_expert_in_training_is_averaged(data: Path, weights: Any) -> None:
+    name = "wan2.2-a14b-action"
+    trainer = make_trainer(name, data, weights(name), ema=0.5)
+    before = {key: value.clone() for key, value in trainer.averages.items()}
+    trainer.train_step(1e-2)
+    moved = {key for key, value in trainer.averages.items() if not torch.equal(value, before[key])}
+    assert moved and not any("transformer_2" in key for key in moved)
+
+
+def test_the_checkpoint_has_the_averages_and_training_goes_on_with_the_weights(
+    data: Path, weights: Any, tmp_path: Path
+) -> None:
+    options: dict[str, Any] = {"weights": weights("nwm-action"), "device": "cpu", "part": "all"}
+    found = {}
+    for decay in (0.0, 0.9):
+        recipe = tiny_recipe("nwm-action", epochs=4, ema=decay)
+        post_train("nwm-action", data, tmp_path / str(decay), recipe=recipe, **options)
+        found[decay] = load_file(tmp_path / str(decay) / "cdit.safetensors")
+    twin = make_trainer("nwm-action", data, weights("nwm-action"), epochs=4, ema=0.9)
+    for step in range(4):
+        twin.train_step(twin.recipe.rate * twin.recipe.scale_rate(step / 4))
+    for name, value in found[0.9].items():
+        torch.testing.assert_close(value, twin.averages[f"cdit.{name}"], rtol=0, atol=0)
+    assert any(not torch.equal(value, found[0.0][name]) for name, value in found[0.9].items())
+    weights_before = {name: value.detach().clone() for name, value in twin.trained.items()}
+    with twin.use_averages():
+        assert all(torch.equal(value, found[0.9][name.removeprefix("cdit.")]) for name, value in twin.trained.items())
+    assert all(torch.equal(value, weights_before[name]) for name, value in twin.trained.items())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cache_changes_nothing_but_is_read(
+    name: str, data: Path, weights: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Same bytes without a cache, with an empty one and with a filled one, which needs neither clips nor encoders."""
+    plain, filling, reading = (
+        make_trainer(name, data, weights(name), epochs=3, mirror=0.5, checkpointing=False) for _ in range(3)
+    )
+    filling._cache = reading._cache = LatentCache(tmp_path, {"of": name})
+    monkeypatch.setattr(reading.model, "encode", None)
+    monkeypatch.setattr(reading, "_load_clip", None)
+    for trainer in (plain, filling, reading):
+        for _ in range(3):
+            trainer.train_step(1e-3)
+    require_equal(plain, filling)
+    require_equal(plain, reading)
+    files = [path.name for path in tmp_path.rglob("*.safetensors")]
+    assert 4 < len(files) <= 8 and any("mirrored" in each for each in files) and not list(tmp_path.rglob("*.part"))
+
+
+def test_a_damaged_file_of_the_cache_is_made_anew(data: Path, weights: Any, tmp_path: Path) -> None:
+    plain, cached = (make_trainer("nwm-action", data, weights("nwm-action"), epochs=3) for _ in range(2))
+    cached._cache = LatentCache(tmp_path, {})
+    for step in range(3):
+        for path in tmp_path.rglob("*.safetensors"):
+            path.write_bytes(path.read_bytes()[: 40 * step])
+        plain.train_step(1e-3)
+        cached.train_step(1e-3)
+    require_equal(plain, cached)
+
+
+def test_trainings_share_a_cache_unless_latents_differ(data: Path, weights: Any, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"weights": weights("nwm-action"), "device": "cpu", "part": "all"}
+    options["cache"] = tmp_path / "cache"
+
+    def count(number: int, **changes: Any) -> int:
+        recipe = tiny_recipe("nwm-action", **changes)
+        post_train("nwm-action", data, tmp_path / f"out{number}", recipe=recipe, **options)
+        return len(list((tmp_path / "cache").iterdir()))
+
+    assert [count(0), count(1, rate=1e-2, ema=0.5), count(2, size=(64, 64))] == [1, 1, 2]
+
+
+def test_8_bit_adam_is_near_adam_and_resumes_exactly(data: Path, weights: Any) -> None:
+    pytest.importorskip("bitsandbytes", reason="no bitsandbytes: pip install 'wiw[lowbit]'")
+    name = "nwm-action"
+    whole, half, plain = (
+        make_trainer(name, data, weights(name), epochs=6, optimizer=kind)
+        for kind in ("adamw8bit", "adamw8bit", "adamw")
+    )
+    first = {key: value.detach().clone() for key, value in plain.trained.items()}
+    state = io.BytesIO()
+    for step in range(6):
+        whole.train_step(1e-3)
+        plain.train_step(1e-3)
+        if step == 2:
+            torch.save(whole.state_dict(), state)
+    state.seek(0)
+    half.load_state_dict(torch.load(state, weights_only=True))
+    for _ in range(3):
+        half.train_step(1e-3)
+    require_equal(whole, half)
+    apart, moved = (
+        sum(float((value - other[key]).abs().sum()) for key, value in plain.trained.items())
+        for other in (whole.trained, first)
+    )
+    assert 0 < apart < 0.5 * moved
+
+
+def test_8_bit_adam_that_is_not_installed_is_told(data: Path, weights: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "bitsandbytes" else found(name))
+    with pytest.raises(DependencyError, match=r"optimizer=adamw8bit needs; pip install 'wiw\[lowbit\]'"):
+        make_trainer("nwm-action", data, weights("nwm-action"), optimizer="adamw8bit")
+
+
+def test_remedies_name_what_is_not_yet_lowered() -> None:
+    said = "; ".join(list_remedies(tiny_recipe("svd-action", ema=0.9, precision="bfloat16")))
+    assert "rows=1 (now 2)" in said and "optimizer=adamw8bit" in said and "ema=0" in said and "64x128" in said
+    lean = tiny_recipe("svd-action", optimizer="adamw8bit", precision="bfloat16", rows=1)
+    assert list_remedies(lean)[0].startswith("lora=32") and np.isfinite(lean.rate)
