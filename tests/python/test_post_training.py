@@ -93,7 +93,7 @@ def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, wei
     trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0)
 
     def measure(place: str) -> float:
-        clips = [trainer._clips[int(row)] for row in trainer.order.select(0)]
+        clips = [trainer.clips[int(row)] for row in trainer.order.select(0)]
         with torch.no_grad():
             return float(trainer._compute_losses(place, clips * 4, torch.Generator().manual_seed(9)).mean())
 
@@ -230,7 +230,7 @@ def test_denoisers_are_called_as_world_models_call_them(
         Gaussian, "__init__", lambda self, parameters, deterministic=False: stock(self, parameters, True)
     )
     trainer = make_trainer(name, data, weights(name), checkpointing=False, rows=1, drop=0.0)
-    clip = trainer._clips[0]
+    clip = trainer.clips[0]
     trained = _record(
         trainer, lambda: trainer._compute_losses(trainer.places[0], [clip], torch.Generator().manual_seed(0))
     )
@@ -326,7 +326,7 @@ def test_what_has_no_loss_in_training_generates_the_clip(
     )
     trainer = make_trainer(name, data, weights(name), checkpointing=False, drop=0.0)
     objective, generator = trainer.objective, trainer.objective.generator
-    clip = load_clips([trainer._clips[0]], generator.size, np.arange(5)).frames
+    clip = load_clips([trainer.clips[0]], generator.size, np.arange(5)).frames
     encoded = objective.encode(clip, torch.Generator().manual_seed(0))
     for place in trainer.places:
         monkeypatch.setattr(getattr(objective.pipeline, place), "forward", _predict_perfectly(name, encoded["latents"]))
@@ -335,7 +335,7 @@ def test_what_has_no_loss_in_training_generates_the_clip(
             objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.places
         ]
     assert float(torch.cat(losses).max()) < 1e-6
-    plan = trainer._clips[0].actions[1:]
+    plan = trainer.clips[0].actions[1:]
     control = Control(plan, action.to_trajectory(plan), action.to_viewpoints(plan))
     arguments = generator.arguments
     generator.arguments = lambda *each: {**arguments(*each), "output_type": "latent"}

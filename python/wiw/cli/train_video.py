@@ -49,27 +49,38 @@ def train_video(
     Raises:
         ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.
     """
-    from wiw.errors import ArgumentError
     from wiw.runs.part_options import parse_options
     from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
     from wiw.training.post_training.train import choose_precision, post_train
 
-    if data is None:
-        raise ArgumentError(
-            f"{name} trains on a navigation dataset; give a folder of `wiw collect navigation` by --data"
-        )
+    folder = require_data(name, data)
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
     chosen = load_recipe(name, recipe, options)
     if "precision" not in options:
         chosen = choose_precision(chosen, weights.get("device"))
     began = time.monotonic()
-    with announce_resume(), _Progress(chosen.batch) as progress:
-        card = post_train(name, data, out, recipe=chosen, on_step=progress, **weights)
+    with announce_resume(), TrainingProgress(chosen.batch) as progress:
+        card = post_train(name, folder, out, recipe=chosen, on_step=progress, **weights)
     print(f"{card['steps']:,} steps of {chosen.batch} clips, loss {card['loss']:.4f}, {time.monotonic() - began:.0f} s")
     print(f"checkpoint  {out}")
     shown = " ".join(f"--world-model-option {pair}" for pair in (f"checkpoint={out}", *_list_shape(name, card)))
     print(f"run it:     wiw run imagenav --world-model {name} {shown}")
     return 0
+
+
+def require_data(name: str, data: Path | None) -> Path:
+    """Return the folder of the dataset.
+
+    Raises:
+        ArgumentError: there is none.
+    """
+    from wiw.errors import ArgumentError
+
+    if data is None:
+        raise ArgumentError(
+            f"{name} trains on a navigation dataset; give a folder of `wiw collect navigation` by --data"
+        )
+    return data
 
 
 def _list_shape(name: str, card: Mapping[str, Any]) -> list[str]:
@@ -80,13 +91,13 @@ def _list_shape(name: str, card: Mapping[str, Any]) -> list[str]:
     return [f"'{key}={card['recipe'][key]}'" for key in ("size", "frames") if card["recipe"][key] != usual[key]]
 
 
-class _Progress:
+class TrainingProgress:
     """Steps, loss, clips per second and memory: a bar with the time left, or a line a minute."""
 
     def __init__(self, batch: int) -> None:
         self._batch, self._bars = batch, Bars()
 
-    def __enter__(self) -> _Progress:
+    def __enter__(self) -> TrainingProgress:
         self._bars.__enter__()
         self._began = self._said = time.monotonic()
         self._first: int | None = None

@@ -34,7 +34,7 @@ class PocketRecipe(ClipRecipe):
     """Weight of absolute errors of colours."""
     squared: float = 4.0
     """Weight of squared errors of colours, which lie from -1 to 1."""
-    distance: float = 0.05
+    distance: float = 0.1
     """Weight of absolute errors of log-distances; 0 where the dataset has no depth."""
     average: float = 0.995
     """Decay of the moving average of the weights, which is what is kept."""

@@ -17,7 +17,7 @@ from wiw.networks import has_bfloat16
 from wiw.training.pocket.batches import PlaceBatch, draw_batch
 from wiw.training.pocket.frames import ReducedFrames
 from wiw.training.pocket.recipe import PocketRecipe
-from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seeded
+from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.noise import draw_shifted_uniform
 from wiw.world_models.pocket.network import Denoiser, Views
 
@@ -39,7 +39,7 @@ class PocketTrainer(ClipTrainer):
     def __init__(self, clips: Clips, frames: ReducedFrames, recipe: PocketRecipe) -> None:
         super().__init__(clips, recipe, torch.device("cpu"))
         self._frames = frames
-        with seeded(mix_seed(recipe.seed, "weights"), self.device):
+        with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
             self.network = Denoiser(recipe.size[0], recipe.widths).train()
         self._average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(recipe.average))
         self.start_optimizer(dict(self.network.named_parameters()))

@@ -86,7 +86,7 @@ class ClipTrainer(ResumableTrainer, ABC):
         total = 0.0
         for first in range(0, self.recipe.batch, self.rows):
             rows = batch[first : first + self.rows]
-            with seeded(mix_seed(self.recipe.seed, "step", self.step_count, first), self.device) as random:
+            with seed_torch(mix_seed(self.recipe.seed, "step", self.step_count, first), self.device) as random:
                 losses = self.compute_losses(rows, random)
                 loss = losses.sum() / self.recipe.batch
                 self._require_finite(losses, rows, "loss")
@@ -161,7 +161,7 @@ def mix_seed(seed: int, *parts: object) -> int:
 
 
 @contextmanager
-def seeded(seed: int, device: torch.device) -> Iterator[torch.Generator]:
+def seed_torch(seed: int, device: torch.device) -> Iterator[torch.Generator]:
     """Yield a generator on the CPU, and seed torch's own ones, which are as before afterwards."""
     devices = [device] if device.type == "cuda" else []
     with torch.random.fork_rng(devices):

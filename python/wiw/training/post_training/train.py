@@ -14,10 +14,11 @@ import wiw
 from wiw.datasets.navigation import NavigationData, Part
 from wiw.errors import ArgumentError, TrainingError
 from wiw.files import atomic_folder
+from wiw.training.post_training.clip_trainer import ClipTrainer, arrange_clips
 from wiw.training.post_training.families import find_family, load_generator
 from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
-from wiw.training.post_training.trainer import PostTrainer, arrange_clips
+from wiw.training.post_training.trainer import PostTrainer
 from wiw.training.trainer import run_training
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements
@@ -82,7 +83,7 @@ def post_train(
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
     dataset = NavigationData(data, part)
-    _require_panoramas(dataset)
+    require_panoramas(dataset)
     arrange_clips(len(dataset.clips(recipe.frames)), recipe)
     options = {"revision": revision, "variant": variant, "device": device, **_extra_options(name)}
     generator = load_generator(model, recipe, None if weights is None else _resolve(str(weights)), options)
@@ -100,14 +101,14 @@ def post_train(
     return card
 
 
-def run_steps(trainer: PostTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]) -> None:
+def run_steps(trainer: ClipTrainer, state: SignalledCheckpoint, on_step: Callable[[int, int, float], None]) -> None:
     """Train from the start, or from the state that is kept, to the end.
 
     Raises:
         TrainingError: the loss is not finite; the state before is kept.
         ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
     """
-    recipe, phases = trainer.recipe, len(trainer.places)
+    recipe, phases = trainer.recipe, trainer.phases
     with state.watch():
         try:
             run_training(
@@ -115,7 +116,7 @@ def run_steps(trainer: PostTrainer, state: SignalledCheckpoint, on_step: Callabl
                 recipe,
                 trainer.steps_per_epoch,
                 None,
-                lambda progress: recipe.scale_rate(progress * phases % 1),  # each denoiser has a schedule of its own
+                lambda progress: recipe.scale_rate(progress * phases % 1),  # each network has a schedule of its own
                 lambda step, steps, _: on_step(step, steps, trainer.mean_loss),
                 state,
             )
@@ -204,7 +205,8 @@ def _require_free(out: Path) -> None:
         raise ArgumentError(f"{out} holds something already; name a folder that is new or empty")
 
 
-def _require_panoramas(data: NavigationData) -> None:
+def require_panoramas(data: NavigationData) -> None:
+    """Raise ArgumentError unless a dataset is of panoramas."""
     camera = data.meta.get("camera", {}).get("projection")
     if camera != "equirectangular":
         raise ArgumentError(

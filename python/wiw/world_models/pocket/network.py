@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -110,22 +111,19 @@ class Denoiser(nn.Module):
     def __init__(self, height: int = 64, widths: tuple[int, ...] = (48, 96, 160, 224)) -> None:
         super().__init__()
         self.height, self.widths = height, tuple(widths)
-        fine, *coarser = self.widths
+        fine = self.widths[0]
         inputs = 3 + 3 * len(RADII) + 2
         self.outputs = (len(RADII) + 1, 3, 1)
         embedding = 4 * fine
         self.embed = nn.Sequential(nn.Linear(4 * FREQUENCIES, embedding), nn.SiLU(), nn.Linear(embedding, embedding))
         self.first = Convolution(inputs * PATCH**2, fine)
         self.down = nn.ModuleList([Scale(fine, fine, embedding, attends=False)])
-        self.shrink = nn.ModuleList()
-        self.up = nn.ModuleList([Scale(2 * fine, fine, embedding, attends=False)])
-        self.grow = nn.ModuleList()
-        for above, width in zip(self.widths, coarser, strict=False):
+        self.up, self.shrink, self.grow = nn.ModuleList(), nn.ModuleList(), nn.ModuleList()
+        for above, width in pairwise(self.widths):
             self.shrink.append(Convolution(above, width, stride=2))
             self.down.append(Scale(width, width, embedding, attends=True))
             self.grow.append(Convolution(width, above))
-            if width != self.widths[-1]:
-                self.up.append(Scale(2 * width, width, embedding, attends=True))
+            self.up.append(Scale(2 * above, above, embedding, attends=len(self.up) > 0))
         self.norm = nn.GroupNorm(8, fine)
         self.last = nn.Conv2d(fine, sum(self.outputs) * PATCH**2, 1)
         nn.init.normal_(self.last.weight, std=0.01)
