@@ -43,7 +43,10 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
 
 def train(
     what: Positional[
-        Annotated[Literal["recogniser", "warpnet", "pocket", "perception", "armnet", "diffuser", VideoName], arg(metavar="WHAT")]
+        Annotated[
+            Literal["recogniser", "warpnet", "pocket", "perception", "armnet", "diffuser", VideoName],
+            arg(metavar="WHAT"),
+        ]
     ] = "recogniser",
     /,
     *,
@@ -105,8 +108,8 @@ def train(
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
     beside copy and warp; for pocket, PSNR on windows of the val scenes, beside what has learnt nothing, and how much of
-    it is lost where it is told another window's places; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
-    val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
+    it is lost where it is told another window's places; for perception, accuracy and IoU of categories, accuracy of
+    states and of colour words on the val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
     diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults; those of
     perception for four epochs of a schedule that was first laid out for six (docs/perception.md).
 
@@ -121,12 +124,12 @@ def train(
         option: Number of such a recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
             `wiw.training.post_training.recipe.PostTrainingRecipe` and `wiw.training.pocket.recipe.PocketRecipe`.
         device: Of torch, for video models. Default: the GPU if there is one.
-        part: Part of the dataset for pocket and video models: train leaves out one in twenty scenes for validation. Default:
-            train.
+        part: Part of the dataset for pocket and video models: train leaves out one in twenty scenes for validation.
+            Default: train.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
             Default: apartments:train:80; 160 of them for perception.
-        val: Held-out scenes of recogniser, warpnet, pocket and perception. recogniser splits them, or the samples of a single
-            one, into halves for calibration and evaluation. Default: apartments:val:20.
+        val: Held-out scenes of recogniser, warpnet, pocket and perception. recogniser splits them, or the samples of a
+            single one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
         epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4

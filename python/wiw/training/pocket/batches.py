@@ -58,7 +58,9 @@ def draw_batch(
     colors = (colors + 1) * torch.from_numpy(gain.astype(np.float32)) - 1
     distances = None
     if frames.log_distances.size:
-        distances = torch.from_numpy(_turn(frames.log_distances[chosen], rolls, mirrored)[:, 1:, None].astype(np.float32))
+        distances = torch.from_numpy(
+            _turn(frames.log_distances[chosen], rolls, mirrored)[:, 1:, None].astype(np.float32)
+        )
     return PlaceBatch(colors[:, 0], torch.from_numpy(places[:, 1:].astype(np.float32)), colors[:, 1:], distances)
 
 
@@ -85,7 +87,10 @@ def compute_displacements(positions: NDArray[np.float64], facing: NDArray[np.flo
 def _turn(panoramas: NDArray[np.generic], rolls: NDArray[np.int64], mirrored: NDArray[np.bool_]) -> NDArray[np.generic]:
     """Roll panoramas [B, N, H, W, ...] by columns [B, N] to the right, then mirror those of some rows [B]."""
     made = np.stack(
-        [[np.roll(each, int(by), axis=1) for each, by in zip(row, bys, strict=True)] for row, bys in zip(panoramas, rolls, strict=True)]
+        [
+            [np.roll(each, int(by), axis=1) for each, by in zip(row, bys, strict=True)]
+            for row, bys in zip(panoramas, rolls, strict=True)
+        ]
     )
     made[mirrored] = made[mirrored, :, :, ::-1]
     return made

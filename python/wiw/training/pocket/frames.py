@@ -31,8 +31,7 @@ Bar = Callable[[Iterable[Any], str, int], Iterable[Any]]
 
 @dataclass(frozen=True)
 class ReducedFrames:
-    """P panoramas, one for each position, and the F frames of all segments that show them, one segment after another.
-    """
+    """P panoramas, one for each position, and the F frames that show them, one segment after another."""
 
     images: NDArray[np.uint8]
     """uint8 [P, H, W, 3]."""
@@ -66,7 +65,9 @@ def reduce_frames(
         with atomic_folder(place) as draft:
             for name, array in _build_arrays(data, size, bar).items():
                 np.save(draft / f"{name}.npy", array)
-    return ReducedFrames(**{each.name: np.load(place / f"{each.name}.npy", mmap_mode="r") for each in fields(ReducedFrames)})
+    return ReducedFrames(
+        **{each.name: np.load(place / f"{each.name}.npy", mmap_mode="r") for each in fields(ReducedFrames)}
+    )
 
 
 def read_heading(poses: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,7 +111,7 @@ def reduce_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.
 
 
 def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float16]:
-    """Return log-distances [h, w] of metres [H, W], at pixels' middles; where nothing is hit (0), that of `FARTHEST`."""
+    """Return log-distances [h, w] of metres [H, W], at pixels' middles; `FARTHEST` where nothing is hit (0)."""
     metres = cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)
     return np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST)).astype(np.float16)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Windows of held-out scenes, rendered as they are asked for: what world models are measured on.
 
-`wiw collect navigation` refuses scenes of val and test splits, so that nobody trains on them. These windows are drawn by
-the same traversals, and are never written.
+`wiw collect navigation` refuses scenes of val and test splits, so that nobody trains on them. These windows are drawn
+by the same traversals, and are never written.
 """
 
 from __future__ import annotations
@@ -152,12 +152,17 @@ def evaluate(
         window for name in bar(names, f"measuring on {specs}", len(names)) for window in draw_windows(name, count, seed)
     ]
     rows = list(measure(windows, {**BASELINES, "pocket": imagine_by(model)}, seed))
-    return {kind: _summarise([row for row in rows if row["kind"] == kind]) for kind in sorted({w.kind for w in windows})}
+    return {
+        kind: _summarise([row for row in rows if row["kind"] == kind]) for kind in sorted({w.kind for w in windows})
+    }
 
 
 def _summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     def average(model: str, control: str) -> dict[str, float]:
-        found = {step: [r["psnr"] for r in rows if (r["model"], r["control"], r["step"]) == (model, control, step)] for step in STEPS}
+        found = {
+            step: [r["psnr"] for r in rows if (r["model"], r["control"], r["step"]) == (model, control, step)]
+            for step in STEPS
+        }
         return {str(step): round(float(np.mean(values)), 3) for step, values in found.items() if values}
 
     psnr = {model: average(model, "true") for model in dict.fromkeys(row["model"] for row in rows)}

@@ -56,7 +56,11 @@ def train_pocket(
     require_panoramas(dataset)
     clips = dataset.clips(recipe.frames)
     arrange_clips(len(clips), recipe)
-    card: dict[str, Any] = {"wiw": wiw.__version__, "data": describe_dataset(dataset, part), "recipe": recipe.describe()}
+    card: dict[str, Any] = {
+        "wiw": wiw.__version__,
+        "data": describe_dataset(dataset, part),
+        "recipe": recipe.describe(),
+    }
     trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
     run_steps(trainer, state, on_step)

@@ -73,7 +73,7 @@ class PocketTrainer(ClipTrainer):
             estimate = self.network(noisy, levels, views.sweep, batch.places)
         errors = measure_errors(views.blend(estimate) - batch.views, recipe)
         if batch.log_distances is not None and recipe.distance:
-            found = estimate.log_distance.unflatten(0, levels.shape + (-1,))
+            found = estimate.log_distance.unflatten(0, (*levels.shape, -1))
             errors = errors + recipe.distance * average_sphere((found - batch.log_distances).abs())
         return errors / levels.clamp_min(recipe.least_level).square()
 

@@ -104,7 +104,12 @@ class Pocket(Trained):
             small = Views.around(to_network(shrink_panorama(image, self._network.size)[None]), moved)
             estimate = sample_views(self._network, small, draw_noise(small, [seed]), self.steps)
             size = image.shape[:2]
-            return np.stack([self._show(image, estimate.pick(row).enlarge(*size), moved[:, row : row + 1]) for row in range(len(places))])
+            return np.stack(
+                [
+                    self._show(image, estimate.pick(row).enlarge(*size), moved[:, row : row + 1])
+                    for row in range(len(places))
+                ]
+            )
 
     @staticmethod
     def _show(image: NDArray[np.uint8], estimate: Any, place: Tensor) -> NDArray[np.uint8]:
