@@ -36,7 +36,8 @@ class Pocket(Trained):
 
     Args:
         weights: a file of `wiw train pocket`; None means those that come with wiw.
-        steps: of the sampler: 1 gives the mean of what may be seen, more give sharper views that are less certain.
+        steps: of the sampler: 1 gives the mean of what may be seen, more draw one
+            of them, with blotches where it is uncertain.
 
     Raises:
         DependencyError: torch or safetensors is not installed.
