@@ -224,6 +224,7 @@ WORLD_MODELS = Registry(
         "wan2.2-a14b-action": "wiw.world_models.video.actions.variants:Wan22Action",
         "cosmos-predict2-action": "wiw.world_models.video.actions.variants:CosmosPredict2Action",
         "warpnet": "wiw.world_models.warpnet.model:WarpNet",
+        "pocket": "wiw.world_models.pocket.model:Pocket",
         "armnet": "wiw.world_models.armnet.model:ArmNet",
         "remote:": "wiw.world_models.remote.model:Remote",
     },

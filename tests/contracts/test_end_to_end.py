@@ -35,7 +35,7 @@ NAMES = wiw.registry.list_world_models()
 TASKS = ("imagenav", "ar")
 PLANS = (["forward", "turn_left"], ["turn_left", "forward"])
 POSES = ([[50, 40, 40, 0, 60, 60, 1], [50, 40, 30, 0, 60, 60, 0]], [[50, 60, 40, 0, 60, 60, 1]])
-MOVES_A_CAMERA = ("warp", "sana-wm", "nwm", "pathdreamer", "se3ds", "warpnet", "remote:")
+MOVES_A_CAMERA = ("warp", "sana-wm", "nwm", "pathdreamer", "se3ds", "warpnet", "pocket", "remote:")
 """World models that know nothing of poses of a gripper."""
 MOVES_AN_ARM = ("armnet",)
 """World models that know nothing else."""

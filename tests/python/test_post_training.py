@@ -214,7 +214,7 @@ def test_denoisers_are_called_as_world_models_call_them(
     )
     monkeypatch.setattr("wiw.training.post_training.svd.LOG_GIVEN", (-4.0, 0.0))  # about the noise of the pipeline
     trainer = make_trainer(name, data, weights(name), checkpointing=False, rows=1, drop=0.0)
-    clip, place, rows = trainer._clips[0], trainer.model.places[0], np.zeros(1, np.int64)
+    clip, place, rows = trainer.clips[0], trainer.model.places[0], np.zeros(1, np.int64)
     trained = _record(trainer, lambda: trainer._compute_losses(place, rows, torch.Generator().manual_seed(0)))
     generator = trainer.model.objective.generator
     control = Control(clip.actions[1:], action.to_trajectory(clip.actions[1:]), action.to_viewpoints(clip.actions[1:]))
@@ -307,7 +307,7 @@ def test_what_has_no_loss_in_training_generates_the_clip(
     )
     trainer = make_trainer(name, data, weights(name), checkpointing=False, drop=0.0)
     objective, generator = trainer.model.objective, trainer.model.objective.generator
-    clip = load_clips([trainer._clips[0]], generator.size).pixels
+    clip = load_clips([trainer.clips[0]], generator.size).pixels
     encoded = objective.sample(objective.encode(clip), torch.Generator().manual_seed(0))
     for place in trainer.model.places:
         monkeypatch.setattr(getattr(objective.pipeline, place), "forward", _predict_perfectly(name, encoded["latents"]))
@@ -316,7 +316,7 @@ def test_what_has_no_loss_in_training_generates_the_clip(
             objective.compute_losses(place, encoded, torch.Generator().manual_seed(1)) for place in trainer.model.places
         ]
     assert float(torch.cat(losses).max()) < 1e-6
-    plan = trainer._clips[0].actions[1:]
+    plan = trainer.clips[0].actions[1:]
     control = Control(plan, action.to_trajectory(plan), action.to_viewpoints(plan))
     arguments = generator.arguments
     generator.arguments = lambda *each: {**arguments(*each), "output_type": "latent"}
@@ -397,12 +397,12 @@ def test_a_killed_training_ends_with_the_same_bytes(data: Path, weights: Any, tm
 STOPPED = """
 import os, signal, sys
 from wiw.cli import run_process, train_video
-stock = train_video._Progress.__call__
+stock = train_video.TrainingProgress.__call__
 def show(self, step, steps, loss):
     stock(self, step, steps, loss)
     if step == 3:
         os.kill(os.getpid(), signal.SIGTERM)
-train_video._Progress.__call__ = show
+train_video.TrainingProgress.__call__ = show
 run_process()
 """
 

@@ -127,7 +127,7 @@ def test_the_network_is_called_as_the_world_model_calls_it(data: Path, weights: 
         trainer.model.network,
         lambda: trainer._compute_losses("cdit", np.array([3]), torch.Generator().manual_seed(0)),
     )
-    clip = trainer._clips[3]
+    clip = trainer.clips[3]
     model = NWM(weights=str(weights), steps=2, device="cpu")
     plan = clip.actions[4:5]
     control = Control(plan, action.to_trajectory(plan), action.to_viewpoints(plan), length=1)
@@ -182,13 +182,13 @@ def test_front_views_are_those_that_the_loop_shows(data: Path) -> None:
 def test_a_dataset_of_front_views_is_taken_as_it_is(tmp_path: Path, weights: Path) -> None:
     front = save_dataset(tmp_path / "front", projection="perspective")
     trainer = make_trainer("nwm-action", front, weights)
-    assert trainer._clips[0].images.shape == (6, 64, 128, 3) and np.isfinite(trainer.train_step(1e-4))
+    assert trainer.clips[0].images.shape == (6, 64, 128, 3) and np.isfinite(trainer.train_step(1e-4))
 
 
 def test_a_mirrored_clip_turns_the_other_way(data: Path, weights: Path) -> None:
     """What the network sees of a mirrored clip is the mirror image of what it sees of the clip."""
     trainer = make_trainer("nwm-action", data, weights)
-    clip = trainer._clips[1]
+    clip = trainer.clips[1]
     clip = Clip(clip.images, np.array([0, FORWARD, TURN_LEFT, TURN_RIGHT, TURN_LEFT, FORWARD], np.int8))
     mirrored = mirror_clip(clip)
     assert mirrored.actions.tolist() == [0, FORWARD, TURN_RIGHT, TURN_LEFT, TURN_RIGHT, FORWARD]

@@ -80,7 +80,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (scenes, "scenes", "Draw scenes and print their sizes."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
-    (train, "train", "Train a network: recogniser, warpnet, perception, armnet, diffuser or a video model."),
+    (train, "train", "Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model."),
 )
 
 

@@ -14,37 +14,42 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
+from wiw.cli.train_pocket import train_pocket
 from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, train_video
 
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
 ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
+ON_DATA = (*VIDEO, "pocket")
 USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "scenes": (ON_SCENES, "does not train on scenes"),
-    "val": (ON_SCENES, "does not train on scenes"),
+    "val": ((*ON_SCENES, "pocket"), "is not measured on scenes"),
     "places": (ON_SCENES, "does not train on scenes"),
     "categories": (("recogniser",), "has no categories"),
     "plays": (ON_PLAYS, "does not train on plays"),
     "demonstrations": (ON_DEMONSTRATIONS, "does not train on demonstrations"),
     "workers": ((*ON_SCENES, *ON_PLAYS), "prepares its data in one process"),
-    "cache": ((*ON_SCENES, *ON_PLAYS, *VIDEO), "caches no training data"),
+    "cache": ((*ON_SCENES, *ON_PLAYS, *ON_DATA), "caches no training data"),
     "minutes": ((*ON_SCENES, *ON_PLAYS, "diffuser"), "has no time limit, but --option clips=N"),
-    "data": (VIDEO, "trains on other data"),
+    "data": (ON_DATA, "trains on other data"),
     "weights": (VIDEO, "begins with random weights"),
-    "recipe": (VIDEO, "reads no recipe"),
-    "option": (VIDEO, "reads no recipe"),
+    "recipe": (ON_DATA, "reads no recipe"),
+    "option": (ON_DATA, "reads no recipe"),
     "device": (VIDEO, "trains on the CPU"),
-    "part": (VIDEO, "trains on other data"),
-    "validation": (VIDEO, "is evaluated on --val, if at all"),
-    "decisions": (VIDEO, "is evaluated on --val, if at all"),
-    "tracker": (VIDEO, "reports to no tracker"),
+    "part": (ON_DATA, "trains on other data"),
+    "validation": (ON_DATA, "is evaluated on --val, if at all"),
+    "decisions": (ON_DATA, "is evaluated on --val, if at all"),
+    "tracker": (ON_DATA, "reports to no tracker"),
 }
 """For each option that not all networks use: those that do, and why the others refuse it."""
 
 
 def train(
     what: Positional[
-        Annotated[Literal["recogniser", "warpnet", "perception", "armnet", "diffuser", VideoName], arg(metavar="WHAT")]
+        Annotated[
+            Literal["recogniser", "warpnet", "pocket", "perception", "armnet", "diffuser", VideoName],
+            arg(metavar="WHAT"),
+        ]
     ] = "recogniser",
     /,
     *,
@@ -70,11 +75,13 @@ def train(
     workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
 ) -> int:
-    """Train a network: recogniser, warpnet, perception, armnet, diffuser or a video model (NAME-action).
+    """Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model (NAME-action).
 
     recogniser: the policy of Active Recognition; it recognises the object in a red box from any number of real and
     imagined views. Trained on scenes.
     warpnet: a world model of navigation; it predicts the panorama that is seen from a place nearby. Trained on scenes.
+    pocket: a world model of navigation, too: a small video diffusion model that draws all views of a plan together.
+    Trained on a dataset of `wiw collect navigation`, without pretrained weights.
     perception: the labeller of question answering; it gives each pixel of a view a category and a state, on or off,
     open or closed. Colour words are calibrated along with it. Trained on scenes.
     armnet: a world model of manipulation; it predicts the front view after each gripper pose of a plan. Trained on
@@ -94,6 +101,7 @@ def train(
     $ wiw collect manipulation --episodes 120 --frames 16 --depth --out demos
     $ wiw train diffuser --demonstrations demos --out diffuser.safetensors
     $ wiw collect navigation --scenes apartments:train:80 --out data
+    $ wiw train pocket --data data --out pocket.safetensors
     $ wiw train ltx-action --data data --out runs/ltx
     $ wiw train wan2.1-action --data data --weights /models/wan2.1 --option clips=1600 --option lora=16 --out runs/wan
     $ wiw run imagenav --world-model ltx-action --world-model-option checkpoint=runs/ltx
@@ -101,44 +109,48 @@ def train(
     $ wiw train svd-action --data demos --out runs/svd-arm
 
     First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
-    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, diffuser takes
-    a night; less with --minutes. An interrupted training of perception, armnet, diffuser or a video model resumes from
-    its checkpoint beside FILE; repeat the command. Video models also write it at SIGUSR1.
+    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, pocket two to
+    three hours, diffuser a night; less with --minutes, or with --option clips=N for pocket. An interrupted training of
+    perception, pocket, armnet, diffuser or a video model resumes from its checkpoint beside FILE; repeat the command.
+    pocket and video models also write it at SIGUSR1.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
-    beside copy and warp; for perception, accuracy and IoU of categories, accuracy of states and of colour words on the
-    val scenes; for armnet, errors on held-out plays, beside copy and a table where nothing but the arm moves.
-    diffuser is not evaluated. The weights shipped with wiw were trained by this command with its defaults; those of
-    perception for four epochs of a schedule that was first laid out for six (docs/perception.md).
+    beside copy and warp; for pocket, PSNR on windows of the val scenes, beside what has learnt nothing, and how much of
+    it is lost where it is told another window's places; for perception, accuracy and IoU of categories, accuracy of
+    states and of colour words on the val scenes; for armnet, errors on held-out plays, beside copy and a table where
+    nothing but the arm moves. diffuser is not evaluated. The weights shipped with wiw were trained by this command with
+    its defaults; those of perception for four epochs of a schedule that was first laid out for six
+    (docs/perception.md), those of pocket on 16 800 clips.
 
     Args:
-        what: recogniser, warpnet, perception, armnet, diffuser or a video model.
+        what: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model.
         out: Weights, a safetensors file of a few MB. Default: WHAT.safetensors. For video models a new folder. Default:
             WHAT.
-        data: Dataset for video models: a folder of `wiw collect navigation`, or of `wiw collect manipulation`.
+        data: Dataset for pocket and video models: a folder of `wiw collect navigation`; for video models also of `wiw
+            collect manipulation`.
         weights: Pretrained weights that a video model begins with: a folder as save_pretrained writes it, or a name on
             the Hugging Face hub. Default: those of the world model.
-        recipe: YAML file with numbers of a video model's recipe, on top of the shipped ones.
-        option: Number of a video model's recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
-            `wiw.training.post_training.recipe.PostTrainingRecipe`.
+        recipe: YAML file with numbers of the recipe of pocket or a video model, on top of the shipped ones.
+        option: Number of such a recipe, such as rate=2e-5, clips=1600 or batch=8; may be given again. See
+            `wiw.training.post_training.recipe.PostTrainingRecipe` and `wiw.training.pocket.recipe.PocketRecipe`.
         device: Of torch, for video models. Default: the GPU if there is one.
-        part: Part of the dataset for video models: train leaves out one in twenty scenes, or demonstrations, for
-            validation. Default: train.
-        validation: Another dataset of `wiw collect navigation`, of other scenes, on which a video model is validated.
-            Default: the scenes that --part train leaves out.
-        decisions: File of `wiw collect decisions`, by which validation also measures how well a video model's order of
-            the plans agrees with the true one.
-        tracker: Program that draws a video model's loss and validation; needs its package. OUT.log/metrics.jsonl has
-            the same in any case.
+        part: Part of the dataset for pocket and video models: train leaves out one in twenty scenes, or demonstrations,
+            for validation. Default: train.
+        validation: Another dataset of `wiw collect navigation`, of other scenes, on which pocket or a video model is
+            validated while it trains. Default: the scenes that --part train leaves out.
+        decisions: File of `wiw collect decisions`, by which validation also measures how well the model's order of the
+            plans agrees with the true one.
+        tracker: Program that draws loss and validation of pocket or a video model; needs its package.
+            OUT.log/metrics.jsonl has the same in any case.
         scenes: Training scenes of recogniser, warpnet and perception: apartments:train[:N], a mesh or a Gazebo world.
             Default: apartments:train:80; 160 of them for perception.
-        val: Held-out scenes of recogniser, warpnet and perception. recogniser splits them, or the samples of a single
-            one, into halves for calibration and evaluation. Default: apartments:val:20.
+        val: Held-out scenes of recogniser, warpnet, pocket and perception. recogniser splits them, or the samples of a
+            single one, into halves for calibration and evaluation. Default: apartments:val:20.
         categories: What recogniser tells apart. Default: the built-in list of 26 categories.
         demonstrations: Folder of `wiw collect manipulation`: with depth for diffuser; additional data for armnet.
-        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 4 for perception
-            and armnet, 400 for diffuser.
+        epochs: How often each sample is used, on average. Default: 25 for recogniser, 6 for warpnet, 1 for pocket, 4
+            for perception and armnet, 400 for diffuser.
         minutes: Train fewer epochs if all of them would take longer than this.
         places: Places sampled in each scene, for recogniser (default: 16) and perception (default: 12), or walks
             recorded in each scene, for warpnet (default: 24).
@@ -188,6 +200,10 @@ def train(
             _train_diffuser(out, demonstrations, minutes, {**lengths, "seed": seed})
         elif what == "armnet":
             _train_armnet(out, source, minutes, DEFAULT_PLAYS if plays is None else plays, demonstrations, lengths)
+        elif what == "pocket":
+            numbers = _drop_none({"epochs": epochs, "seed": seed or None})
+            given = {"part": part or "train", "validation": validation, "decisions": decisions, "tracker": tracker}
+            train_pocket(out, data, source.cache, source.val, recipe, option, numbers, given, _show_bar)
         elif what == "perception":
             _train_perception(out, source, minutes, rules, lengths)
         else:

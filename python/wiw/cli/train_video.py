@@ -55,33 +55,33 @@ def train_video(
     Raises:
         ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.
     """
-    from wiw.errors import ArgumentError
     from wiw.runs.part_options import parse_options
     from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
     from wiw.training.post_training.train import choose_precision, post_train
 
-    if data is None:
-        raise ArgumentError(
-            f"{name} trains on a dataset; give a folder of `wiw collect navigation` or `wiw collect manipulation` by "
-            "--data"
-        )
+    folder = require_data(name, data, " or `wiw collect manipulation`")
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
     chosen = load_recipe(name, recipe, options)
     if "precision" not in options:
         chosen = choose_precision(chosen, weights.get("device"))
     began = time.monotonic()
-    with announce_resume(), _Progress(chosen.batch) as progress:
+    with announce_resume(), TrainingProgress(chosen.batch) as progress:
         card = post_train(
-            name, data, out, recipe=chosen, on_step=progress, on_validation=progress.show_validation, **weights
+            name, folder, out, recipe=chosen, on_step=progress, on_validation=progress.show_validation, **weights
         )
-    taken = time.monotonic() - began
-    print(f"{card['trained_steps']:,} steps of {chosen.batch} clips, loss {card['loss']:.4f}, {taken:.0f} s")
-    if "validation" in card:
-        print(f"best        step {card['steps']:,}: {describe_validation(card['validation'])}")
+    print(f"{describe_steps(card, chosen.batch)}, {time.monotonic() - began:.0f} s")
     print(f"log         {out}.log")
     print(f"checkpoint  {out}")
     print(f"run it:     {_write_command(out, card['run'])}")
     return 0
+
+
+def describe_steps(card: Mapping[str, Any], batch: int) -> str:
+    """Return how long a training was, how it ended, and which weights were the best."""
+    text = f"{card['trained_steps']:,} steps of {batch} clips, loss {card['loss']:.4f}"
+    if "validation" not in card:
+        return text
+    return f"{text}, best after {card['steps']:,} ({describe_validation(card['validation'])})"
 
 
 def _write_command(out: Path, run: Mapping[str, Any]) -> str:
@@ -92,13 +92,26 @@ def _write_command(out: Path, run: Mapping[str, Any]) -> str:
     return f"wiw run {run['task']} --world-model {run['world_model']} {shown}"
 
 
-class _Progress:
+def require_data(name: str, data: Path | None, also: str = "") -> Path:
+    """Return the folder of the dataset.
+
+    Raises:
+        ArgumentError: there is none.
+    """
+    from wiw.errors import ArgumentError
+
+    if data is None:
+        raise ArgumentError(f"{name} trains on a dataset; give a folder of `wiw collect navigation`{also} by --data")
+    return data
+
+
+class TrainingProgress:
     """Steps, loss, clips per second and memory: a bar with the time left, or a line a minute."""
 
     def __init__(self, batch: int) -> None:
         self._batch, self._bars = batch, Bars()
 
-    def __enter__(self) -> _Progress:
+    def __enter__(self) -> TrainingProgress:
         self._bars.__enter__()
         self._began = self._said = time.monotonic()
         self._first: int | None = None

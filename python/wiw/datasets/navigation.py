@@ -136,6 +136,12 @@ class Clips(Sequence[NavigationSegment]):
         segment, start = self.locate(index)
         return self._data.read(segment).clip(start, self._length)
 
+    def describe(self, index: int) -> str:
+        """Return scene, segment and first frame of a clip, in words."""
+        segment, start = self.locate(index)
+        scene = self[index].scene
+        return f"clip {index} (scene {scene}, segment {segment} of the dataset, from frame {start})"
+
     def locate(self, index: int) -> tuple[int, int]:
         """Return the segment of a clip, and the frame of it that the clip begins with."""
         at = index + len(self) if index < 0 else index

@@ -153,9 +153,16 @@ class NavigationClips(CorpusClips):
 
     def describe(self, index: int) -> str:
         """Return scene, segment and first frame."""
-        segment, start = self._clips.locate(index)
-        scene = self._clips[index].scene
-        return f"clip {index} (scene {scene}, segment {segment} of the dataset, from frame {start})"
+        return self._clips.describe(index)
+
+
+def require_panoramas(name: str, corpus: Corpus) -> None:
+    """Raise ArgumentError unless a corpus of primitives has panoramas, which models in the loop see."""
+    if corpus.view != "panorama":
+        raise ArgumentError(
+            f"{name}: models that follow primitives see panoramas, but this dataset has {corpus.view} views; collect "
+            "without --perspective"
+        )
 
 
 # -- manipulation ------------------------------------------------------------------------------------------------------

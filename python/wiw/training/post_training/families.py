@@ -13,7 +13,7 @@ from wiw.action import PoseGrid
 from wiw.errors import ArgumentError
 from wiw.suggestions import did_you_mean
 from wiw.training.post_training.conditioned_generator import ConditionedGenerator, build_config, identify_weights
-from wiw.training.post_training.corpora import Corpus, NavigationCorpus
+from wiw.training.post_training.corpora import Corpus, NavigationCorpus, require_panoramas
 from wiw.training.post_training.cosmos import CosmosObjective
 from wiw.training.post_training.ltx import LTXObjective
 from wiw.training.post_training.nwm import TrainableNWM
@@ -104,11 +104,8 @@ class VideoFamily(Family):
 
     def fit(self, corpus: Corpus, recipe: PostTrainingRecipe) -> tuple[Corpus, PostTrainingRecipe]:
         """Return both as they are, but for the size where the recipe leaves it open."""
-        if corpus.space != GRIPPER_POSES and corpus.view != "panorama":
-            raise ArgumentError(
-                f"{self.world_model}: models that follow primitives see panoramas, but this dataset has {corpus.view} "
-                "views; collect without --perspective"
-            )
+        if corpus.space != GRIPPER_POSES:
+            require_panoramas(self.world_model, corpus)
         if corpus.space == GRIPPER_POSES and recipe.mirror:
             raise ArgumentError("recipe: mirror: the mirror image of an arm is another arm; expected 0 for poses")
         return corpus, replace(recipe, size=recipe.size or self._find_size(corpus))

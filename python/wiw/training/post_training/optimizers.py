@@ -11,10 +11,10 @@ import torch
 from torch import nn
 
 from wiw.errors import DependencyError
-from wiw.training.post_training.recipe import PostTrainingRecipe
+from wiw.training.post_training.recipe import ClipRecipe
 
 
-def create_optimizer(parameters: Sequence[nn.Parameter], recipe: PostTrainingRecipe) -> torch.optim.Optimizer:
+def create_optimizer(parameters: Sequence[nn.Parameter], recipe: ClipRecipe) -> torch.optim.Optimizer:
     """Return the recipe's optimiser; "adamw8bit" keeps both moments in blocks of 8 bits (Dettmers et al. 2022).
 
     Raises:

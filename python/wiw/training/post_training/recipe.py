@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints, overload
 
 import yaml
 
@@ -20,8 +21,8 @@ OptimizerName = Literal["adamw", "adamw8bit"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PostTrainingRecipe:
-    """Numbers of one post-training.
+class ClipRecipe(ABC):
+    """Numbers of any training on clips of frames and actions.
 
     Raises:
         ArgumentError: a number is out of range.
@@ -33,37 +34,22 @@ class PostTrainingRecipe:
     """Height and width in pixels that clips are brought to; those of the world model if None."""
     rate: float
     """Peak learning rate."""
-    schedule: Schedule = "constant"
-    warmup: float = 0.0
-    """Share of the steps in which the learning rate grows from 0."""
     clips: int | None = 40_000
     """How many clips are trained on; all there are if None. Fewer clips are always among the more."""
     epochs: int = 1
     batch: int = 16
     """Clips per step of the optimiser."""
-    rows: int = 1
-    """Clips in one pass through the networks; gradients of several passes are added up."""
-    lora: int = 0
-    """Rank of the LoRA; 0 trains the whole denoiser."""
     shift: float = 1.0
     """How far noise levels are moved towards noise, where the model's schedule has a shift."""
-    drop: float = 0.1
-    """Share of clips whose actions are replaced by the null token."""
-    mirror: float = 0.0
-    """Share of clips whose left and right are exchanged, in frames and primitives."""
-    still: float = 0.0
-    """NWM: share of clips whose context is its last frame, repeated, as at the first decision of an episode."""
     clip_norm: float = 1.0
     """Largest norm of the gradient."""
     weight_decay: float = 0.01
     optimizer: OptimizerName = "adamw"
     """AdamW; "adamw8bit" keeps its moments in 8 bits, 2 bytes a parameter instead of 8."""
     ema: float = 0.0
-    """Decay a step of averaged weights, which the checkpoint then has; 0 averages nothing."""
+    """Decay a step of averaged weights, which are what is kept; 0 averages nothing."""
     precision: Precision = "bfloat16"
     """Precision of matrix products and of frozen weights; trained weights are float32."""
-    checkpointing: bool = True
-    """Whether activations are computed again in the backward pass, which takes less memory."""
     seed: int = 0
     held_out: float = 0.05
     """Share of the scenes, chosen by a hash of their names, that are left out of training, for validation."""
@@ -75,29 +61,76 @@ class PostTrainingRecipe:
     def __post_init__(self) -> None:
         if self.size is not None:
             object.__setattr__(self, "size", tuple(self.size))
-        counts = {"clips": self.clips or 1, "epochs": self.epochs, "batch": self.batch, "rows": self.rows}
-        counts |= {"validate_every": self.validate_every or 1, "validate_clips": self.validate_clips}
-        for name, value in {**counts, "frames": self.frames - 1}.items():
-            if value < 1:
-                raise ArgumentError(f"recipe: {name}: expected {2 if name == 'frames' else 1} or more, got {value}")
+        self._require_counts("clips", "epochs", "batch", "validate_every", "validate_clips")
+        self._require_shares("ema", "held_out")
+        if self.frames < 2:
+            raise ArgumentError(f"recipe: frames: expected 2 or more, got {self.frames}")
         for name in ("rate", "clip_norm", "shift"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ArgumentError(f"recipe: {name}: expected a finite number above 0, got {getattr(self, name)}")
-        for name in ("warmup", "drop", "mirror", "still", "ema", "held_out"):
-            if not 0 <= getattr(self, name) < 1:
-                raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
-        if self.lora < 0 or self.weight_decay < 0 or not 0 <= self.seed < 2**63:
-            raise ArgumentError("recipe: expected lora and weight_decay of 0 or more, and a seed from 0 to 2**63 - 1")
+        if self.weight_decay < 0 or not 0 <= self.seed < 2**63:
+            raise ArgumentError("recipe: expected a weight_decay of 0 or more, and a seed from 0 to 2**63 - 1")
         if self.size is not None and (len(self.size) != 2 or min(self.size) < 8):
             raise ArgumentError(f"recipe: size: expected height and width in pixels, got {self.size}")
-        if self.batch % self.rows:
-            raise ArgumentError(f"recipe: rows: expected a divisor of batch ({self.batch}), got {self.rows}")
 
     @property
     def clip_size(self) -> tuple[int, int]:
         """Height and width of clips, once it is known which model they are for."""
         assert self.size is not None, "the family fills it in"
         return self.size
+
+    @abstractmethod
+    def scale_rate(self, progress: float) -> float:
+        """Return the factor of the learning rate after a share of the steps, 0 to 1."""
+
+    def describe(self) -> dict[str, Any]:
+        """Return the recipe as JSON values."""
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+
+    def _require_counts(self, *names: str) -> None:
+        for name in names:
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ArgumentError(f"recipe: {name}: expected 1 or more, got {value}")
+
+    def _require_shares(self, *names: str) -> None:
+        for name in names:
+            if not 0 <= getattr(self, name) < 1:
+                raise ArgumentError(f"recipe: {name}: expected a share from 0 to below 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PostTrainingRecipe(ClipRecipe):
+    """Numbers of one post-training.
+
+    Raises:
+        ArgumentError: a number is out of range.
+    """
+
+    schedule: Schedule = "constant"
+    warmup: float = 0.0
+    """Share of the steps in which the learning rate grows from 0."""
+    rows: int = 1
+    """Clips in one pass through the networks; gradients of several passes are added up."""
+    lora: int = 0
+    """Rank of the LoRA; 0 trains the whole denoiser."""
+    drop: float = 0.1
+    """Share of clips whose actions are replaced by the null token."""
+    mirror: float = 0.0
+    """Share of clips whose left and right are exchanged, in frames and primitives."""
+    still: float = 0.0
+    """NWM: share of clips whose context is its last frame, repeated, as at the first decision of an episode."""
+    checkpointing: bool = True
+    """Whether activations are computed again in the backward pass, which takes less memory."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_counts("rows")
+        self._require_shares("warmup", "drop", "mirror", "still")
+        if self.lora < 0:
+            raise ArgumentError(f"recipe: lora: expected 0 or more, got {self.lora}")
+        if self.batch % self.rows:
+            raise ArgumentError(f"recipe: rows: expected a divisor of batch ({self.batch}), got {self.rows}")
 
     def scale_rate(self, progress: float) -> float:
         """Return the factor of the learning rate after a share of the steps, 0 to 1."""
@@ -111,15 +144,32 @@ class PostTrainingRecipe:
         }
         return factors[self.schedule]()
 
-    def describe(self) -> dict[str, Any]:
-        """Return the recipe as JSON values."""
-        return {**asdict(self), "size": None if self.size is None else list(self.size)}
+
+R = TypeVar("R", bound=ClipRecipe)
 
 
+@overload
 def load_recipe(
     name: str, file: str | Path | None = None, options: Mapping[str, Any] | None = None
-) -> PostTrainingRecipe:
+) -> PostTrainingRecipe: ...
+@overload
+def load_recipe(
+    name: str, file: str | Path | None = None, options: Mapping[str, Any] | None = None, *, kind: type[R]
+) -> R: ...
+def load_recipe(
+    name: str,
+    file: str | Path | None = None,
+    options: Mapping[str, Any] | None = None,
+    *,
+    kind: type[ClipRecipe] = PostTrainingRecipe,
+) -> ClipRecipe:
     """Return the recipe of a model: shipped, with a YAML file of one's own and options on top.
+
+    Args:
+        name: of the model.
+        file: YAML.
+        options: by name.
+        kind: of recipe that the model has.
 
     Raises:
         ArgumentError: a key that no recipe has, or a value of another type.
@@ -127,9 +177,9 @@ def load_recipe(
     """
     values: dict[str, Any] = {}
     for path in (FOLDER / f"{name}.yaml", *([Path(file)] if file else [])):
-        values |= _check(_read(path), str(path))
-    values |= _check(dict(options or {}), "recipe")
-    return PostTrainingRecipe(**values)
+        values |= _check(_read(path), str(path), kind)
+    values |= _check(dict(options or {}), "recipe", kind)
+    return kind(**values)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -142,9 +192,9 @@ def _read(path: Path) -> dict[str, Any]:
     return content
 
 
-def _check(values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    known = [field.name for field in fields(PostTrainingRecipe)]
-    kinds = get_type_hints(PostTrainingRecipe)
+def _check(values: Mapping[str, Any], where: str, kind: type[ClipRecipe]) -> dict[str, Any]:
+    known = [field.name for field in fields(kind)]
+    kinds = get_type_hints(kind)
     found: dict[str, Any] = {}
     for name, given in values.items():
         if name not in known:
@@ -173,13 +223,16 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind == int | None:
         return value is None or _fits(value, int)
     if kind == tuple[int, int] | None:
-        return value is None or (isinstance(value, list | tuple) and all(_fits(side, int) for side in value))
+        return value is None or _fits(value, tuple[int, int])
+    if get_origin(kind) is tuple:
+        return isinstance(value, list | tuple) and all(_fits(each, int) for each in value)
     return value in get_args(kind)
 
 
 def _describe(kind: Any) -> str:
     names: dict[Any, str] = {int: "a whole number", float: "a number", bool: "true or false"}
+    names |= {int | None: "a whole number or null", tuple[int, int]: "[height, width]"}
     names |= {tuple[int, int] | None: "[height, width] or null"}
     if kind in names:
         return names[kind]
-    return "a whole number or null" if kind == int | None else f"one of {', '.join(get_args(kind))}"
+    return "a list of whole numbers" if get_origin(kind) is tuple else f"one of {', '.join(get_args(kind))}"

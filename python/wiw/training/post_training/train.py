@@ -14,14 +14,15 @@ import wiw
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
+from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import Corpus, CorpusPart, NavigationCorpus, open_corpus
 from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
 from wiw.training.post_training.latent_cache import LatentCache
-from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
+from wiw.training.post_training.recipe import ClipRecipe, PostTrainingRecipe, load_recipe
 from wiw.training.post_training.sampling import create_sampler
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.trackers import open_tracker
-from wiw.training.post_training.trainer import PostTrainer, arrange_clips
+from wiw.training.post_training.trainer import PostTrainer
 from wiw.training.post_training.training_log import TrainingLog
 from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
 from wiw.training.trainer import run_training
@@ -108,16 +109,13 @@ def post_train(
         state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
         latents = None if cache is None else open_cache(Path(cache), loaded, corpus)
         trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe, latents)
-        folder = out.with_name(f"{out.name}.log")
         if not state.path.exists():
-            shutil.rmtree(folder, ignore_errors=True)  # of an earlier training under this name
-        trackers = [] if tracker is None else [open_tracker(tracker, out.name, folder, recipe.describe())]
+            remove_log(out)
         validated = ValidatedTrainer(
             trainer,
             create_sampler(trainer) if checked else None,
             checked,
-            TrainingLog(folder / LOG, trackers),
-            folder,
+            open_log(out, tracker, recipe),
             lambda best, found: write_checkpoint(best, trainer, {**card, **found}, lambda _: True),
             lambda: state.save_if_due(validated, recipe.epochs, validated.step_count),
             on_validation,
@@ -125,7 +123,7 @@ def post_train(
         run_steps(validated, state, on_step)
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
     card |= {"run": describe_run(family, corpus, recipe)}
-    card = publish_checkpoint(out, validated, card)
+    card = publish_checkpoint(out, validated, trainer, card)
     state.remove()
     return card
 
@@ -135,7 +133,7 @@ def find_held_out(
     corpus: Corpus,
     validation: str | Path | None,
     decisions: str | Path | None,
-    recipe: PostTrainingRecipe,
+    recipe: ClipRecipe,
 ) -> tuple[NavigationData, NavigationData] | None:
     """Return what is trained on, and what it is validated on: another dataset, or the scenes that it leaves out.
 
@@ -170,7 +168,7 @@ def run_steps(
         ArgumentError, FileError: see `wiw.training.checkpoint.Checkpoint`.
     """
     inner = trainer.trainer
-    recipe, phases = inner.recipe, len(inner.model.places)
+    recipe, phases = inner.recipe, inner.phases
     with state.watch():
         try:
             run_training(
@@ -191,7 +189,31 @@ def run_steps(
             trainer.finish()
 
 
-def publish_checkpoint(out: Path, trainer: ValidatedTrainer, card: Mapping[str, Any]) -> dict[str, Any]:
+def open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
+    """Return the log of a training, in `OUT.log`, which a tracker is told as well.
+
+    Raises:
+        DependencyError: the tracker's package is not installed.
+    """
+    folder = locate_log(out)
+    return TrainingLog(
+        folder / LOG, [] if tracker is None else [open_tracker(tracker, out.name, folder, recipe.describe())]
+    )
+
+
+def remove_log(out: Path) -> None:
+    """Remove the log of an earlier training under this name."""
+    shutil.rmtree(locate_log(out), ignore_errors=True)
+
+
+def locate_log(out: Path) -> Path:
+    """Return the folder of a training's log."""
+    return out.with_name(f"{out.name}.log")
+
+
+def publish_checkpoint(
+    out: Path, trainer: ValidatedTrainer, trained: PostTrainer, card: Mapping[str, Any]
+) -> dict[str, Any]:
     """Put the best weights in validation, or the last ones without it, where they belong; return their card.
 
     Raises:
@@ -199,7 +221,7 @@ def publish_checkpoint(out: Path, trainer: ValidatedTrainer, card: Mapping[str, 
     """
     if not trainer.best.exists():
         found = {**card, "steps": trainer.step_count}
-        write_checkpoint(out, trainer.trainer, found)
+        write_checkpoint(out, trained, found)
         return found
     own = json.loads((trainer.best / CARD).read_text(encoding="utf-8"))
     found = {**card, "steps": own["steps"], "validation": own["validation"]}

@@ -20,8 +20,8 @@ from wiw.files import atomic_file
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.decision_errors import measure_decisions
 from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, measure_clips, resize_frames, select_clips
-from wiw.training.post_training.recipe import PostTrainingRecipe
-from wiw.training.post_training.trainer import PostTrainer
+from wiw.training.post_training.clip_trainer import ClipTrainer
+from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.post_training.training_log import TrainingLog
 
 CARD = "training.json"
@@ -44,6 +44,8 @@ class ValidationSet:
 
     clips: HeldOutClips
     decisions: Decisions | None
+    every: int
+    """Steps between two validations."""
     identity: Mapping[str, Any]
     """JSON-able: which clips and decisions they are."""
 
@@ -57,7 +59,7 @@ class ValidationSet:
 
 
 def choose_validation_set(
-    data: NavigationData, held_out: NavigationData, decisions: str | Path | None, recipe: PostTrainingRecipe
+    data: NavigationData, held_out: NavigationData, decisions: str | Path | None, recipe: ClipRecipe
 ) -> ValidationSet:
     """Return the clips of held-out scenes that a training is validated on, and stored decisions, if any.
 
@@ -93,7 +95,8 @@ def choose_validation_set(
     identity: dict[str, Any] = {"data": held_out.digest(), "scenes": sorted(set(clips.scenes))}
     if decisions is not None:
         identity["decisions"] = digest_decisions(decisions)
-    return ValidationSet(clips, stored, identity)
+    assert recipe.validate_every, "asked for"
+    return ValidationSet(clips, stored, recipe.validate_every, identity)
 
 
 def resize_decisions(decisions: Decisions, size: tuple[int, int]) -> Decisions:
@@ -107,14 +110,13 @@ class ValidatedTrainer(ResumableTrainer):
     """A trainer that is validated before a step, every so many steps; what it learns does not depend on it.
 
     Validation belongs to the step after it, so that a state written before it resumes with it. The weights, the log
-    and the picture of the best are in `folder`.
+    and the picture of the best are in one folder.
 
     Args:
         trainer: to be validated.
         imagine: with its networks.
         validation: what it is measured on; None to log alone.
-        log: of the training.
-        folder: for pictures and the best weights.
+        log: of the training; pictures and the best weights lie beside it.
         save: writes the trainer's weights as a checkpoint, given the folder and what was found.
         between: called between two calls of the model, such as to stop when told to.
         on_validation: told what was found.
@@ -122,17 +124,16 @@ class ValidatedTrainer(ResumableTrainer):
 
     def __init__(
         self,
-        trainer: PostTrainer,
+        trainer: ClipTrainer,
         imagine: Imagine | None,
         validation: ValidationSet | None,
         log: TrainingLog,
-        folder: Path,
         save: Callable[[Path, Mapping[str, Any]], None],
         between: Callable[[], None] = lambda: None,
         on_validation: OnValidation = lambda *_: None,
     ) -> None:
         self.trainer, self._imagine, self._validation, self._log = trainer, imagine, validation, log
-        self._folder, self._save, self._between, self._tell = folder, save, between, on_validation
+        self._folder, self._save, self._between, self._tell = log.path.parent, save, between, on_validation
         self._validated: set[int] = set()
 
     @property
@@ -144,10 +145,9 @@ class ValidatedTrainer(ResumableTrainer):
         """Validate if it is time, then train on one batch and return its loss.
 
         Raises:
-            TrainingError, FileError: see `PostTrainer.train_step`.
+            TrainingError, FileError: see `ClipTrainer.train_step`.
         """
-        every = self.trainer.recipe.validate_every
-        if every and self.step_count % every == 0:
+        if self._validation is not None and self.step_count % self._validation.every == 0:
             self.validate()
         loss = self.trainer.train_step(learning_rate)
         self._log.write(self.step_count, {"loss": loss, "rate": learning_rate})

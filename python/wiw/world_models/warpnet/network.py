@@ -55,22 +55,25 @@ def rays(height: int, width: int) -> Tensor:
 
 @cache
 @torch.inference_mode(False)  # training may use what was first made for a rollout
-def plain_room(height: int, width: int) -> Tensor:
-    """Return log-distances [1, H, W] from the middle of a round room 2.6 m high and 5 m wide, 1 m above its floor."""
+def plain_room(height: int, width: int, radius: float = 2.5) -> Tensor:
+    """Return log-distances [1, H, W] from the middle of a round room 2.6 m high, 1 m above its floor."""
     up = rays(height, width)[1:2]
     level = (1 - up * up).sqrt()
     floor_or_ceiling = torch.where(up < 0, 1.0, 1.6) / up.abs()
-    return torch.minimum(floor_or_ceiling, 2.5 / level).log()
+    return torch.minimum(floor_or_ceiling, radius / level).log()
 
 
-def warp(source: Tensor, log_distance: Tensor, ahead: Tensor) -> Tensor:
-    """Return colours [B, C, H, W] from `ahead` [B] metres further ahead, where things will be exp(log_distance) away.
+def warp(source: Tensor, log_distance: Tensor, ahead: Tensor, right: Tensor | None = None) -> Tensor:
+    """Return colours [B, C, H, W] from `ahead` [B] metres further ahead, and `right` [B] (0 if None) further right,
+    where things will be exp(log_distance) away.
 
     Each pixel's point is carried back into the source's frame and its colour taken there, bilinearly.
     """
     height, width = log_distance.shape[-2:]
     points = log_distance.clamp(_log(NEAREST), _log(FARTHEST)).exp() * rays(height, width)
     x, y, z = points[:, 0], points[:, 1], points[:, 2] - ahead[:, None, None]
+    if right is not None:
+        x = x + right[:, None, None]
     longitude, latitude = torch.atan2(x, -z), torch.atan2(y, (x * x + z * z).clamp_min(1e-8).sqrt())
     columns = source.shape[-1]
     u = longitude * ((1 / torch.pi) * columns / (columns + 2))  # one more column on each side

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw train pocket`: a small video generator, from nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from wiw.cli.train_video import TrainingProgress, describe_steps, require_data
+
+
+def train_pocket(
+    out: Path,
+    data: Path | None,
+    cache: Path,
+    val: str,
+    recipe: Path | None,
+    pairs: Sequence[str],
+    numbers: Mapping[str, Any],
+    given: Mapping[str, Any],
+    bar: Callable[..., Any],
+) -> None:
+    """Train pocket, measure it on held-out scenes and print what was found.
+
+    Args:
+        out: file of the weights.
+        data: folder of the dataset.
+        cache: folder of prepared training data.
+        val: scenes that it is measured on.
+        recipe: YAML file on top of the shipped recipe.
+        pairs: KEY=VALUE of the recipe, on top of both.
+        numbers: of the recipe that have flags of their own.
+        given: part of the dataset, and what it is validated on.
+        bar: wraps an iterable in a progress bar.
+
+    Raises:
+        ArgumentError: no data; see also `wiw.training.pocket.train.train_pocket`.
+    """
+    from wiw.runs.part_options import parse_options
+    from wiw.training.pocket import train as training
+    from wiw.training.pocket.held_out import evaluate
+    from wiw.training.pocket.recipe import PocketRecipe
+    from wiw.training.post_training.recipe import load_recipe
+    from wiw.world_models.pocket.model import Pocket
+    from wiw.world_models.pocket.weights import load, save
+
+    options = {**numbers, **parse_options(pairs, PocketRecipe, "--option")}
+    chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
+    folder = require_data("pocket", data)
+    with TrainingProgress(chosen.batch) as progress:
+        card = training.train_pocket(
+            folder, out, cache, chosen, on_step=progress, on_validation=progress.show_validation, bar=bar, **given
+        )
+    card["val"] = val
+    card["held_out"] = evaluate(Pocket(out), val, chosen.seed, bar=bar)
+    save(out, load(out)[0], card)
+    _report(card)
+    print(f"log       {out}.log")
+
+
+def _report(card: Mapping[str, Any]) -> None:
+    print(describe_steps(card, card["recipe"]["batch"]))
+    for kind, found in card["held_out"].items():
+        print(f"{f'{kind}: steps of 0.2 m ahead':<30}" + "".join(f"{step:>8}" for step in found["psnr"]["copy"]))
+        for name, values in found["psnr"].items():
+            print(f"  {name:<28}" + "".join(f"{values[step]:8.1f}" for step in values))
+        if found["gap"]:
+            print(f"  {'control gap':<28}" + "".join(f"{value:8.1f}" for value in found["gap"].values()))
+    print("PSNR in dB of whole panoramas, weighted by latitude; the gap is what is lost when others' places are shown")

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames of a navigation dataset in pocket's size, decoded once and kept on disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import partial
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from wiw.datasets.navigation import NavigationData
+from wiw.datasets.navigation_segment import DEPTH_UNITS, NavigationSegment
+from wiw.errors import ArgumentError
+from wiw.files import atomic_folder
+from wiw.training.jobs import count_threads
+from wiw.world_models.warpnet.network import FARTHEST, NEAREST
+
+VERSION = 1
+"""Of what is kept; raised when it changes."""
+Bar = Callable[[Iterable[Any], str, int], Iterable[Any]]
+"""Wraps an iterable of a given number of items in a progress bar: (items, text, total)."""
+
+
+@dataclass(frozen=True)
+class ReducedFrames:
+    """P panoramas, one for each position, and the F frames that show them, one segment after another."""
+
+    images: NDArray[np.uint8]
+    """uint8 [P, H, W, 3]."""
+    log_distances: NDArray[np.float16]
+    """float16 [P, H, W]: of metres along the ray; empty [P, 0, 0] where no depth was collected."""
+    poses: NDArray[np.float64]
+    """float64 [P, 3]: x and z in the world in metres, and the heading in radians to the left of -Z."""
+    pictures: NDArray[np.int64]
+    """int64 [F]: the panorama of each frame."""
+    starts: NDArray[np.int64]
+    """int64 [S]: first frame of each segment."""
+
+    def find_places(self, segment: int, start: int, length: int) -> NDArray[np.int64]:
+        """Return the panoramas of a clip, each once, in order."""
+        first = self.starts[segment] + start
+        shown = self.pictures[first : first + length]
+        return shown[np.concatenate([[True], np.diff(shown) != 0])]
+
+
+def reduce_frames(
+    data: NavigationData, size: tuple[int, int], folder: Path, bar: Bar = lambda items, text, total: items
+) -> ReducedFrames:
+    """Return the frames of a dataset in a size (height, width); what `folder` has of it is not decoded again.
+
+    Raises:
+        FileError: the dataset is damaged, or the folder cannot be written.
+        ArgumentError: the dataset's panoramas cannot be turned by whole columns in that size.
+    """
+    place = folder / f"pocket-{_compute_digest(data, size)}"
+    if not place.is_dir():
+        with atomic_folder(place) as draft:
+            for name, array in _build_arrays(data, size, bar).items():
+                np.save(draft / f"{name}.npy", array)
+    return ReducedFrames(
+        **{each.name: np.load(place / f"{each.name}.npy", mmap_mode="r") for each in fields(ReducedFrames)}
+    )
+
+
+def read_heading(poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return headings [...] of cameras [..., 4, 4], in radians to the left of -Z."""
+    return np.arctan2(poses[..., 0, 2], poses[..., 2, 2])
+
+
+def _compute_digest(data: NavigationData, size: tuple[int, int]) -> str:
+    rows = [(row["file"], row["row_group"]) for row in data.segments]
+    identity = [VERSION, data.meta["files"], rows, list(size)]
+    return blake2b(json.dumps(identity, sort_keys=True).encode(), digest_size=12).hexdigest()
+
+
+def _build_arrays(data: NavigationData, size: tuple[int, int], bar: Bar) -> dict[str, NDArray[Any]]:
+    with ThreadPoolExecutor(count_threads()) as pool:
+        parts = [_reduce_segment(segment, size, pool) for segment in bar(data, "decoding segments", len(data))]
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in ("images", "log_distances", "poses")}
+    firsts = np.cumsum([0, *(len(part["images"]) for part in parts[:-1])])
+    arrays["pictures"] = np.concatenate([part["pictures"] + at for part, at in zip(parts, firsts, strict=True)])
+    arrays["starts"] = np.cumsum([0, *(len(part["pictures"]) for part in parts[:-1])])
+    return arrays
+
+
+def _reduce_segment(segment: NavigationSegment, size: tuple[int, int], pool: Executor) -> dict[str, NDArray[Any]]:
+    shown, pictures = np.unique(segment.sources, return_inverse=True)
+    decoded = list(pool.map(partial(_decode_small, segment, size), shown.tolist()))
+    poses = segment.poses[shown]
+    headings = read_heading(poses)
+    _require_whole_columns(segment, headings - headings[0], size[1])
+    return {
+        "images": np.stack([image for image, _ in decoded]),
+        "log_distances": np.stack([log_distance for _, log_distance in decoded]),
+        "poses": np.column_stack([poses[:, 0, 3], poses[:, 2, 3], headings]),
+        "pictures": pictures,
+    }
+
+
+def reduce_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return a panorama in a size (height, width), by means over areas."""
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
+
+
+def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float16]:
+    """Return log-distances [h, w] of metres [H, W], at pixels' middles; `FARTHEST` where nothing is hit (0)."""
+    metres = cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST)).astype(np.float16)
+
+
+def _decode_small(
+    segment: NavigationSegment, size: tuple[int, int], frame: int
+) -> tuple[NDArray[np.uint8], NDArray[np.float16]]:
+    """Return a frame's picture, and its log-distances, empty where no depth was collected."""
+    color, depth = segment.decode(frame)
+    if depth is None:
+        return reduce_image(color, size), np.zeros((0, 0), np.float16)
+    return reduce_image(color, size), reduce_depth(depth.astype(np.float32) / np.float32(DEPTH_UNITS), size)
+
+
+def _require_whole_columns(segment: NavigationSegment, turns: NDArray[np.float64], width: int) -> None:
+    columns = turns / (2 * np.pi) * width
+    if np.abs(columns - columns.round()).max() > 0.01:
+        raise ArgumentError(
+            f"{segment.scene}, segment {segment.segment}: expected turns by whole columns of panoramas {width} columns "
+            f"wide, got one by {columns[np.abs(columns - columns.round()).argmax()]:.2f}"
+        )

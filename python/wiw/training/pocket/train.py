@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train pocket on a navigation dataset, or resume its training, and write its weights."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import wiw
+from wiw.datasets.navigation import NavigationData, Part
+from wiw.files import atomic_file
+from wiw.training.held_out_clips import Frames, Imagine, imagine_with
+from wiw.training.pocket.frames import Bar, reduce_frames
+from wiw.training.pocket.recipe import PocketRecipe
+from wiw.training.pocket.trainer import PocketTrainer
+from wiw.training.post_training.clip_trainer import arrange_clips
+from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
+from wiw.training.post_training.stop_signals import SignalledCheckpoint
+from wiw.training.post_training.train import find_held_out, open_log, remove_log, run_steps
+from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
+from wiw.world_models.pocket.model import Pocket
+from wiw.world_models.pocket.weights import load, save
+
+BEST = "pocket.safetensors"
+"""Name of the best weights so far, in the log's folder."""
+
+
+def train_pocket(
+    data: str | Path,
+    out: Path,
+    cache: Path,
+    recipe: PocketRecipe,
+    part: Part = "train",
+    validation: str | Path | None = None,
+    decisions: str | Path | None = None,
+    tracker: str | None = None,
+    seconds: float = 600.0,
+    on_step: Callable[[int, int, float], None] = lambda *_: None,
+    on_validation: OnValidation = lambda *_: None,
+    bar: Bar = lambda items, text, total: items,
+) -> dict[str, Any]:
+    """Train, or resume, and write the file of weights: the best in validation, or the last without it.
+
+    A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
+    SIGTERM or Ctrl-C. The same call resumes from it; with the same number of threads it ends with the same bytes.
+    `OUT.log` has the loss of each step and what validations found.
+
+    Args:
+        data: folder of `wiw collect navigation`, of panoramas.
+        out: file of the weights.
+        cache: folder of frames in the recipe's size, which are made once.
+        recipe: the numbers.
+        part: of the dataset: "train", which leaves a share of the scenes for validation, or "all".
+        validation: folder of another dataset whose clips it is validated on; the scenes left out if None.
+        decisions: file of `wiw collect decisions`, for the rank agreement with the oracle.
+        tracker: "trackio", "wandb" or "tensorboard", told what the log is.
+        seconds: least time between two writes of the state.
+        on_step: called after each step with its number, the number of all steps and a running mean of the loss.
+        on_validation: called after each validation with the number of steps done and what was found.
+        bar: shows how far decoding has come.
+
+    Returns:
+        The card in the file: data, recipe, steps, validation and the loss at the end.
+
+    Raises:
+        ArgumentError: a dataset of perspective views, too few clips, a state of a training with other data or numbers,
+            or validation on scenes that are trained on or not there.
+        TrainingError: the loss is not finite; the last good state is kept, the message names the batch.
+        FileError: the dataset is missing or damaged, or a file cannot be written.
+    """
+    dataset = NavigationData(data, part, recipe.held_out)
+    corpus = NavigationCorpus(dataset, part)
+    require_panoramas("pocket", corpus)
+    clips = dataset.clips(recipe.frames)
+    arrange_clips(len(clips), recipe)
+    split = find_held_out("pocket", corpus, validation, decisions, recipe)
+    checked = None if split is None else choose_validation_set(*split, decisions, recipe)
+    card: dict[str, Any] = {"wiw": wiw.__version__, "data": corpus.describe(), "recipe": recipe.describe()}
+    card |= {"validated_on": checked.identity if checked else None}
+    trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
+    state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
+    if not state.path.exists():
+        remove_log(out)
+    validated = ValidatedTrainer(
+        trainer,
+        create_sampler(trainer),
+        checked,
+        open_log(out, tracker, recipe),
+        lambda best, found: _save_best(best, trainer, found),
+        lambda: state.save_if_due(validated, recipe.epochs, validated.step_count),
+        on_validation,
+    )
+    run_steps(validated, state, on_step)
+    card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
+    card = _publish_weights(out, validated, trainer, card)
+    state.remove()
+    return card
+
+
+def create_sampler(trainer: PocketTrainer) -> Imagine:
+    """Return how the network in training imagines, with its averaged weights."""
+    imagine = imagine_with(Pocket.of(trainer.network))
+    trainer.network.train()
+
+    def imagine_now(
+        images: Frames, plans: NDArray[np.int8], seeds: NDArray[np.uint64], wanted: NDArray[np.int64]
+    ) -> Frames:
+        with trainer.use_averages():
+            trainer.network.eval()
+            try:
+                return imagine(images, plans, seeds, wanted)
+            finally:
+                trainer.network.train()
+
+    return imagine_now
+
+
+def _save_best(folder: Path, trainer: PocketTrainer, found: Mapping[str, Any]) -> None:
+    with trainer.use_averages():
+        save(folder / BEST, trainer.network, found)
+    with atomic_file(folder / CARD) as draft:
+        draft.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+
+
+def _publish_weights(
+    out: Path, validated: ValidatedTrainer, trainer: PocketTrainer, card: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Write the best weights in validation, or the last ones without it; return their card."""
+    if not validated.best.exists():
+        found = {**card, "steps": trainer.step_count}
+        with trainer.use_averages():
+            save(out, trainer.network, found)
+        return found
+    network, own = load(validated.best / BEST)
+    found = {**card, **own}
+    save(out, network, found)
+    shutil.rmtree(validated.best)
+    return found

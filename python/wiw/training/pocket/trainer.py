@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train pocket's denoiser: flow matching between noise and views, the clean views predicted."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from wiw.datasets.navigation import Clips
+from wiw.networks import has_bfloat16
+from wiw.training.pocket.batches import PlaceBatch, draw_batch
+from wiw.training.pocket.frames import ReducedFrames
+from wiw.training.pocket.recipe import PocketRecipe
+from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
+from wiw.training.post_training.noise import draw_shifted_uniform
+from wiw.world_models.pocket.network import Denoiser, Views
+
+
+class PocketTrainer(ClipTrainer):
+    """Train a denoiser from random weights, and average them.
+
+    Args:
+        clips: what is trained on.
+        frames: of the same dataset, in the recipe's size.
+        recipe: of the training.
+
+    Raises:
+        ArgumentError: there are fewer clips than one step takes.
+    """
+
+    recipe: PocketRecipe
+    clips: Clips
+
+    def __init__(self, clips: Clips, frames: ReducedFrames, recipe: PocketRecipe) -> None:
+        super().__init__(clips, recipe, torch.device("cpu"))
+        self._frames = frames
+        with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
+            self.network = Denoiser(recipe.size[0], recipe.widths).train()
+        self.start_optimizer(dict(self.network.named_parameters()))
+
+    def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
+        """Return the loss of each clip."""
+        clips = [self._frames.find_places(*self.clips.locate(int(row)), self.recipe.frames) for row in rows]
+        rng = np.random.default_rng(int(torch.randint(2**62, (), generator=random)))
+        return self._compute_losses(draw_batch(self._frames, clips, self.recipe.places, rng), random)
+
+    def _compute_losses(self, batch: PlaceBatch, random: torch.Generator) -> Tensor:
+        recipe = self.recipe
+        levels = draw_shifted_uniform(len(batch.source), recipe.shift, random)
+        levels[torch.rand(len(levels), generator=random) < recipe.pure_noise] = 1
+        noise = torch.randn(batch.views.shape, generator=random)
+        noisy = torch.lerp(batch.views, noise, levels[:, None, None, None, None])
+        views = Views.around(batch.source, batch.places)
+        with torch.autocast("cpu", torch.bfloat16, enabled=recipe.precision == "bfloat16" and has_bfloat16()):
+            estimate = self.network(noisy, levels, views.sweep, batch.places)
+        errors = measure_errors(views.blend(estimate) - batch.views, recipe)
+        if batch.log_distances is not None and recipe.distance:
+            found = estimate.log_distance.unflatten(0, (*levels.shape, -1))
+            errors = errors + recipe.distance * average_sphere((found - batch.log_distances).abs())
+        return errors / levels.clamp_min(recipe.least_level).square()
+
+
+def measure_errors(difference: Tensor, recipe: PocketRecipe) -> Tensor:
+    """Return the errors of colours [B, F, 3, H, W] of each clip."""
+    return average_sphere(recipe.squared * difference.square() + recipe.absolute * difference.abs())
+
+
+def average_sphere(values: Tensor) -> Tensor:
+    """Return means [B] of panoramas [B, F, C, H, W], in which pixels count as the area that they cover."""
+    height = values.shape[-2]
+    areas = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))
+    return (values.mean(dim=(1, 2, 4)) * areas).sum(dim=1) / areas.sum()

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""pocket's training: what its batches show, that it learns, stops, resumes, and is measured."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from wiw.cli import main
+from wiw.datasets.navigation import NavigationData
+from wiw.errors import ArgumentError, TrainingError
+from wiw.training.collect_navigation import collect_navigation
+
+pytest.importorskip("pyarrow", reason="needs wiw[export]")
+torch = pytest.importorskip("torch", reason="needs wiw[torch]")
+
+from wiw.training.held_out_clips import imagine_with, select_clips  # noqa: E402
+from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
+from wiw.training.pocket.frames import ReducedFrames, reduce_frames  # noqa: E402
+from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
+from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
+from wiw.training.pocket.train import create_sampler, train_pocket  # noqa: E402
+from wiw.training.pocket.trainer import PocketTrainer, average_sphere  # noqa: E402
+from wiw.training.post_training.recipe import load_recipe  # noqa: E402
+from wiw.training.post_training.validation import ValidationSet  # noqa: E402
+from wiw.world_models.pocket.model import Pocket  # noqa: E402
+from wiw.world_models.pocket.weights import load  # noqa: E402
+from wiw.world_models.warpnet.network import warp  # noqa: E402
+
+RULES = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5}
+SIZE = (16, 32)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory, two_rooms: str) -> Path:
+    folder = tmp_path_factory.mktemp("navigation")
+    collect_navigation(folder, two_rooms, rules=RULES, size=(64, 128), seed=3, backend="cpu", lossless=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def frames(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> ReducedFrames:
+    return reduce_frames(NavigationData(dataset), (64, 128), tmp_path_factory.mktemp("frames"))
+
+
+def recipe(**changes: Any) -> PocketRecipe:
+    small = {"size": SIZE, "widths": (8, 32, 32, 32), "frames": 8, "places": 3, "clips": 4, "precision": "float32"}
+    return load_recipe("pocket", options={**small, **changes}, kind=PocketRecipe)
+
+
+def trainer(dataset: Path, cache: Path, **changes: Any) -> PocketTrainer:
+    data, chosen = NavigationData(dataset), recipe(**changes)
+    return PocketTrainer(data.clips(chosen.frames), reduce_frames(data, chosen.size, cache), chosen)
+
+
+# -- data --------------------------------------------------------------------------------------------------------------
+
+
+def test_frames_are_decoded_once_and_show_what_the_dataset_shows(
+    dataset: Path, tmp_path: Path, monkeypatch: Any
+) -> None:
+    data = NavigationData(dataset)
+    frames = reduce_frames(data, (64, 128), tmp_path)
+    for index in (0, len(data) - 1):
+        segment = data[index]
+        places = frames.find_places(index, 0, len(segment))
+        assert len(places) == len(np.unique(segment.sources))
+        first = frames.starts[index]
+        for at in range(len(segment)):
+            picture = int(frames.pictures[first + at])
+            shown = np.roll(frames.images[picture], int(segment.rolls[at]), axis=1)
+            np.testing.assert_array_equal(shown, segment.images[at])
+    monkeypatch.setattr("wiw.training.pocket.frames._build_arrays", None)
+    again = reduce_frames(data, (64, 128), tmp_path)
+    np.testing.assert_array_equal(again.images, frames.images)
+
+
+def test_with_the_true_distances_a_batch_is_the_warp_of_its_source(frames: ReducedFrames, dataset: Path) -> None:
+    """So places, turns, mirrors and distances belong together."""
+    rng = np.random.default_rng(0)
+    clips = NavigationData(dataset).clips(8)
+    chosen = [frames.find_places(*clips.locate(int(row)), 8) for row in rng.integers(0, len(clips), 24)]
+    batch = draw_batch(frames, [clip for clip in chosen if len(clip) > 4], 3, rng)
+    assert batch.log_distances is not None
+    right, ahead = batch.places.flatten(0, 1).unbind(1)
+    source = batch.source.repeat_interleave(3, dim=0)
+    made = warp(source, batch.log_distances.flatten(0, 1), ahead, right).unflatten(0, batch.places.shape[:2])
+    error = average_sphere((made - batch.views).abs())
+    still = average_sphere((batch.source[:, None] - batch.views).abs())
+    assert (error < 0.75 * still).all() and error.mean() < 0.5 * still.mean()
+
+
+def test_displacements_are_right_and_ahead_of_who_faces_there() -> None:
+    positions = np.array([[[1.0, 2.0], [1.0, 1.0], [3.0, 2.0]]])  # (x, z); -z is ahead at heading 0
+    np.testing.assert_allclose(compute_displacements(positions, np.zeros(1))[0], [[0, 0], [0, 1], [2, 0]], atol=1e-12)
+    left = compute_displacements(positions, np.array([np.pi / 2]))[0]  # faces -x
+    np.testing.assert_allclose(left, [[0, 0], [1, 0], [0, -2]], atol=1e-12)
+
+
+def test_places_are_in_order_from_one_end_of_the_clip() -> None:
+    rng, clip = np.random.default_rng(0), np.arange(10, 16)
+    for _ in range(20):
+        drawn = draw_places(clip, 4, rng)
+        steps = np.abs(drawn - drawn[0])
+        assert drawn[0] in (10, 15) and (np.diff(steps) > 0).all()
+    assert set(draw_places(clip[:2], 4, rng)) == {10, 11}
+    assert draw_places(clip[:1], 4, rng).tolist() == [10] * 5
+
+
+# -- training ----------------------------------------------------------------------------------------------------------
+
+
+def test_it_learns_four_clips_by_heart(dataset: Path, tmp_path: Path) -> None:
+    learner = trainer(dataset, tmp_path, epochs=40, pure_noise=0.99)
+    losses = [learner.train_step(3e-3) for _ in range(40)]
+    assert np.mean(losses[-8:]) < 0.8 * np.mean(losses[:8])
+    assert any(not torch.equal(value, learner.averages[name]) for name, value in learner.trained.items())
+
+
+def test_it_resumes_exactly(dataset: Path, tmp_path: Path) -> None:
+    whole, half = (trainer(dataset, tmp_path, epochs=4) for _ in range(2))
+    for _ in range(4):
+        whole.train_step(1e-3)
+    for _ in range(2):
+        half.train_step(1e-3)
+    resumed = trainer(dataset, tmp_path, epochs=4)
+    resumed.load_state_dict(half.state_dict())
+    for _ in range(2):
+        resumed.train_step(1e-3)
+    assert resumed.mean_loss == whole.mean_loss
+    for one, other in ((resumed.trained, whole.trained), (resumed.averages, whole.averages)):
+        for name, value in one.items():
+            assert torch.equal(value, other[name]), name
+
+
+def test_a_loss_that_is_not_finite_stops_it_and_names_the_clips(dataset: Path, tmp_path: Path) -> None:
+    learner = trainer(dataset, tmp_path)
+    before = [value.clone() for value in learner.network.parameters()]
+    with torch.no_grad():
+        learner.network.last.bias.fill_(float("nan"))
+    with pytest.raises(TrainingError, match=r"step 1: the loss is not finite on a batch of clip \d+ \(scene"):
+        learner.train_step(1e-3)
+    changed = [
+        name
+        for (name, value), old in zip(learner.network.named_parameters(), before, strict=True)
+        if not torch.equal(value, old)
+    ]
+    assert changed == ["last.bias"]
+
+
+def test_the_rate_rises_stays_and_falls() -> None:
+    chosen = recipe(warmup=0.1, decay=0.5)
+    assert [round(chosen.scale_rate(at), 3) for at in (0, 0.05, 0.1, 0.5, 0.75, 1.0)] == [0, 0.5, 1, 1, 0.5, 0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"size": (24, 48)}, "size: expected a height of a multiple of 16"),
+        ({"widths": (8, 8, 8)}, "widths: expected four"),
+        ({"places": 0}, "places: expected 1 or more"),
+        ({"pure_noise": 1.5}, "pure_noise: expected a share"),
+        ({"least_level": 0}, "least_level: expected a level"),
+        ({"lora": 4}, "no recipe has 'lora'"),
+    ],
+)
+def test_a_recipe_that_cannot_be_is_refused(changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(ArgumentError, match=said):
+        recipe(**changes)
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+def test_windows_show_what_their_trajectories_say(two_rooms: str) -> None:
+    windows = draw_windows(two_rooms, 2, 0)
+    assert {window.kind for window in windows} == {"mixed", "straight"}
+    straight = next(window for window in windows if window.kind == "straight")
+    np.testing.assert_allclose(straight.trajectory[:, :2], [[0.2 * k, 0] for k in range(1, 9)], atol=1e-6)
+    rows = list(measure(windows, BASELINES, 0))
+    assert {(row["kind"], row["control"]) for row in rows} == {
+        ("mixed", "true"), ("mixed", "shuffled"), ("straight", "true")
+    }  # fmt: skip
+    mean = {name: np.mean([row["psnr"] for row in rows if row["model"] == name]) for name in BASELINES}
+    assert mean["one room"] > mean["rolled"] >= mean["copy"]
+    rolled = {row["control"]: row["psnr"] for row in rows if row["model"] == "rolled" and row["window"] == 0}
+    assert rolled["true"] == rolled["shuffled"]  # turns are the window's own
+
+
+def test_shuffled_windows_walk_as_another_does(two_rooms: str) -> None:
+    windows = [window for window in draw_windows(two_rooms, 3, 0) if window.kind == "mixed"]
+    others = shuffle_places(windows, 0)
+    for window, other in zip(windows, others, strict=True):
+        np.testing.assert_array_equal(window.trajectory[:, 2], other[:, 2])
+        assert not np.array_equal(window.trajectory[:, :2], other[:, :2])
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_trains_measures_and_is_run(
+    dataset: Path, two_rooms: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from functools import partial
+
+    from wiw.training.pocket.held_out import evaluate
+
+    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=1))
+    out = tmp_path / "pocket.safetensors"
+    options = [
+        f"--option={pair}" for pair in ("frames=8", "places=2", "clips=8", "size=[16,32]", "widths=[8,32,32,32]")
+    ]
+    command = ["train", "pocket", "--data", str(dataset), "--out", str(out), "--cache", str(tmp_path / "cache")]
+    assert main([*command, "--val", two_rooms, "--part", "all", *options]) == 0
+    said = capsys.readouterr().out
+    assert "2 steps of 4 clips" in said and "control gap" in said
+    card = Pocket(out).card
+    assert card["steps"] == 2 and set(card["held_out"]) == {"mixed", "straight"}
+    assert set(card["held_out"]["mixed"]["psnr"]) == {"copy", "rolled", "one room", "pocket"}
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
+        (["--data", "nowhere"], "nowhere"),
+        (["--data", "d", "--device", "cuda"], "--device: pocket trains on the CPU"),
+        (["--data", "d", "--option", "lr=1"], "no recipe has 'lr'"),
+    ],
+)
+def test_what_it_cannot_use_is_refused(options: list[str], said: str, tmp_path: Path, capsys: Any) -> None:
+    assert main(["train", "pocket", "--out", str(tmp_path / "p"), *options]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_validation_keeps_the_best_weights_and_changes_no_training(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clips = select_clips(NavigationData(dataset).clips(8), 3, 0, SIZE)
+    checked = ValidationSet(clips, None, 1, {"made": "of what is trained on, for the test"})
+    monkeypatch.setattr("wiw.training.pocket.train.find_held_out", lambda *_: (None, None))
+    monkeypatch.setattr("wiw.training.pocket.train.choose_validation_set", lambda *_: checked)
+    told: dict[int, float] = {}
+    options = {"on_validation": lambda step, found: told.update({step: found["psnr"]})}
+    out = tmp_path / "pocket.safetensors"
+    card = train_pocket(dataset, out, tmp_path, recipe(epochs=3), "all", **options)
+    assert list(told) == [0, 1, 2, 3] and card["trained_steps"] == 3
+    assert card["steps"] == max((1, 2, 3), key=told.__getitem__)
+    assert card["validation"]["psnr"] == told[card["steps"]] and load(out)[1] == card
+    log = [
+        json.loads(line) for line in (tmp_path / "pocket.safetensors.log" / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert [line["step"] for line in log if "loss" in line] == [1, 2, 3]
+    assert (tmp_path / "pocket.safetensors.log" / "step-0000003.png").exists()
+
+    monkeypatch.setattr("wiw.training.pocket.train.find_held_out", lambda *_: None)
+    plain = train_pocket(dataset, tmp_path / "plain.safetensors", tmp_path, recipe(epochs=3), "all")
+    assert plain["loss"] == card["loss"] and plain["steps"] == 3 and "validation" not in plain
+
+
+def test_what_is_validated_are_the_averaged_weights_and_they_are_put_back(dataset: Path, tmp_path: Path) -> None:
+    learner = trainer(dataset, tmp_path, ema=0.5)
+    learner.train_step(1e-2)
+    imagine = create_sampler(learner)
+    before = {name: value.clone() for name, value in learner.trained.items()}
+    image = np.random.default_rng(0).integers(0, 255, (1, *SIZE, 3)).astype(np.uint8)
+    asked = image, np.ones((1, 7), np.int8), np.zeros(1, np.uint64), np.array([[7]])
+    shown = imagine(*asked)
+    assert all(torch.equal(value, before[name]) for name, value in learner.trained.items()) and learner.network.training
+    with torch.no_grad():
+        for name, value in learner.trained.items():
+            value.copy_(learner.averages[name])
+    np.testing.assert_array_equal(imagine_with(Pocket.of(learner.network))(*asked), shown)
