@@ -392,7 +392,7 @@ def write(file: str, text: str) -> Callable[[Path], None]:
         (set_column(FRAME_FILE, "index", 3), "expected frames 0 to .* of episode 0, got others"),
         (cut_short(FRAME_FILE), "got a damaged one"),
         (cut_short(EPISODE_FILE), "damaged file"),
-        (write("meta/info.json", "[]"), "expected JSON of a LeRobot dataset"),
+        (write("meta/info.json", "[]"), "expected a LeRobot dataset"),
         (write("meta/wiw.json", '{"what": "flying"}'), "navigation or manipulation, got flying"),
         (
             write("meta/wiw.json", '{"what": "navigation", "meta": {"camera": 1}}'),

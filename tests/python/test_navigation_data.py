@@ -475,7 +475,7 @@ def test_a_damaged_dataset_is_told(collected: Path, tmp_path: Path) -> None:
         (tmp_path / "meta.json").write_text(text)
         with pytest.raises(FileError, match=words):
             NavigationData(tmp_path)
-    with pytest.raises(FileError, match="expected a folder of that command"):
+    with pytest.raises(FileError, match="expected the description of a navigation dataset"):
         NavigationData(tmp_path / "nowhere")
 
 

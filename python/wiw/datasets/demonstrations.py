@@ -26,6 +26,7 @@ from wiw.datasets.demonstration import DEPTH_UNITS, Demonstration, Outline
 from wiw.datasets.parquet_files import MANIFEST
 from wiw.datasets.shards import Shard, require_pyarrow
 from wiw.errors import ArgumentError, FileError
+from wiw.mapping_files import read_json_object
 
 SHARD = 10
 """Demonstrations a file."""
@@ -139,17 +140,13 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         FileError: there is no manifest, or none that can be read.
     """
     path = folder / MANIFEST
-    try:
-        found = json.loads(path.read_text())
-        if not isinstance(found, dict) or not isinstance(found.get("tasks"), list):
-            raise ValueError("no list of tasks")
-        if type(found.get("episodes")) is not int:
-            raise ValueError("no number of episodes")
-        return found
-    except FileNotFoundError as error:
-        raise FileError(f"{path} is missing; expected a folder that `wiw collect` has written") from error
-    except (OSError, ValueError) as error:
-        raise FileError(f"{path}: expected a manifest of `wiw collect`, got something else ({error})") from error
+    found = read_json_object(path, "a manifest of `wiw collect`, in a folder that it has written")
+    if not isinstance(found.get("tasks"), list) or type(found.get("episodes")) is not int:
+        raise FileError(
+            f"{path}: expected a manifest of `wiw collect` with a list of tasks and a number of episodes, got "
+            f"{', '.join(found) or 'no keys'}"
+        )
+    return found
 
 
 def shard_paths(folder: Path, config: Mapping[str, Any], task: str) -> list[Path]:

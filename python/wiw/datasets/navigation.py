@@ -27,6 +27,7 @@ from wiw.datasets.navigation_segment import NavigationSegment
 from wiw.datasets.parquet_files import MANIFEST, require_pyarrow
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
+from wiw.mapping_files import read_json_object
 
 META = "meta.json"
 Part = Literal["all", "train", "held-out"]
@@ -164,16 +165,14 @@ def read_meta(folder: Path) -> dict[str, Any]:
         FileError: there is none, it is of another format, or the dataset is not finished.
     """
     path = folder / META
-    try:
-        found = json.loads(path.read_text())
-        if not isinstance(found, dict) or not isinstance(found.get("files"), dict):
-            raise ValueError("no list of files")
-    except FileNotFoundError as error:
-        begun = (folder / MANIFEST).exists()
-        hint = "repeat `wiw collect navigation` until it is finished" if begun else "expected a folder of that command"
-        raise FileError(f"{path} is missing; `wiw collect navigation` writes it at its end: {hint}") from error
-    except (OSError, ValueError) as error:
-        raise FileError(f"{path}: expected the description of a navigation dataset, got {error}") from error
+    if not path.exists() and (folder / MANIFEST).exists():
+        raise FileError(
+            f"{path} is missing; `wiw collect navigation` writes it at its end: repeat `wiw collect navigation` until "
+            "it is finished"
+        )
+    found = read_json_object(path, "the description of a navigation dataset, which `wiw collect navigation` writes")
+    if not isinstance(found.get("files"), dict):
+        raise FileError(f"{path}: expected the description of a navigation dataset, got no list of files")
     if found.get("format") != FORMAT:
         raise FileError(f"{path}: expected a navigation dataset of format {FORMAT}, got {found.get('format')}")
     return found
@@ -209,16 +208,7 @@ def read_navigation_manifest(folder: Path) -> dict[str, Any]:
         FileError: there is no manifest, or it is not one of a navigation dataset.
     """
     path = folder / MANIFEST
-    try:
-        found = json.loads(path.read_text())
-        if not isinstance(found, Mapping) or found.get("what") != "navigation":
-            raise ValueError("not of a navigation dataset")
-        return dict(found)
-    except FileNotFoundError as error:
-        raise FileError(
-            f"{path} is missing; expected a new folder, or one that `wiw collect navigation` has begun"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise FileError(
-            f"{path}: expected a manifest of `wiw collect navigation`, got something else ({error})"
-        ) from error
+    found = read_json_object(path, "a new folder, or one that `wiw collect navigation` has begun")
+    if found.get("what") != "navigation":
+        raise FileError(f"{path}: expected a manifest of `wiw collect navigation`, got one of {found.get('what')}")
+    return found

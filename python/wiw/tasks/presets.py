@@ -15,7 +15,8 @@ from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError
+from wiw.mapping_files import read_yaml_mapping
 from wiw.suggestions import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "configs"
@@ -153,15 +154,7 @@ def _find(task: str, preset: str | Path) -> Path | None:
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileError(f"{path}: {error}") from error
-    if not isinstance(content, Mapping):
-        raise FileError(f"{path}: expected rules as `name: value` lines, got {type(content).__name__}")
-    return content
+    return read_yaml_mapping(path, "rules as `name: value` lines")
 
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate, groupby
 from pathlib import Path, PurePosixPath
@@ -13,6 +12,7 @@ import numpy as np
 
 from wiw.datasets.lerobot.layout import INDICES, INFO, SOURCE, VERSION, Episode, Feature
 from wiw.errors import FileError
+from wiw.mapping_files import read_json_object
 
 EPISODE_COLUMNS = ("tasks", "length", "data/chunk_index", "data/file_index", "dataset_from_index", "dataset_to_index")
 TIME_TOLERANCE = 1e-4
@@ -32,13 +32,13 @@ class LeRobotFolder:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.info = _read_json(folder / INFO, "a LeRobot dataset, which has it")
+        self.info = read_json_object(folder / INFO, "a LeRobot dataset, which has it")
         if str(self.info.get("codebase_version")).partition(".")[0] != VERSION.partition(".")[0]:
             raise FileError(
                 f"{folder / INFO}: expected a LeRobot dataset of format {VERSION}, got "
                 f"{self.info.get('codebase_version')}; LeRobot converts older ones"
             )
-        self.source = _read_json(
+        self.source = read_json_object(
             folder / SOURCE,
             "a dataset that `wiw data export` has written: others lack poses, cameras and scenes or tables",
         )
@@ -223,15 +223,3 @@ def check_file_name(name: str) -> str:
     if not name.endswith(".parquet") or ".." in parts or parts[0] == "/":
         raise FileError(f"meta/episodes: expected file as the name of a Parquet file in the new folder, got {name}")
     return name
-
-
-def _read_json(path: Path, expected: str) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text())
-        if not isinstance(found, dict):
-            raise ValueError("no object")
-        return found
-    except FileNotFoundError as error:
-        raise FileError(f"{path} is missing; expected {expected}") from error
-    except (OSError, ValueError) as error:
-        raise FileError(f"{path}: expected JSON of {expected}, got something else ({error})") from error

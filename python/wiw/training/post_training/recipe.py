@@ -10,9 +10,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints, overload
 
-import yaml
-
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError
+from wiw.mapping_files import read_yaml_mapping
 
 FOLDER = Path(__file__).parents[2] / "configs" / "post-training"
 Schedule = Literal["constant", "linear", "cosine"]
@@ -177,19 +176,9 @@ def load_recipe(
     """
     values: dict[str, Any] = {}
     for path in (FOLDER / f"{name}.yaml", *([Path(file)] if file else [])):
-        values |= _check(_read(path), str(path), kind)
+        values |= _check(read_yaml_mapping(path, "a recipe, `name: value` lines"), str(path), kind)
     values |= _check(dict(options or {}), "recipe", kind)
     return kind(**values)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise FileError(f"{path}: expected a recipe in YAML, got {error}") from error
-    if not isinstance(content, dict):
-        raise FileError(f"{path}: expected a mapping of a recipe's numbers, got {type(content).__name__}")
-    return content
 
 
 def _check(values: Mapping[str, Any], where: str, kind: type[ClipRecipe]) -> dict[str, Any]:

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read files of one mapping: YAML that people write, and JSON that programs do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import FileError
+
+
+def read_yaml_mapping(path: Path, expected: str) -> dict[str, Any]:
+    """Return the mapping in a YAML file.
+
+    Args:
+        path: of the file.
+        expected: words for what it should hold.
+
+    Raises:
+        FileError: it cannot be read, is no YAML, or no mapping.
+    """
+    import yaml
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise FileError(f"{path}: expected {expected}, got {error}") from error
+    if not isinstance(content, dict):
+        raise FileError(f"{path}: expected {expected}, got {type(content).__name__}")
+    return content
+
+
+def read_json_object(path: Path, expected: str) -> dict[str, Any]:
+    """Return the object in a JSON file.
+
+    Args:
+        path: of the file.
+        expected: words for what it should hold.
+
+    Raises:
+        FileError: it is missing, cannot be read, is no JSON, or no object.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        if not isinstance(found, dict):
+            raise ValueError("no object")
+        return found
+    except FileNotFoundError as error:
+        raise FileError(f"{path} is missing; expected {expected}") from error
+    except (OSError, ValueError) as error:
+        raise FileError(f"{path}: expected {expected}, got something else ({error})") from error
