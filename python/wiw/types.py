@@ -67,6 +67,9 @@ class Answer:
     choices: tuple[str, ...]
     probabilities: NDArray[np.float64]
     """float64 [len(choices)], sum 1."""
+    raw: NDArray[np.float64] | None = None
+    """float64 [len(choices)], sum at most 1: the probabilities as a language model gave them, before they were made to
+    sum to 1; None where nothing was left out."""
 
     @property
     def label(self) -> str:
@@ -75,8 +78,9 @@ class Answer:
 
     @property
     def confidence(self) -> float:
-        """Its probability."""
-        return float(np.max(self.probabilities))
+        """Its probability, the raw one where it is known: what is left out counts against an answer."""
+        given = self.probabilities if self.raw is None else self.raw
+        return float(given[int(np.argmax(self.probabilities))])
 
 
 @dataclass(frozen=True)

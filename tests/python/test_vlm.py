@@ -66,13 +66,15 @@ def test_choices_equal_their_slow_twin(listed: dict[str, float]) -> None:
         return
     assert found is not None
     np.testing.assert_allclose(found[0], slow_choice(listed, "ABCD"), rtol=1e-9, atol=1e-12)
-    assert found[1] == pytest.approx(min(1.0, sum(math.exp(listed[token]) for token in named)))
+    given = {label: sum(math.exp(p) for token, p in listed.items() if token.strip(" (.)") == label) for label in "ABCD"}
+    np.testing.assert_allclose(found[1], np.array([*given.values()]) / max(1.0, sum(given.values())))
 
 
 def test_tokens_that_a_server_forbids_count_nothing() -> None:
     found = choices.read_logprobs([("A", -0.1), ("B", -9999.0), ("x", -math.inf), ("y", math.nan)], "ABC")
     assert found is not None
     np.testing.assert_allclose(found[0], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(found[1], [math.exp(-0.1), 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -85,14 +87,14 @@ def test_tokens_that_a_server_forbids_count_nothing() -> None:
 )  # fmt: skip
 def test_votes_are_letters_that_stand_alone(text: str, vote: int | None) -> None:
     found = choices.count_votes([text], tuple("ABC"))
-    assert found is None if vote is None else found is not None and found[0].argmax() == vote and found[1] == 1
+    assert found is None if vote is None else found is not None and found[0].argmax() == vote and found[1].sum() == 1
 
 
 def test_a_server_without_logprobs_is_asked_for_votes_and_the_reply_says_so() -> None:
     texts = iter(["?", "A", "(B)", "b", "no idea", "B."])
     client = MockClient(lambda call: Completion(next(texts)))
     reply = ask(client, "Which?", choices=("x", "y"))
-    assert (reply.by, reply.mass) == ("votes", 0.8) and reply.problem is None
+    assert (reply.by, reply.mass) == ("votes", 0.8) and reply.problem is None and reply.raw.tolist() == [0.2, 0.6]
     assert reply.probabilities.tolist() == [0.25, 0.75]
     assert len({call.seed for call in client.calls}) == 6 and {call.temperature for call in client.calls[1:]} == {1.0}
 
@@ -107,6 +109,7 @@ def test_a_withheld_answer_is_no_choice_whatever_tokens_it_lists(finish: str) ->
 def test_mass_below_one_half_is_doubtful() -> None:
     reply = ask(MockClient(lambda call: {"A": 0.2, " B": 0.1, "The": 0.7}), "Which?", choices=("x", "y"))
     assert reply.doubtful and reply.mass == pytest.approx(0.3)
+    np.testing.assert_allclose(reply.raw, [0.2, 0.1])
     np.testing.assert_allclose(reply.probabilities, [2 / 3, 1 / 3])
 
 
@@ -123,6 +126,24 @@ def test_rounds_find_the_distribution_of_a_model_that_is_consistent(count: int, 
 
     reply = ask(MockClient(script, top_logprobs=most), "Which?", choices=tuple(f"o{i}" for i in range(count)))
     np.testing.assert_allclose(reply.probabilities, truth, rtol=1e-6)
+
+
+def test_one_question_with_all_choices_goes_on_after_z() -> None:
+    """27 letters, of which a server that lists 5 tokens names some: unlisted ones keep at most what is left over."""
+    options = tuple(f"o{i}" for i in range(27))
+    client = MockClient(lambda call: {"Γ": 0.6, "B": 0.2, "the": 0.1, "C": 0.05, "D": 0.02, "E": 0.03}, top_logprobs=5)
+    reply = ask(client, "Which?", choices=options, rounds=False)
+    (call,) = client.calls
+    assert len(call.labels) == 27 and call.labels[-2:] == ("Z", "Γ") and "Γ. o26" in call.messages[-1].content[-1]
+    assert reply.raw[[26, 1, 2, 4]].tolist() == pytest.approx([0.6, 0.2, 0.05, 0.03]) and reply.raw[3] == 0
+    assert reply.mass == pytest.approx(0.88) and reply.probabilities.sum() == pytest.approx(1)
+    assert reply.probabilities[3] < reply.probabilities[4] + 1e-9 < reply.probabilities[26]
+    votes = MockClient(lambda call: Completion("Γ."))
+    assert ask(votes, "Which?", choices=options, rounds=False).probabilities.argmax() == 26
+    many = tuple(f"o{i}" for i in range(60))
+    in_rounds = MockClient()
+    assert ask(in_rounds, "Which?", choices=many, rounds=False).probabilities.shape == (60,)
+    assert max(len(call.labels) for call in in_rounds.calls) <= 36
 
 
 def test_requests_that_make_no_sense_are_refused() -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from wiw._core import core
 from wiw.action import ActionSpace
 from wiw.datasets import episodes as episode_file
+from wiw.datasets import habitat
 from wiw.datasets.visibility import COARSE, measure_sizes, measure_unoccluded_sizes
 from wiw.datasets.worlds import World
 from wiw.errors import ArgumentError, FileError
@@ -53,6 +54,37 @@ CATEGORIES = (
     "washing machine",
 )
 """Categories of targets and answers where no others are given: as many as there are letters."""
+
+PUBLISHED_CATEGORIES = (
+    "appliances",
+    "bathtub",
+    "bed",
+    "cabinet",
+    "chair",
+    "chest_of_drawers",
+    "clothes",
+    "counter",
+    "curtain",
+    "cushion",
+    "door",
+    "fireplace",
+    "furniture",
+    "gym_equipment",
+    "mirror",
+    "picture",
+    "plant",
+    "seating",
+    "shower",
+    "sink",
+    "sofa",
+    "stool",
+    "table",
+    "toilet",
+    "towel",
+    "tv_monitor",
+    "window",
+)
+"""Choices of World-in-World's episodes: 27 categories of Matterport3D, all of them whatever a file's targets are."""
 
 ALIASES = {
     "carpet": "rug",
@@ -342,8 +374,8 @@ def load(
 ) -> tuple[list[Episode], tuple[str, ...]]:
     """Return the episodes of a file and the labels that their answers are chosen from.
 
-    These are `categories`, else what the file's header names, else the built-in list where it holds all targets, else
-    the targets' own categories.
+    These are `categories`, else what the file's header names, else for published episodes `PUBLISHED_CATEGORIES`, else
+    the built-in list where it holds all targets, else the targets' own categories.
 
     Raises:
         FileError: see `wiw.datasets.episodes.load`; a target or category is missing or not among the choices. Names
@@ -355,7 +387,9 @@ def load(
     named = categories or _header(path)
     present = {episode.info["category"] for episode in found}
     if named is None:
-        named = CATEGORIES if present <= set(CATEGORIES) else sorted(present)
+        published = any(episode.info.get("source") == habitat.PUBLISHED for episode in found)
+        fixed = PUBLISHED_CATEGORIES if published else CATEGORIES
+        named = fixed if present <= set(fixed) else sorted(present)
     for i, episode in enumerate(found):
         if episode.info["category"] not in named:
             raise FileError(

@@ -17,6 +17,8 @@ from wiw.errors import FileError
 from wiw.types import Episode
 
 Order = Literal["xyzw", "wxyz"]
+PUBLISHED = "world-in-world"
+"""Source of episodes that the paper's authors have published, as `Episode.info` names it."""
 _UNREADABLE = (LookupError, TypeError, ValueError, ArithmeticError, AttributeError)
 """What an item of another shape raises."""
 
@@ -105,7 +107,7 @@ def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
             goal_yaw=yaw_of(item["goal_rotation"], "wxyz", where),
             geodesic=float("nan"),
             info={
-                "source": "world-in-world",
+                "source": PUBLISHED,
                 "radius": number(item["goal_radius"], "goal_radius"),
                 **({} if steps is None else {"ideal_primitives": int(steps)}),
             },
@@ -139,7 +141,7 @@ def _active_recognition(item: Mapping[str, Any], where: str) -> Episode:
             goal_yaw=0.0,
             geodesic=float("nan"),
             info={
-                "source": "world-in-world",
+                "source": PUBLISHED,
                 "target": int(item["target_id"]),
                 "category": text(item["target_categrory"], "target_categrory"),
                 "difficulty": int(item["difficulty"]),

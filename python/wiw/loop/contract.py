@@ -167,6 +167,9 @@ def _check_choice(name: str, answer: Any, choices: tuple[str, ...]) -> None:
     p = np.asarray(answer.probabilities, np.float64)
     if p.shape != (len(choices),) or not (p >= 0).all() or abs(p.sum() - 1) > 1e-3:
         raise ContractError(f"{name}: expected {len(choices)} probabilities that sum to 1, got {p.tolist()}")
+    raw = p if answer.raw is None else np.asarray(answer.raw, np.float64)
+    if raw.shape != p.shape or not (raw >= 0).all() or raw.sum() > 1 + 1e-3:
+        raise ContractError(f"{name}: expected {len(choices)} raw probabilities, sum at most 1, got {raw.tolist()}")
 
 
 def _check_text_answer(name: str, answer: Any) -> None:

@@ -131,6 +131,7 @@ def _answer(answer: Answer | TextAnswer) -> dict[str, Any]:
         "label": answer.label,
         "confidence": answer.confidence,
         "probabilities": dict(zip(answer.choices, answer.probabilities, strict=True)),
+        **({} if answer.raw is None else {"raw": dict(zip(answer.choices, answer.raw, strict=True))}),
     }
 
 

@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from wiw.vlm.messages import Message
 
+LABELS = ascii_uppercase + "ΓΔΘΛΞΠΣΦΨΩ"
+"""Letters of options: the Latin capitals, then those Greek ones that look like none of them."""
 LETTER_CONTEXT = " \t\r\n\u2581\u0120\u010a().:*\"'`[]"
 """Characters that tokenizers and models put around a letter; the special ones are the spaces of sentencepiece and
 byte-level BPE.
 """
 _VOTE = re.compile(
-    r"\W*(?:(?:the\s+)?(?:correct\s+)?(?:answer|option)(?:\s+is)?\s*:?\s*)?[(\[*\"'`]*([A-Z])\s*(?:$|[.):,;*\]\n])",
+    r"\W*(?:(?:the\s+)?(?:correct\s+)?(?:answer|option)(?:\s+is)?\s*:?\s*)?[(\[*\"'`]*([A-ZΓΔΘΛΞΠΣΦΨΩ])\s*(?:$|[.):,;*\]\n])",
     re.IGNORECASE,
 )
 """Matches a letter that stands by itself; "A chair" and "I'm sorry" begin with words."""
@@ -28,7 +30,7 @@ _VOTE_LENGTH = 64
 
 def get_labels(count: int) -> tuple[str, ...]:
     """Return the first letters."""
-    return tuple(ascii_uppercase[:count])
+    return tuple(LABELS[:count])
 
 
 def append_options(messages: Sequence[Message], options: Sequence[str]) -> tuple[Message, ...]:
@@ -47,11 +49,11 @@ def split_options(count: int, most: int) -> list[list[int]]:
 
 def read_logprobs(
     listed: Sequence[tuple[str, float]], labels: Sequence[str]
-) -> tuple[NDArray[np.float64], float] | None:
-    """Return the labels' probabilities and the mass that the model gave them; None where none of them is listed.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return the labels' probabilities, which sum to 1, and those that the model gave them; None where none is listed.
 
-    Variants of a label ("A", " A", "(A") are one. A label that is not listed gets the most that it can have: as much as
-    the least likely listed token, or as what all of these leave over.
+    Variants of a label ("A", " A", "(A") are one. Of the former, a label that is not listed gets the most that it can
+    have: as much as the least likely listed token, or as what all of these leave over; of the latter, nothing.
     """
     listed = [(token, min(value, 0.0)) for token, value in listed if not math.isnan(value)]
     found = [
@@ -63,17 +65,20 @@ def read_logprobs(
     left = 1.0 - float(sum(np.exp(value) for _, value in listed))
     least = min(*(value for _, value in listed), float(np.log(max(left, 1e-300))))
     scores = np.array([np.logaddexp.reduce(values) if values else least for values in found], np.float64)
-    mass = float(sum(np.exp(score) for score, values in zip(scores, found, strict=True) if values))
+    raw = np.where([bool(values) for values in found], np.exp(np.maximum(scores, -745.0)), 0.0)
     weights = np.exp(np.clip(scores - scores.max(), -745.0, 0.0))
-    return weights / weights.sum(), min(mass, 1.0)
+    return weights / weights.sum(), raw / max(raw.sum(), 1.0)
 
 
-def count_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np.float64], float] | None:
-    """Return the shares of the samples that begin with each label, and with any; None where none does."""
+def count_votes(
+    texts: Sequence[str], labels: Sequence[str]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return each label's share of the votes, and of all samples; None where no sample begins with a label."""
     votes = [vote for vote in (parse_vote(text, labels) for text in texts) if vote is not None]
     if not votes:
         return None
-    return np.bincount(votes, minlength=len(labels)) / len(votes), len(votes) / len(texts)
+    counts = np.bincount(votes, minlength=len(labels))
+    return counts / len(votes), counts / len(texts)
 
 
 def parse_vote(text: str, labels: Sequence[str]) -> int | None:

@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from hashlib import blake2b
-from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -80,13 +79,14 @@ def _derive_seed(seed: int, attempt: int) -> int:
 
 
 def _ask_for_choice(request: Request, listed: int, votes: int) -> Talk:
-    """Ask a multiple-choice question; text and mass are the last round's; "votes" if any round used them."""
+    """Ask a multiple-choice question; the text is the last round's; "votes" if any round used them."""
     found = yield from _ask_in_rounds(request, range(len(request.choices)), listed, votes)
     if isinstance(found, Reply):
         return found
     probabilities, rounds = found
     by = "votes" if any(reply.by == "votes" for reply in rounds) else "logprobs"
-    return Reply(rounds[-1].text, probabilities=probabilities, mass=rounds[-1].mass, by=by)
+    raw = rounds[0].raw if len(rounds) == 1 else probabilities * rounds[-1].mass
+    return Reply(rounds[-1].text, probabilities=probabilities, raw=raw, by=by)
 
 
 def _ask_in_rounds(
@@ -94,9 +94,10 @@ def _ask_in_rounds(
 ) -> Generator[list[Call], list[Completion], tuple[NDArray[np.float64], list[Any]] | Reply]:
     """Return the probabilities of some of the choices, and all replies on the way; or an unusable reply.
 
-    More choices than a server lists tokens are asked about in groups, and the best of each group in a final.
+    More choices than there are labels, or with `rounds` than a server lists tokens, are asked about in groups, and the
+    best of each group in a final.
     """
-    most = listed or len(ascii_uppercase)
+    most = listed if listed and request.rounds else len(choices.LABELS)
     groups = choices.split_options(len(options), most)
     first = yield from _ask_groups(request, [[options[i] for i in group] for group in groups], listed, votes)
     if isinstance(first, Reply):
@@ -161,5 +162,5 @@ def _read_vote(completion: Completion) -> str:
 def _make_reply(outcome: tuple[NDArray[np.float64], float] | None, completion: Completion, by: str) -> Reply | None:
     if outcome is None:
         return None
-    probabilities, mass = outcome
-    return Reply(completion.text, probabilities=probabilities, mass=mass, by=by)
+    probabilities, raw = outcome
+    return Reply(completion.text, probabilities=probabilities, raw=raw, by=by)

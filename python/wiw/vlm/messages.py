@@ -42,6 +42,9 @@ class Request:
 
     messages: tuple[Message, ...]
     choices: tuple[str, ...] = ()
+    rounds: bool = True
+    """Whether more choices than the server lists tokens are asked about in rounds. In one question with all of them,
+    choices that are not listed are known to be unlikely, and nothing else."""
     schema: type[BaseModel] | None = None
     temperature: float = 0.0
     seed: int = 0
@@ -143,14 +146,20 @@ class Reply:
     """The validated object, where the request has a schema."""
     probabilities: NDArray[np.float64] | None = None
     """float64 [choices], sum 1, where the request has choices."""
-    mass: float | None = None
-    """Probability that the model gave to the choices before normalisation; or the share of votes for one of them."""
+    raw: NDArray[np.float64] | None = None
+    """float64 [choices], sum at most 1: `probabilities` as the model gave them, before they were made to sum to 1; 0
+    where it listed none. With votes, the shares of all samples. After several rounds, scaled by the last one's."""
     by: str = ""
     """"logprobs", or "votes" where the server returns no log-probabilities."""
     repaired: bool = False
     """Whether JSON syntax errors were repaired."""
     problem: Problem | None = None
     completions: tuple[CompletionRecord, ...] = field(default=(), repr=False)
+
+    @property
+    def mass(self) -> float | None:
+        """Probability that the model gave to all choices together; or the share of votes for one of them."""
+        return None if self.raw is None else float(self.raw.sum())
 
     @property
     def doubtful(self) -> bool:
