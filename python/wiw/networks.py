@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from wiw.errors import ArgumentError, DeviceMemoryError, WeightsError
 
@@ -63,6 +65,18 @@ def memory_guard(what: str, cures: str) -> Iterator[None]:
             raise
         torch.cuda.empty_cache()
         raise DeviceMemoryError(f"{what} does not fit on the device ({str(error).splitlines()[0]}); {cures}") from error
+
+
+def in_hub_cache(repository: str) -> bool:
+    """Return whether some state of a repository lies in the Hugging Face cache."""
+    snapshots = hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
+    return any(snapshots.glob("*/*"))
+
+
+def hub_cache() -> Path:
+    """Return the folder where the hub's client keeps what it has downloaded."""
+    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "huggingface"
+    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
 
 
 def is_path(name: str) -> bool:

@@ -266,10 +266,13 @@ TRACKERS = Registry(
     "tracker",
     "",
     {
+        "frames": "wiw.perception.make_tracker:make_frame_tracker",
+        "sam2": "wiw.perception.sam2:Sam2",
+        "flow": "wiw.perception.flow:Flow",
         "reprojection": "wiw.perception.tracking:Reprojection",
         "growing": "wiw.perception.growing:Growing",
-        "sam2": "wiw.perception.sam2:Sam2",
     },
+    "wiw.perception.tracking:Tracker",
 )
 DETECTORS = Registry(
     "detector",

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -71,27 +73,6 @@ def test_nothing_is_followed_from_where_nothing_is_seen(weights: Path) -> None:
     assert follow(Sam2(weights), gone).boxes == (None, None, None)
 
 
-def test_a_panorama_is_turned_so_that_the_target_is_in_the_middle(weights: Path) -> None:
-    from wiw.perception.sam2 import Sam2
-
-    tracker, seen = Sam2(weights), []
-
-    def spy(start: Any, frames: Any, seed: Any, box: Any) -> Any:
-        seen.append((seed, box))
-        marked = np.zeros(frames.shape[:3], bool)
-        marked[:, 20:40, 56:72] = True
-        return marked
-
-    tracker._track_video = spy
-    for across in (False, True):
-        view = observation(across)
-        track = follow(tracker, view)
-        np.testing.assert_array_equal(track.masks[0], view.target.mask)  # turned back
-    for seed, box in seen:
-        assert box == (56, 20, 72, 40)
-        np.testing.assert_array_equal(np.flatnonzero(seed.any(axis=0)), np.arange(56, 72))
-
-
 @pytest.mark.parametrize(("score", "found"), [(1.0, True), (-1.0, False)])
 def test_masks_are_read_back_and_lost_targets_left_out(
     weights: Path, monkeypatch: pytest.MonkeyPatch, score: float, found: bool
@@ -121,3 +102,44 @@ def test_masks_are_read_back_and_lost_targets_left_out(
         left, top, right, bottom = track.boxes[0]
         shift = 4  # the target's middle is 4 columns right of the panorama's
         np.testing.assert_allclose([left, top, right, bottom], [64 + shift, 16, 96 + shift, 32], atol=2)
+
+
+def test_the_video_begins_with_the_real_views_and_is_read_after_them(
+    weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A target behind the agent: the network is shown it in the first view, and asked about the frames alone."""
+    import torch
+
+    from wiw.perception.sam2 import Sam2
+
+    tracker, behind = Sam2(weights), observation(across_the_seam=True)
+    shown: list[int] = []
+
+    def answer(session: Any, start_frame_idx: int) -> Any:
+        shown.append(session.num_frames)
+        assert list(session.point_inputs_per_obj[0]) == [0] and start_frame_idx == 0
+        for frame in range(session.num_frames):
+            logits = torch.full((1, 1, 16, 16), -5.0)
+            logits[..., frame, :8] = 5.0
+            yield SimpleNamespace(frame_idx=frame, pred_masks=logits, object_score_logits=torch.ones(1, 1))
+
+    monkeypatch.setattr(tracker._model, "propagate_in_video_iterator", answer)
+    track = follow(tracker, behind, panoramic=False)
+    (count,) = shown
+    views = count - 3
+    assert views >= 8, "half a turn from the target to the front, and the front view itself"
+    for k, box in enumerate(track.boxes):
+        assert (box[1] + box[3]) / 2 == pytest.approx(40 / 16 * (views + k + 0.5), abs=2.5), "the masks are the frames'"
+
+
+def test_it_is_known_by_its_weights(weights: Path, tmp_path: Path) -> None:
+    import torch
+
+    from wiw.perception.sam2 import Sam2
+
+    said = Sam2(weights).describe()
+    assert said["name"] == "Sam2" and said == Sam2(shutil.copytree(weights, tmp_path / "moved")).describe()
+    other = Sam2(weights)
+    with torch.no_grad():
+        next(other._model.parameters()).add_(1.0)
+    assert other.describe()["weights"] != said["weights"]

@@ -15,9 +15,11 @@ from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT, to_viewpoints
 from wiw.datasets.imagenav import camera_pose
 from wiw.datasets.worlds import world
 from wiw.envs.pointing import Pointing
-from wiw.errors import ArgumentError
-from wiw.panorama import directions
+from wiw.errors import ArgumentError, WeightsError
+from wiw.panorama import directions, rotate, to_perspective
 from wiw.perception.boxes import box_width, find_box, keep_largest_part, scale_box
+from wiw.perception.flow import Flow
+from wiw.perception.frame_tracking import FrameTracker
 from wiw.perception.growing import Growing, grow_mask
 from wiw.perception.tracking import Reprojection, Tracker, remove_specks, reproject_masks, track_rollouts
 from wiw.perception.views import cut_target_views
@@ -181,6 +183,121 @@ def test_a_tracker_says_what_it_lacks(two_rooms: str) -> None:
     with pytest.raises(ArgumentError, match=r"viewpoints \[K, 4, 4\]"):
         Reprojection().track([observation], [viewpoints[:2]], [frames])
     assert isinstance(TRACKERS.make("reprojection"), Tracker)
+
+
+# -- trackers that look at the frames ----------------------------------------------------------------------------------
+
+
+class Recorder(FrameTracker):
+    """Keeps what it is asked to follow, and finds the target where it was first."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, Any, Any]] = []
+
+    def follow(self, views: Any, masks: Any, frames: Any) -> Any:
+        self.asked.append((views, masks, frames))
+        return np.repeat(masks[:1], len(frames), axis=0)
+
+
+def imagine_nothing(observation: Observation, actions: Any, front: bool = False) -> tuple[Proposal, Rollout]:
+    """A plan and the frames of a model that ignores it: after the real leading turns all stands still."""
+    plan, turns = Proposal(actions), 0
+    while turns < len(plan.actions) and plan.actions[turns] == TURN_LEFT:
+        turns += 1
+    panoramas = [rotate(observation.panorama, 22.5 * min(k, turns)) for k in range(1, len(plan.actions) + 1)]
+    frames = np.stack([to_perspective(each, 90.0, (384, 384)) if front else each for each in panoramas])
+    real = np.arange(len(frames)) < turns
+    return plan, Rollout(frames, real, "front" if front else "panorama")
+
+
+def track_one(tracker: Tracker, observation: Observation, plan: Proposal, rollout: Rollout) -> Any:
+    return track_rollouts(tracker, [observation], [[plan]], [[rollout]])[0][0]
+
+
+@pytest.mark.parametrize("front", [False, True])
+@pytest.mark.parametrize("turns", [0, 1])
+def test_the_box_stays_on_a_thing_that_stands_still_though_the_plan_moves(
+    two_rooms: str, front: bool, turns: int
+) -> None:
+    yaw = np.pi / 2 - 0.3 - turns * np.pi / 8
+    observation, _, _ = look(world(two_rooms), (-1.2, 0, -0.2), yaw, "table")
+    plan, rollout = imagine_nothing(observation, [TURN_LEFT] * turns + [FORWARD, FORWARD, TURN_RIGHT, FORWARD], front)
+    start = rotate(observation.target.mask.astype(np.uint8), 22.5 * turns)
+    start = (to_perspective(start, 90.0, (384, 384), interpolation="nearest") if front else start) > 0
+    looked, told = (track_one(tracker, observation, plan, rollout) for tracker in (Flow(), Reprojection()))
+    assert looked.visible.all()
+    for mask in looked.masks[turns:]:
+        assert overlap(mask, start) > 0.97
+    assert overlap(told.masks[-1], start) < 0.3, "geometry says where the plan would have led"
+    if turns:
+        assert overlap(looked.masks[0], start) > 0.99, "a real frame"
+
+
+@pytest.mark.parametrize(("position", "yaw", "name"), [((-1.2, 0, -1.0), 3.0, "table"), ((1.5, 0, 0.5), 0.0, "chest")])
+def test_true_frames_are_followed_by_their_pixels(two_rooms: str, position: Any, yaw: float, name: str) -> None:
+    observation, frames, truth = look(world(two_rooms), position, yaw, name)
+    blind = replace(observation, depth=None)
+    track = Flow().track([blind], [np.tile(np.eye(4), (len(PLAN), 1, 1))], [frames])[0]
+    agreement = [overlap(mask, true) for mask, true in zip(track.masks, truth, strict=True)]
+    assert min(agreement) > 0.8
+
+
+def test_a_frame_that_shows_something_else_has_no_box(two_rooms: str) -> None:
+    observation, _, _ = look(world(two_rooms), (-1.2, 0, -0.2), np.pi / 2 - 0.3, "table")
+    elsewhere, _, _ = look(world(two_rooms), (1.5, 0, 0.5), 0.0, "chest")
+    poses = [np.tile(np.eye(4), (4, 1, 1))]
+    noise = np.random.default_rng(0).integers(0, 255, observation.panorama.shape, np.uint8)
+    frames = np.stack([noise, np.full_like(noise, 90), elsewhere.panorama, observation.panorama])
+    track = Flow().track([observation], poses, [frames])[0]
+    assert track.visible.tolist() == [False, False, False, True], "it is found again where it comes back"
+    assert not track.masks[:3].any()
+    gone = replace(observation, target=Target(np.zeros((576, 1024), bool), None, None))
+    assert not Flow().track([gone], poses, [frames])[0].visible.any()
+
+
+def test_panoramas_are_followed_from_after_the_real_turns_with_the_target_in_the_middle(two_rooms: str) -> None:
+    observation, _, _ = look(world(two_rooms), (-1.2, 0, -1.0), 0.3, "table")
+    tracker = Recorder()
+    plan, rollout = imagine_nothing(observation, [TURN_LEFT, TURN_LEFT, FORWARD, FORWARD])
+    track = track_one(tracker, observation, plan, rollout)
+    ((views, masks, frames),) = tracker.asked
+    assert len(views) == len(masks) == 1 and len(frames) == 2
+    np.testing.assert_array_equal(views[0], frames[0])  # nothing moves but by the real turns
+    box = find_box(masks[0])
+    assert abs((box[0] + box[2]) / 2 - 512) <= 1
+    for turns, mask in zip((1, 2, 2, 2), track.masks, strict=True):
+        turned = rotate(observation.target.mask.astype(np.uint8), 22.5 * turns) > 0
+        np.testing.assert_array_equal(mask, turned)
+
+
+def test_front_views_are_led_up_to_from_one_that_faces_the_target(two_rooms: str) -> None:
+    observation, _, _ = look(world(two_rooms), (-1.2, 0, -0.2), -np.pi / 2, "table")
+    assert observation.target.front_box is None, "the test needs a target behind the agent"
+    tracker = Recorder()
+    track_one(tracker, observation, *imagine_nothing(observation, [TURN_LEFT, FORWARD, FORWARD], front=True))
+    ((views, masks, frames),) = tracker.asked
+    assert len(frames) == 2 and 5 <= len(views) <= 9
+    box = find_box(masks[0])
+    assert abs((box[0] + box[2]) / 2 - 192) < 8, "the first view faces it"
+    assert not masks[-1].any()
+    np.testing.assert_array_equal(views[-1], frames[0])
+    shift = np.abs(np.diff(views.astype(int), axis=0)).mean(axis=(1, 2, 3))
+    assert (shift > 1).all(), "each view is a turn further"
+
+
+def test_the_tracker_of_frames_is_sam2_only_where_its_weights_are(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    made = TRACKERS.make("frames")
+    assert isinstance(made, Flow) and made.describe() == {"name": "Flow"} and made.needs == ()
+    with pytest.raises(WeightsError, match="no folder"):
+        TRACKERS.make("frames", weights=str(tmp_path / "sam2"))  # asked for: nothing takes its place
+    (tmp_path / "models--facebook--sam2.1-hiera-tiny/snapshots/abc").mkdir(parents=True)
+    (tmp_path / "models--facebook--sam2.1-hiera-tiny/snapshots/abc/config.json").write_text("{}")
+    monkeypatch.setattr("wiw.perception.make_tracker.Sam2", lambda **options: ("sam2", options))
+    monkeypatch.setattr("wiw.registry.Registry._check_kind", lambda self, name, thing: thing)
+    assert TRACKERS.make("frames") == ("sam2", {})
 
 
 # -- boxes -------------------------------------------------------------------------------------------------------------

@@ -435,7 +435,7 @@ def test_weights_in_the_hubs_cache_need_no_network(hub, made, world_model_option
     assert model.describe()["commit"] == commit
     np.testing.assert_array_equal(rollout(model), rollout(made("ltx")))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    from wiw.world_models.status import in_hub_cache
+    from wiw.networks import in_hub_cache
 
     assert in_hub_cache("some/model") and not in_hub_cache("some/other")
 

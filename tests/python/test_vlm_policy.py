@@ -147,13 +147,12 @@ def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
     assert "next 1 action(s)" in words(moving) and "Plan 1:" in words(moving)
     assert [image.shape[:2] for image in images(moving)[:2]] == [(480, 480), (576, 1024)] and len(images(moving)) == 3
     shapes = [image.shape[:2] for image in images(answering)]
-    assert (
-        shapes[0] == (prompt_images.VIEW, prompt_images.VIEW) and len(shapes) == 2 and shapes[1][1] > prompt_images.VIEW
-    )
+    assert shapes[:2] == [(480, 480), (576, 1024)] and len(shapes) == 3 and shapes[2][1] > prompt_images.VIEW
     for image in (*images(moving), *images(answering), *images(proposing[0])):
         assert redness(image) > 20, "the target is not boxed"
     assert "turn left" not in words(answering) and moving.labels == ("A", "B", "C")
-    assert decision.answer.label == "table" and decision.answer.confidence == pytest.approx(1.0)
+    assert decision.answer.label == "table" and decision.answer.probabilities.max() == pytest.approx(1.0)
+    assert decision.answer.confidence == pytest.approx(0.9), "as the model gave it"
     assert decision.chosen == 0 and decision.actions[0] == FORWARD and decision.execute == 1
 
 
@@ -164,7 +163,49 @@ def test_recognition_without_a_world_model_is_two_questions(recognition: Any) ->
     decision = decide_in(recognition, VLM(client))
     assert [each.purpose for each in decision.exchanges] == ["move", "answer"]
     assert decision.actions.tolist() == [RIGHT] and decision.chosen == 0
-    assert [len(images(call)) for call in client.calls] == [2, 1]
+    assert [len(images(call)) for call in client.calls] == [2, 2]
+
+
+def test_the_category_may_be_asked_from_one_view_centred_on_the_target(recognition: Any) -> None:
+    client = MockClient(script)
+    decide_in(recognition, VLM(client, answer_view="target"))
+    (view,) = images(client.calls[-1])
+    assert view.shape[:2] == (prompt_images.VIEW, prompt_images.VIEW) and redness(view) > 20
+    assert "centred on one thing" in words(client.calls[-1]) and "panorama" not in words(client.calls[-1])
+
+
+def test_confidence_that_ends_an_episode_is_the_models_own(tmp_path: Path, two_rooms: str) -> None:
+    """0.9 of all probability, though 0.99 of that on letters: below 0.95, so that the episode goes on."""
+    ended = {}
+    for mass in (0.9, 1.0):
+
+        def answer(call: Call, mass: float = mass) -> Any:
+            return (
+                {letter_of(call, "table"): 0.99 * mass, letter_of(call, "chest"): 0.01 * mass, "I": 1 - mass}
+                if (". table" in words(call))
+                else script(call)
+            )
+
+        policy = VLM(MockClient(answer))
+        log = evaluate("ar", wiw.Agent(policy), 1, seed=0, out=tmp_path / f"{mass}", progress=False,
+                       episode_file=str(a_file(tmp_path, two_rooms)))  # fmt: skip
+        rows = list(log.store.decisions("none"))
+        ended[mass] = len(rows)
+        (episode,) = log.episodes
+        assert episode["metrics"]["confidence"] == pytest.approx(0.99 * mass)
+        assert rows[0]["answer"]["raw"]["table"] == pytest.approx(0.99 * mass)
+        assert rows[0]["answer"]["probabilities"]["table"] == pytest.approx(0.99)
+    assert ended[1.0] == 1 and ended[0.9] == 10
+
+
+def test_all_categories_are_one_question_or_rounds(tmp_path: Path, two_rooms: str) -> None:
+    goal = wiw.types.Goal("ar", choices=tuple(f"thing {k}" for k in range(27)))
+    env = wiw.make("AR-v0", episode_file=a_file(tmp_path, two_rooms))
+    _, info = env.reset(options={"episode": 0})
+    for rounds, asked in ((False, [27]), (True, [14, 13, 20])):
+        client = MockClient()
+        wiw.Agent(VLM(client, rounds=rounds), execute=1).decide(env.unwrapped.observation, goal, info["key"])
+        assert [len(call.labels) for call in client.calls if len(call.labels) > 3] == asked
 
 
 def test_a_primitive_that_no_plan_begins_with_is_a_plan_of_its_own(recognition: Any) -> None:
@@ -222,7 +263,10 @@ def test_strips_name_actions_and_show_where_the_target_is() -> None:
     )
     half = strip.shape[1] // 2
     assert redness(strip[:, :half]) > 50 and redness(strip[:, half:]) == 0
+    lost = prompt_images.render_plan_strip(Proposal([FORWARD, LEFT]), rollout)
     bar = strip.shape[0] - prompt_images.VIEW
+    assert not np.array_equal(strip[:bar, half:], lost[:bar, half:]), "a bar says that the target is lost"
+    np.testing.assert_array_equal(strip[:bar, : half - 4], lost[:bar, : half - 4])
     assert bar > 10 and not np.array_equal(strip[:bar, : prompt_images.VIEW], strip[:bar, -prompt_images.VIEW :])
     views = prompt_images.render_target_strip(rollout, Track(masks, ((500, 250, 540, 300), None)))
     assert views is not None and views.shape[1] == prompt_images.VIEW and redness(views) > 50
@@ -276,7 +320,14 @@ def test_a_users_own_prompts_are_checked(tmp_path: Path, two_rooms: str) -> None
 
 
 def test_options_out_of_range_and_tasks_without_prompts() -> None:
-    for wrong in ({"proposals": "many"}, {"revision": "guess"}, {"temperature": -1.0}, {"tries": 0}, {"colour": 1}):
+    for wrong in (
+        {"proposals": "many"},
+        {"revision": "guess"},
+        {"temperature": -1.0},
+        {"tries": 0},
+        {"colour": 1},
+        {"answer_view": "x"},
+    ):
         with pytest.raises(ArgumentError):
             VLM("mock", **wrong)
     with pytest.raises(ArgumentError, match="ar, imagenav"):

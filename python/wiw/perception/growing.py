@@ -37,6 +37,7 @@ class Growing(Reprojection):
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
+        real: Sequence[int],
     ) -> list[NDArray[np.bool_]]:
         """Return the grown masks."""
         seeds = self.reproject_with_holes(observations, viewpoints, frames, panoramic)

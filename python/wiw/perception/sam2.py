@@ -10,23 +10,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import panorama
 from wiw.errors import ArgumentError
 from wiw.networks import resolve_device
 from wiw.perception import pretrained
-from wiw.perception.boxes import Mask, box_width, find_box
-from wiw.perception.tracking import Tracker, get_target
-from wiw.types import Box, Observation
+from wiw.perception.boxes import Mask, find_box
+from wiw.perception.frame_tracking import FrameTracker
+from wiw.types import Box
+
+WEIGHTS = "facebook/sam2.1-hiera-tiny"
+"""Repository on the hub."""
 
 
-class Sam2(Tracker):
-    """Segments the target in the imagined frames as a video that begins with the real observation.
-
-    A panorama is rotated first, so that the target is at its centre and not across the seam.
+class Sam2(FrameTracker):
+    """Segments the target in the imagined frames as a video that begins with a real view.
 
     Args:
         weights: a folder or hub name that `transformers.Sam2VideoModel.from_pretrained` takes, or such a model.
-        prompt: how the target is marked in the first frame: by its "box", as in the paper, or its "mask".
+        prompt: how the target is marked in the first view: by its "box", as in the paper, or its "mask".
         device: of torch; the GPU if there is one.
         revision: of the hub's repository.
 
@@ -38,7 +38,7 @@ class Sam2(Tracker):
 
     def __init__(
         self,
-        weights: Any = "facebook/sam2.1-hiera-tiny",
+        weights: Any = WEIGHTS,
         prompt: Literal["box", "mask"] = "box",
         device: str | None = None,
         revision: str | None = None,
@@ -51,54 +51,27 @@ class Sam2(Tracker):
             weights = pretrained.load_network("Sam2VideoModel", ("sam2_video",), weights, revision, self.device)
         self._model = weights.to(self.device).eval()
 
-    def predict_masks(
-        self,
-        observations: Sequence[Observation],
-        viewpoints: Sequence[NDArray[np.float64]],
-        frames: Sequence[NDArray[np.uint8]],
-        panoramic: bool,
-    ) -> list[NDArray[np.bool_]]:
-        """Track one video per plan; a target that is out of sight at the start gets empty masks."""
-        return [
-            self._track_panoramas(observation, images) if panoramic else self._track_front_views(observation, images)
-            for observation, images in zip(observations, frames, strict=True)
-        ]
+    def describe(self) -> dict[str, Any]:
+        """Return a JSON-able identity, with a digest of the weights."""
+        from wiw.weight_file import digest
 
-    def _track_panoramas(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        mask, columns = get_target(observation).mask, frames.shape[2]
-        box = find_box(mask, wraps=True)
-        if box is None:
-            return np.zeros(frames.shape[:3], bool)
-        middle = (box[0] + box_width(box, mask.shape[1]) / 2) / mask.shape[1]
-        shift = columns // 2 - round(middle * columns)
-        start = np.roll(_resize_to_frames(observation.panorama, frames), shift, axis=1)
-        seed = np.roll(mask, round(shift * mask.shape[1] / columns), axis=1)
-        found = self._track_video(start, np.roll(frames, shift, axis=2), seed, find_box(seed))
-        return np.roll(found, -shift, axis=2)
+        return {**super().describe(), "prompt": self.prompt, "weights": digest(self._model.state_dict())}
 
-    def _track_front_views(self, observation: Observation, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        seed = panorama.to_perspective(
-            get_target(observation).mask.astype(np.uint8), 90.0, observation.front.shape[:2], interpolation="nearest"
-        ).astype(bool)
-        return self._track_video(
-            _resize_to_frames(observation.front, frames), frames, seed, get_target(observation).front_box
-        )
-
-    def _track_video(
-        self, start: NDArray[np.uint8], frames: NDArray[np.uint8], seed: Mask, box: Box | None
+    def follow(
+        self, views: NDArray[np.uint8], masks: NDArray[np.bool_], frames: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
-        """Return masks of the frames after `start`, in which the target has the mask `seed`, or the box around it."""
+        """Segment a video of the views and the frames, marked in its first image."""
         import torch
 
-        if box is None or not seed.any() or not len(frames):
-            return np.zeros(frames.shape[:3], bool)
+        box = find_box(masks[0])
+        assert box is not None
+        first, found = len(views), np.zeros(frames.shape[:3], bool)
         with torch.inference_mode():
-            session = self._create_session(np.concatenate([start[None], frames]))
-            self._prompt_target(session, seed, box)
-            found = np.zeros(frames.shape[:3], bool)
+            session = self._create_session(np.concatenate([views, frames]))
+            self._prompt_target(session, masks[0], box)
             for output in self._model.propagate_in_video_iterator(session, start_frame_idx=0):
-                if output.frame_idx > 0 and bool((output.object_score_logits > 0).all()):
-                    found[output.frame_idx - 1] = _upsample_mask(output.pred_masks, frames.shape[1:3])
+                if output.frame_idx >= first and bool((output.object_score_logits > 0).all()):
+                    found[output.frame_idx - first] = _upsample_mask(output.pred_masks, frames.shape[1:3])
         return found
 
     def _create_session(self, video: NDArray[np.uint8]) -> Any:
@@ -134,16 +107,6 @@ class Sam2(Tracker):
     @property
     def _side(self) -> int:
         return int(self._model.image_size)
-
-
-def _resize_to_frames(image: NDArray[np.uint8], frames: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Resize a real image to the frames' size."""
-    import cv2
-
-    height, width = frames.shape[1:3]
-    if image.shape[:2] == (height, width):
-        return image
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def _upsample_mask(logits: Any, size: Sequence[int]) -> NDArray[np.bool_]:

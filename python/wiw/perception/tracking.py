@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trackers, which locate the target in imagined frames: their interface, and the one that needs geometry alone."""
+"""Trackers, which locate the target in imagined frames: their interface, and the one that needs geometry alone.
+
+`Reprojection` shows where the target would be if a frame showed what its plan asked for: for world models that are told
+poses. `wiw.perception.frame_tracking` has those that look at the frames.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +46,10 @@ class Tracker(ABC):
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it; a policy that tracks passes this on."""
 
+    def describe(self) -> dict[str, Any]:
+        """Return a JSON-able identity: what tracks depend on beside images and poses."""
+        return {"name": type(self).__name__}
+
     @abstractmethod
     def predict_masks(
         self,
@@ -49,6 +57,7 @@ class Tracker(ABC):
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
+        real: Sequence[int],
     ) -> list[NDArray[np.bool_]]:
         """Return the target's visible pixels in each frame, bool [K, H, W] per plan; `track` documents the
         arguments.
@@ -60,6 +69,7 @@ class Tracker(ABC):
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool = True,
+        real: Sequence[int] | None = None,
     ) -> list[Track]:
         """Follow the targets of B observations into as many imagined plans.
 
@@ -68,12 +78,16 @@ class Tracker(ABC):
             viewpoints: float64 [K, 4, 4] each: T_start_camera of every frame (`wiw.action.to_viewpoints`).
             frames: uint8 [K, H, W, 3] each, panoramas or, with `panoramic=False`, front views (HFOV 90).
             panoramic: which of the two.
+            real: number of each plan's leading frames that are not imagined: turns of the real panorama; None means
+                that all are imagined.
 
         Raises:
             ArgumentError: an observation without a target, or without what the tracker needs; arrays of other shapes.
         """
         _check_arguments(self, observations, viewpoints, frames)
-        found = [remove_specks(masks) for masks in self.predict_masks(observations, viewpoints, frames, panoramic)]
+        counts = [0] * len(frames) if real is None else real
+        predicted = self.predict_masks(observations, viewpoints, frames, panoramic, counts)
+        found = [remove_specks(masks) for masks in predicted]
         return [Track(masks, tuple(find_box(mask, wraps=panoramic) for mask in masks)) for masks in found]
 
 
@@ -102,6 +116,7 @@ def track_rollouts(
             [to_viewpoints(proposal.actions) for _, proposal, _ in flat],
             [rollout.frames for _, _, rollout in flat],
             panoramic=views != {"front"},
+            real=[int(rollout.real.sum()) for _, _, rollout in flat],
         )
     )
     return [[next(tracks) for _ in plans] for plans in proposals]
@@ -122,6 +137,7 @@ class Reprojection(Tracker):
         viewpoints: Sequence[NDArray[np.float64]],
         frames: Sequence[NDArray[np.uint8]],
         panoramic: bool,
+        real: Sequence[int],
     ) -> list[NDArray[np.bool_]]:
         """Return the warped masks, without regions that no observation showed."""
         return [mask for mask, _ in self.reproject_with_holes(observations, viewpoints, frames, panoramic)]

@@ -70,9 +70,7 @@ def read_logprobs(
     return weights / weights.sum(), raw / max(raw.sum(), 1.0)
 
 
-def count_votes(
-    texts: Sequence[str], labels: Sequence[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+def count_votes(texts: Sequence[str], labels: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
     """Return each label's share of the votes, and of all samples; None where no sample begins with a label."""
     votes = [vote for vote in (parse_vote(text, labels) for text in texts) if vote is not None]
     if not votes:

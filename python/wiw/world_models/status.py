@@ -8,6 +8,7 @@ import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
+from wiw.networks import in_hub_cache
 from wiw.world_models.base import Requirements
 
 
@@ -39,18 +40,6 @@ def is_served(name: str, address: str) -> bool:
     served = remote.describe()["model"]
     remote.close()
     return bool(served.get("name") == name)
-
-
-def in_hub_cache(repository: str) -> bool:
-    """Return whether some state of a repository lies in the Hugging Face cache."""
-    snapshots = hub_cache() / f"models--{repository.replace('/', '--')}" / "snapshots"
-    return any(snapshots.glob("*/*"))
-
-
-def hub_cache() -> Path:
-    """Return the folder where the hub's client keeps what it has downloaded."""
-    home = os.environ.get("HF_HOME") or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "huggingface"
-    return Path(os.environ.get("HF_HUB_CACHE") or Path(home) / "hub").expanduser()
 
 
 def has_gpu() -> bool:

@@ -51,6 +51,7 @@ class Recognition(Policy):
     Args:
         weights: of `wiw.perception.recogniser.Recogniser`; None means those shipped with the package.
         tracker: name of the tracker that locates the target in imagined frames, or an instance.
+        tracker_options: what a tracker given by name is made with.
         remember: number of real glimpses stored, from as many places.
         views: number of imagined glimpses of a plan used, the last ones.
         lost: deduction from a plan's score if all its frames lose the target, else in proportion.
@@ -83,6 +84,7 @@ class Recognition(Policy):
         self,
         weights: str | Path | None = None,
         tracker: Any = "reprojection",
+        tracker_options: Mapping[str, Any] | None = None,
         remember: int = 2,
         views: int = 2,
         lost: float = 0.5,
@@ -91,7 +93,7 @@ class Recognition(Policy):
     ) -> None:
         self.file = Path(WEIGHTS if weights is None else weights)
         self.recogniser = Recogniser.load(self.file)
-        self.tracker = TRACKERS.make(tracker)
+        self.tracker = TRACKERS.make(tracker, **(tracker_options or {}))
         self.needs = tuple(sorted({"depth", *self.tracker.needs}))
         self.remember, self.views, self.lost, self.turning, self.trust = remember, views, lost, turning, trust
 
@@ -100,7 +102,7 @@ class Recognition(Policy):
         return {
             "policy": type(self).__name__,
             "weights": blake2b(self.file.read_bytes(), digest_size=8).hexdigest(),
-            "tracker": type(self.tracker).__name__,
+            "tracker": self.tracker.describe(),
             "remember": self.remember,
             "views": self.views,
             "lost": self.lost,

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from wiw._core import core
 from wiw.errors import ArgumentError, DependencyError
-from wiw.perception.tracking import Track, track_rollouts
+from wiw.perception.tracking import Track, Tracker, get_target, track_rollouts
 from wiw.policies.base import FrameSpec, Policy, Situation
 from wiw.policies.vlm import plans, presets, prompt_images
 from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import TRACKERS
-from wiw.types import Answer, Exchange, Goal, Key, Proposal, Rollout, TextAnswer
+from wiw.types import Answer, Exchange, Goal, Key, Observation, Proposal, Rollout, TextAnswer
 from wiw.vlm import Reply, Request, connect, user
 from wiw.vlm.cache import open_reply_cache
 from wiw.vlm.messages import Part
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 OBSERVATION_WORDS = "front view (90 degrees wide) and panorama (360 degrees)"
 """Value of the slot `obs_key`."""
+TARGET_WORDS = "view centred on one thing (90 degrees wide)"
+"""Its value in the question for the category, where that is the view shown."""
 OUT_OF_SIGHT = "the target is neither in sight nor in an imagined view, nothing was asked"
 FALLBACK_SEED, _ANSWER_SEED, _MOVE_SEED, REVISION_SEED = 0x64726177, 0x616E7377, 0x6D6F7665, 0x72657669
 """Separate the seeds of a decision's questions."""
@@ -48,7 +50,9 @@ class Memory:
     horizon: int = 1
     """Most primitives, or poses, of a plan."""
     belief: NDArray[np.float64] | None = None
-    """The last answer."""
+    """The last answer, as probabilities that sum to 1 ..."""
+    raw_belief: NDArray[np.float64] | None = None
+    """... and as the model gave them."""
     decision: tuple[Key, NDArray[Any]] | None = None
     """The plan written, or the primitive chosen, at the latest decision."""
     tracks: tuple[Any, list[Track]] | None = None
@@ -60,8 +64,8 @@ class VLM(Policy):
 
     Image-Goal Navigation: plans are written from front view, panorama and goal image; with a world model a second
     question shows the goal image and what each plan is imagined to lead to. Active Recognition: two multiple-choice
-    questions a decision, for the category, from views centred on the boxed target, and for the next primitive. Robotic
-    Manipulation, where plans are poses: `wiw.policies.vlm.arm`.
+    questions a decision, for the category and for the next primitive, from front view and panorama with the target
+    boxed, and imagined views. Robotic Manipulation, where plans are poses: `wiw.policies.vlm.arm`.
 
     An answer that cannot be used after `tries` is an outcome of the policy: a plan is left out; where none is left, a
     primitive is drawn; a category is the last one, else none is preferred. Note and `exchanges` of the decision say so.
@@ -76,7 +80,13 @@ class VLM(Policy):
             "select" lets it choose one of the proposals, with the probabilities as scores. Not for recognition.
         temperature: of sampled plans; everything else is asked at 0.
         tries: times a question is put before its answer counts as unusable.
-        tracker: finds the target in imagined frames; name or instance.
+        tracker: finds the target in imagined frames (`wiw list trackers`); name or instance, None for a task that
+            points nothing out.
+        tracker_options: what a tracker given by name is made with, such as {"weights": "sam2.1-hiera-large"}.
+        answer_view: what the category is asked from: "observation", front view and panorama, as in the paper, or
+            "target", one view centred on the target.
+        rounds: whether more categories than the server lists tokens are asked about in rounds, rather than in one
+            question with all of them.
         cache: where answers are kept, so that none is paid for twice: "auto" (`~/.cache/wiw/replies`), a folder, "off".
         prices: YAML file of `model: [read, written]`, dollars per million tokens.
         client: further options of the client, such as `dialect` and `concurrency`.
@@ -90,6 +100,8 @@ class VLM(Policy):
     frames = FrameSpec("panorama", (576, 1024))
     tasks: tuple[str, ...] = ("ar", "imagenav")
     """Tasks that it has prompts for."""
+    tracks: bool = True
+    """Whether there are tasks among them that point something out."""
     fallback_action = "a primitive was drawn"
     """Description of the fallback where no plan can be used."""
 
@@ -102,7 +114,10 @@ class VLM(Policy):
         revision: Literal["write", "select"] = "write",
         temperature: float = 1.0,
         tries: int = 3,
-        tracker: Any = "reprojection",
+        tracker: Any = "frames",
+        tracker_options: Mapping[str, Any] | None = None,
+        answer_view: Literal["observation", "target"] = "observation",
+        rounds: bool = False,
         cache: str | Path = "auto",
         prices: str | Path | None = None,
         **client: Any,
@@ -110,12 +125,14 @@ class VLM(Policy):
         if (
             proposals not in ("sampled", "listed")
             or revision not in ("write", "select")
+            or answer_view not in ("observation", "target")
             or temperature < 0
             or tries < 1
         ):
             raise ArgumentError(
-                "policy vlm: expected proposals sampled or listed, revision write or select, temperature >= 0 and "
-                f"tries >= 1, got {proposals}, {revision}, {temperature}, {tries}"
+                "policy vlm: expected proposals sampled or listed, revision write or select, answer_view observation "
+                f"or target, temperature >= 0 and tries >= 1, got {proposals}, {revision}, {answer_view}, "
+                f"{temperature}, {tries}"
             )
         _require_packages()
         self.prompts = Prompts(prompts)
@@ -123,8 +140,9 @@ class VLM(Policy):
         kept = {"cache": open_reply_cache(cache), "prices": table} if isinstance(vlm, str) else {}
         self.client = connect(vlm, **{**kept, **presets.get_client_options(model), **client})
         self.proposals, self.revision, self.temperature, self.tries = proposals, revision, temperature, tries
-        self.tracker = TRACKERS.make(tracker)
-        self.needs = tuple(self.tracker.needs)
+        self.answer_view, self.rounds = answer_view, rounds
+        self.tracker = TRACKERS.make(tracker, **(tracker_options or {})) if tracker and self.tracks else None
+        self.needs = () if self.tracker is None else tuple(self.tracker.needs)
         self._journal: dict[tuple[int, int], list[Exchange]] = {}
 
     def describe(self) -> dict[str, Any]:
@@ -137,8 +155,11 @@ class VLM(Policy):
             "revision": self.revision,
             "temperature": self.temperature,
             "tries": self.tries,
-            "tracker": type(self.tracker).__name__,
+            **({} if self.tracker is None else self._describe_recognition(self.tracker)),
         }
+
+    def _describe_recognition(self, tracker: Tracker) -> dict[str, Any]:
+        return {"tracker": tracker.describe(), "answer_view": self.answer_view, "rounds": self.rounds}
 
     @property
     def spent(self) -> Mapping[str, float]:
@@ -353,7 +374,7 @@ class VLM(Policy):
         proposals: Sequence[Sequence[Proposal]],
         rollouts: Sequence[Sequence[Rollout] | None],
     ) -> Sequence[Answer | TextAnswer | None]:
-        """Return the category, by views centred on the boxed target: the real one, and those imagined for each plan."""
+        """Return the category, by what is really seen of the boxed target and what is imagined of it for each plan."""
         rows = list(zip(situations, proposals, rollouts, strict=True))
         replies = self._ask_each([self._build_answer_requests(*row) if row[0].goal.choices else [] for row in rows])
         return [
@@ -365,24 +386,32 @@ class VLM(Policy):
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout] | None
     ) -> list[Request]:
         """Ask for the category; nothing where the target is in no view."""
-        real = prompt_images.render_target(situation.observation)
-        strips: list[prompt_images.Image] = []
+        real = self._show_target(situation.observation)
+        imagined: list[Part] = []
         if rollouts is not None:
             tracks = self._track_target(situation, proposals, rollouts)
-            found = [
-                prompt_images.render_target_strip(rollout, track)
-                for rollout, track in zip(rollouts, tracks, strict=True)
-            ]
-            strips = [strip for strip in found if strip is not None]
-        if real is None and not strips:
+            for number, (rollout, track) in enumerate(zip(rollouts, tracks, strict=True), 1):
+                imagined += _caption_target_strip(number, rollout, track)
+        if not real and not imagined:
             return []
-        parts: list[Part] = [self._render_prompt(situation, "answerer", 1)]
-        parts += [] if real is None else [real]
-        if strips:
-            parts += [self._render_prompt(situation, "answerer_imagined", 1), *strips]
-        choices = situation.goal.choices
+        words = OBSERVATION_WORDS if self.answer_view == "observation" else TARGET_WORDS
+        parts: list[Part] = [self._render_prompt(situation, "answerer", 1, seen=words), *real]
+        if imagined:
+            parts += [self._render_prompt(situation, "answerer_imagined", 1), *imagined]
         seed = derive_seed(situation.key, _ANSWER_SEED)
-        return [Request((user(*parts),), choices=choices, seed=seed, tries=self.tries)]
+        choices = situation.goal.choices
+        return [Request((user(*parts),), choices=choices, rounds=self.rounds, seed=seed, tries=self.tries)]
+
+    def _show_target(self, observation: Observation) -> list[Part]:
+        """Return what is really seen of the target; nothing where it is out of sight."""
+        if self.answer_view == "target":
+            view = prompt_images.render_target(observation)
+            return [] if view is None else [view]
+        target = get_target(observation)
+        if target.panorama_box is None and target.front_box is None:
+            return []
+        front, panorama = prompt_images.render_observation(observation)
+        return ["Front view:", front, "Panorama:", panorama]
 
     def _build_answer(self, situation: Situation, reply: Reply | None = None) -> Answer:
         memory, choices = situation.memory, situation.goal.choices
@@ -393,9 +422,9 @@ class VLM(Policy):
         else:
             self._record_exchange(situation.key, "answer", reply, instead)
             if reply.probabilities is not None:
-                memory.belief = reply.probabilities
+                memory.belief, memory.raw_belief = reply.probabilities, reply.raw
         believed = _make_uniform_belief(situation.key, len(choices)) if memory.belief is None else memory.belief
-        return Answer(choices, believed)
+        return Answer(choices, believed, memory.raw_belief)
 
     def _track_target(
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
@@ -404,6 +433,10 @@ class VLM(Policy):
         memory: Memory = situation.memory
         name = situation.key, tuple(plan.actions.tobytes() for plan in proposals), id(rollouts[0].frames)
         if memory.tracks is None or memory.tracks[0] != name:
+            if self.tracker is None:
+                raise ArgumentError(
+                    "policy vlm: recognition needs a tracker, and this policy was made with tracker=None"
+                )
             (tracks,) = track_rollouts(self.tracker, [situation.observation], [proposals], [rollouts])
             memory.tracks = name, tracks
         return memory.tracks[1]
@@ -415,11 +448,13 @@ class VLM(Policy):
         replies = iter(self.client.ask([request for own in requests for request in own]))
         return [list(islice(replies, len(own))) for own in requests]
 
-    def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
+    def _render_prompt(
+        self, situation: Situation, name: str, horizon: int, count: int = 1, seen: str = OBSERVATION_WORDS
+    ) -> str:
         return self.prompts.render(
             situation.goal.task,
             name,
-            obs_key=OBSERVATION_WORDS,
+            obs_key=seen,
             look_ahead_action_num=horizon,
             plan_num=count,
             actions=plans.MEANINGS,
@@ -458,6 +493,17 @@ def _caption_strips(proposals: Sequence[Proposal], strips: Sequence[prompt_image
     for number, (plan, strip) in enumerate(zip(proposals, strips, strict=True), 1):
         parts += [f"Plan {number}: {plans.name_actions(plan.actions)}", strip]
     return parts
+
+
+def _caption_target_strip(number: int, rollout: Rollout, track: Track) -> list[Part]:
+    """Return a plan's imagined views of the target, and how many of its imagined frames have lost it."""
+    strip = prompt_images.render_target_strip(rollout, track)
+    if strip is None:
+        return []
+    imagined = ~rollout.real
+    lost, count = int((imagined & ~track.visible).sum()), int(imagined.sum())
+    said = f"; in {lost} of {count} the thing was lost, and they are left out" if lost else ""
+    return [f"Imagined views {number}{said}:", strip]
 
 
 def _measure_agreement(plan: NDArray[Any], written: NDArray[Any]) -> float:

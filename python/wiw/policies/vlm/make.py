@@ -17,6 +17,8 @@ def make_vlm(space: str = PRIMITIVES, task: str = "", **options: Any) -> VLM:
 
     `VLM` documents the options, and `QuestionVLM` those of task "aeqa".
     """
+    if task == "imagenav":  # which points nothing out
+        options["tracker"] = None
     kind = ArmVLM if space == GRIPPER_POSES else QuestionVLM if task in QuestionVLM.tasks else VLM
     return kind(**options)
 

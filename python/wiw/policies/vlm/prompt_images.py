@@ -15,7 +15,7 @@ from wiw.perception.boxes import find_box
 from wiw.perception.tracking import Track
 from wiw.perception.views import cut_target_views
 from wiw.policies.vlm.plans import describe_actions
-from wiw.types import Observation, Proposal, Rollout
+from wiw.types import Box, Observation, Proposal, Rollout
 
 VIEW = 384
 """Side of frames in pixels, as in the paper."""
@@ -33,16 +33,22 @@ def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = No
     box.
     """
     fronts, masks = _cut_front_views(rollout, track)
-    if masks is not None:
-        boxes = [find_box(mask) for mask in masks]
-        fronts = np.stack(
-            [
-                front if box is None else annotate.box(front, box, outside=True)
-                for front, box in zip(fronts, boxes, strict=True)
-            ]
-        )
     titles = [f"Imagined action {k}: {word}" for k, word in enumerate(describe_actions(plan.actions[: len(fronts)]), 1)]
+    if track is not None and masks is not None:
+        boxes = [find_box(mask) for mask in masks]
+        lost = ~track.visible & ~rollout.real
+        titles = [_caption_box(*frame) for frame in zip(titles, boxes, lost, strict=True)]
+        fronts = np.stack([_draw_box(*frame) for frame in zip(fronts, boxes, strict=True)])
     return annotate.strip(fronts, titles)
+
+
+def _caption_box(title: str, box: Box | None, lost: bool) -> str:
+    """Say it where there is no box: the tracker has lost the target, or it is elsewhere around the agent."""
+    return title if box is not None else f"{title}, target {'lost' if lost else 'out of view'}"
+
+
+def _draw_box(view: Image, box: Box | None) -> Image:
+    return view if box is None else annotate.box(view, box, outside=True)
 
 
 def render_target(observation: Observation) -> Image | None:
@@ -63,10 +69,7 @@ def render_target_strip(rollout: Rollout, track: Track) -> Image | None:
     if rollout.view == "panorama":
         images = cut_target_views(rollout.frames[wanted], track.masks[wanted], (VIEW, VIEW)).images
     else:
-        boxes = [track.boxes[k] for k in wanted]
-        images = np.stack(
-            [annotate.box(rollout.frames[k], box or (), outside=True) for k, box in zip(wanted, boxes, strict=True)]
-        )
+        images = np.stack([_draw_box(rollout.frames[k], track.boxes[k]) for k in wanted])
     return annotate.strip(images, _number_views(len(images))) if len(images) else None
 
 

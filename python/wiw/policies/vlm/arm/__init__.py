@@ -35,15 +35,8 @@ class ArmVLM(VLM):
     space = GRIPPER_POSES
     frames = FrameSpec("front", (384, 384))
     tasks = ("manipulation",)
+    tracks = False
     fallback_action = "a pose was drawn"
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.needs = ()
-
-    def describe(self) -> dict[str, Any]:
-        """Return a JSON-able identity, with the model and a digest of the prompts."""
-        return {name: value for name, value in super().describe().items() if name != "tracker"}
 
     def _build_plan_prompt(self, situation: Situation, horizon: int) -> list[Part]:
         examples = self._render_prompt(situation, "examples", horizon)

@@ -74,6 +74,7 @@ class QuestionVLM(VLM):
 
     frames = FrameSpec("panorama", (432, 768), ends=True)
     tasks = ("aeqa",)
+    tracks = False
 
     def __init__(
         self,
@@ -105,7 +106,7 @@ class QuestionVLM(VLM):
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity, with the model, a digest of the prompts, and the perception."""
         own = {"perception": self.labeller.describe(), "history": self.history, "order": self.order}
-        return {**{name: value for name, value in super().describe().items() if name != "tracker"}, **own}
+        return {**super().describe(), **own}
 
     def begin(self, goal: Goal, key: Key) -> QuestionMemory:
         """Return an empty map."""
