@@ -290,7 +290,7 @@ def test_the_tracker_of_frames_is_sam2_only_where_its_weights_are(
 ) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     made = TRACKERS.make("frames")
-    assert isinstance(made, Flow) and made.describe() == {"name": "Flow"} and made.needs == ()
+    assert isinstance(made, Flow) and made.describe() == {"name": "Flow", "follows": "frames"} and made.needs == ()
     with pytest.raises(WeightsError, match="no folder"):
         TRACKERS.make("frames", weights=str(tmp_path / "sam2"))  # asked for: nothing takes its place
     (tmp_path / "models--facebook--sam2.1-hiera-tiny/snapshots/abc").mkdir(parents=True)

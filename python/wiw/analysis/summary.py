@@ -92,6 +92,13 @@ class Group:
     """By label of the row, then by metric."""
 
 
+TRACKED = {
+    "frames": "their pixels",
+    "poses": "the poses that were asked for, whatever the frames show",
+}
+"""What a tracker follows, in words."""
+
+
 @dataclass(frozen=True)
 class Summary:
     """The numbers of a run, as `RunLog.summary()` shows them."""
@@ -112,6 +119,8 @@ class Summary:
 
     unbalanced: int = field(default=0, kw_only=True)
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
+    trackers: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    """What located targets in imagined frames, by name, and what it followed: "frames" or "poses"."""
 
     @property
     def lines(self) -> tuple[ArmSummary, ...]:
@@ -140,12 +149,17 @@ class Summary:
 
     def remarks(self) -> tuple[str, ...]:
         """Return further sentences that a reader of the tables needs."""
-        if not self.unbalanced:
-            return ()
-        return (
-            f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its text "
-            "may give its answer away. Scores cannot be compared with those of balanced questions.",
-        )
+        found = [
+            f"Tracker {name} located the target in imagined frames by {TRACKED[follows]}."
+            for name, follows in self.trackers.items()
+            if follows in TRACKED
+        ]
+        if self.unbalanced:
+            found.append(
+                f"Unbalanced questions in {self.unbalanced} of the episodes: each is asked in one scene only, so its "
+                "text may give its answer away. Scores cannot be compared with those of balanced questions."
+            )
+        return tuple(found)
 
     def utility(self, arm: str) -> Utility:
         """Return an arm's utility: its share of the gain from floor to ceiling."""
@@ -240,7 +254,15 @@ def summarise_run(run: Run) -> Summary:
         twins=find_twins(episodes),
         judge=run.store.judge,
     )
-    return replace(found, unbalanced=count_unbalanced(run))
+    return replace(found, unbalanced=count_unbalanced(run), trackers=_list_trackers(run))
+
+
+def _list_trackers(run: Run) -> dict[str, str]:
+    """Return the trackers of the arms that imagine, and what each follows."""
+    built = run.store.info.get("built", {})
+    revisers = [built[arm].get("revision") for arm in run.arms if arm in built and built[arm].get("model")]
+    trackers = [reviser.get("tracker") for reviser in revisers if isinstance(reviser, Mapping)]
+    return {own["name"]: own["follows"] for own in trackers if isinstance(own, Mapping)}
 
 
 def count_unbalanced(run: Run) -> int:

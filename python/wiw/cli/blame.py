@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.options import Options, tracker_options
+from wiw.cli.parts import MaybeName
 from wiw.cli.stop import stoppable
+from wiw.errors import ArgumentError
 
 
 def blame(
@@ -20,6 +23,9 @@ def blame(
     episodes: Annotated[int | None, arg(metavar="N")] = None,
     workers: Annotated[int | None, arg(metavar="N")] = None,
     retry_errors: bool = False,
+    revision_option: Options = (),
+    tracker: MaybeName = None,
+    tracker_option: Options = (),
 ) -> int:
     """Find the stage that causes the failures of a run: imagination, scoring or proposals; perception or exploration.
 
@@ -56,14 +62,46 @@ def blame(
         episodes: Largest number of failures per arm, drawn at random; all if not given.
         workers: Processes; as many as the run was started with if not given. Results do not depend on it.
         retry_errors: Whether to repeat reruns that ended with an infrastructure error.
+        revision_option: An option of the policy that revises in place of the run's, such as vlm=URL of another server;
+            may be given again. What would change results is refused.
+        tracker: The tracker by another name, likewise.
+        tracker_option: An option of the tracker, such as weights=FOLDER where they lie now; may be given again.
     """
     from wiw.studies.blame import blame as rerun_failures
 
     arms = None if arm is None else [name.strip() for name in arm.split(",") if name.strip()]
-    found = stoppable(lambda: rerun_failures(run, arms, episodes, workers, retry_errors=retry_errors), run, "blame")
+    changes: dict[str, Any] = {
+        "reviser_options": _parse_revision_options(run, revision_option),
+        "tracker": tracker,
+        "tracker_options": tracker_options(tracker, tracker_option),
+    }
+    found = stoppable(
+        lambda: rerun_failures(run, arms, episodes, workers, retry_errors=retry_errors, **changes), run, "blame"
+    )
     found.summary()
     print(f"\nepisodes  {found.save()}")
     errors = sum(len(line.rerun_errors) for line in found.arms)
     if errors:
         print(f"Once the cause of the errors is fixed:  wiw blame {run} --retry-errors", file=sys.stderr)
     return 1 if errors else 0
+
+
+def _parse_revision_options(run: Path, pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Return options of the policy that revises in a run.
+
+    Raises:
+        ArgumentError: its arms have different ones.
+    """
+    from wiw.registry import POLICIES
+    from wiw.runs.execute import recipes_of
+    from wiw.runs.part_options import parse_options
+    from wiw.runs.store import RunStore
+
+    if not pairs:
+        return {}
+    with RunStore.read(run) as store:
+        _, agents = recipes_of(store)
+    revisers = {str(recipe.reviser or recipe.policy) for recipe in agents.values()}
+    if len(revisers) > 1:
+        raise ArgumentError(f"--revision-option: the arms have several policies that revise: {', '.join(revisers)}")
+    return parse_options(pairs, POLICIES.find(revisers.pop()), "--revision-option")

@@ -31,17 +31,27 @@ def model_options(model: str | None, pairs: Sequence[str]) -> dict[str, Any]:
 
 
 def policy_options(
-    policy: str, pairs: Sequence[str], beside: Mapping[str, Mapping[str, Any]]
+    policy: str | None, pairs: Sequence[str], beside: Mapping[str, Mapping[str, Any]], flag: str = "--policy-option"
 ) -> dict[str, Mapping[str, Any]]:
-    """Return what policies are made with, by name: what `--policy-option` gives one, on top of what is known of all."""
+    """Return what policies are made with, by name: what a flag gives one, on top of what is known of all.
+
+    Raises:
+        ArgumentError: options without a policy to take them.
+    """
     from wiw.registry import POLICIES
 
     if not pairs:
         return dict(beside)
-    return {
-        **beside,
-        policy: {**beside.get(policy, {}), **parse_options(pairs, POLICIES.find(policy), "--policy-option")},
-    }
+    if policy is None:
+        raise ArgumentError(f"{flag}: name the policy that takes it with {flag.removesuffix('-option')}")
+    return {**beside, policy: {**beside.get(policy, {}), **parse_options(pairs, POLICIES.find(policy), flag)}}
+
+
+def tracker_options(tracker: str | None, pairs: Sequence[str]) -> dict[str, Any]:
+    """Return the options of a tracker from `--tracker-option`; where none is named, of the one of policy vlm."""
+    from wiw.registry import TRACKERS
+
+    return parse_options(pairs, TRACKERS.find(tracker or "frames"), "--tracker-option") if pairs else {}
 
 
 def semantics_options(source: str | None, pairs: Sequence[str]) -> dict[str, Any]:

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from wiw.cli.options import Options, default_policy, model_options, policy_options, semantics_options, task_options
+from wiw.cli.options import (
+    Options,
+    default_policy,
+    model_options,
+    policy_options,
+    semantics_options,
+    task_options,
+    tracker_options,
+)
 from wiw.errors import ArgumentError
 from wiw.loop.config import PlanConfig
 
@@ -78,6 +86,13 @@ class AgentFlags:
     too."""
     revision: MaybeName = None
     """Scores imagined futures; the policy's own choice if not given."""
+    revision_option: Options = ()
+    """An option of --revision; may be given again."""
+    tracker: MaybeName = None
+    """For ar: finds the target in imagined frames, such as sam2 or reprojection. See `wiw list trackers`. If not given,
+    for policy vlm frames, for recogniser reprojection."""
+    tracker_option: Options = ()
+    """An option of --tracker, such as weights=FOLDER of sam2; may be given again."""
     vlm: Annotated[str | None, arg(metavar="URL")] = None
     """For policy vlm: an OpenAI-compatible server, transformers:PATH, replay:RUN, or mock; http://localhost:8000/v1 if
     not given."""
@@ -104,16 +119,17 @@ class AgentFlags:
             raise ArgumentError(
                 "--width: a search of one level extends no plan; give --depth 2 or more, or leave it out"
             )
-        policy = absolute(self.policy or default_policy(task))
+        policy, reviser = absolute(self.policy or default_policy(task)), self.revision and absolute(self.revision)
+        options = policy_options(policy, self.policy_option, self._vlm_options([policy, reviser or "", *policies]))
         model = None if self.world_model == "none" else absolute(self.world_model)
         return AgentRecipe(
-            policy, model, self.revision and absolute(self.revision), **vars(search),
+            policy, model, reviser, **vars(search),
             model_options=model_options(model, self.world_model_option),
             semantics=self.semantics and absolute(self.semantics),
             semantics_options=semantics_options(self.semantics, self.semantics_option),
-            policy_options=policy_options(
-                policy, self.policy_option, self._vlm_options([policy, self.revision or "", *policies])
-            ),
+            policy_options=policy_options(reviser, self.revision_option, options, "--revision-option"),
+            tracker=self.tracker and absolute(self.tracker),
+            tracker_options=tracker_options(self.tracker, self.tracker_option),
         )  # fmt: skip
 
     def _vlm_options(self, policies: Sequence[str]) -> dict[str, Any]:

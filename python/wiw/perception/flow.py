@@ -72,11 +72,11 @@ def _find_target(image: Grey, mask: Mask, frame: Grey) -> Mask | None:
     if start is None or len(start) < FEWEST or (patch := _find_patch(image, mask, frame)) is None:
         return None
     corner, place, scale = patch
-    guess = ((start - np.float32(corner)) * scale + np.float32(place)).astype(np.float32)
+    guess = ((start - np.array(corner, np.float32)) * scale + np.array(place, np.float32)).astype(np.float32)
     end, arrived = _follow_corners(image, frame, start, guess)
     back, returned = _follow_corners(frame, image, end, start)
     kept = arrived & returned & (np.abs(back - start).max(axis=(1, 2)) < RETURN)
-    kept &= ((end >= 0) & (end < np.float32(frame.shape[::-1]))).all(axis=(1, 2))
+    kept &= ((end >= 0) & (end < np.array(frame.shape[::-1], np.float32))).all(axis=(1, 2))
     if kept.sum() < FEWEST:
         return None
     motion, agree = cv2.estimateAffinePartial2D(start[kept], end[kept], ransacReprojThreshold=OUTLIER)

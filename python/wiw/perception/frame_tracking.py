@@ -27,6 +27,8 @@ class FrameTracker(Tracker):
     the target, turn by turn.
     """
 
+    follows = "frames"
+
     @abstractmethod
     def follow(
         self, views: NDArray[np.uint8], masks: NDArray[np.bool_], frames: NDArray[np.uint8]

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,12 @@ class Tracker(ABC):
 
     needs: tuple[str, ...] = ()
     """"depth" where observations must carry it; a policy that tracks passes this on."""
+    follows: Literal["frames", "poses"]
+    """Whether it looks at the frames, or takes them for what the poses were to show."""
 
     def describe(self) -> dict[str, Any]:
         """Return a JSON-able identity: what tracks depend on beside images and poses."""
-        return {"name": type(self).__name__}
+        return {"name": type(self).__name__, "follows": self.follows}
 
     @abstractmethod
     def predict_masks(
@@ -130,6 +132,7 @@ class Reprojection(Tracker):
     """
 
     needs = ("depth",)
+    follows = "poses"
 
     def predict_masks(
         self,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from wiw.loop.imagination import Imaginer
 from wiw.loop.limits import Limits
 from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
-from wiw.registry import POLICIES, SEMANTICS, WORLD_MODELS
+from wiw.registry import POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
 from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
 from wiw.runs.part_options import parse_options
@@ -36,6 +37,7 @@ REFERENCES = ("none", "copy", "oracle")
 ELSEWHERE = ("vlm", "cache", "prices", "concurrency", "timeout", "attempts")
 """Options of a policy that change no answer: where and how its language model is asked."""
 NO_LIMITS = Limits()
+NOTHING: Mapping[str, Any] = {}
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,10 @@ class AgentRecipe(AgentConfig):
     semantics: Any = None
     semantics_options: Mapping[str, Any] = field(default_factory=dict)
     """What the source of semantics is made with."""
+    tracker: Any = None
+    """Finds the target in imagined frames, for the policy that revises; None: that policy's own."""
+    tracker_options: Mapping[str, Any] = field(default_factory=dict)
+    """What the tracker is made with."""
     observers: Sequence[Observer] = ()
     """Measure decisions; objects in memory."""
 
@@ -98,7 +104,7 @@ class AgentRecipe(AgentConfig):
         semantics = None if self.model is None else self.semantics  # nobody would look at them
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
-        policy, reviser = (self._make_policy(name, space, context.task) for name in (self.policy, self.reviser))
+        policy, reviser = self._make_policies(space, context.task)
         experiment = Experiment(self.placebo, self.imagine_fraction, tuple(self.ground_truth), semantics)
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
@@ -131,7 +137,7 @@ class AgentRecipe(AgentConfig):
     @property
     def is_named(self) -> bool:
         """Whether all parts are names, so that any process can make them again."""
-        parts = (self.policy, self.model, self.reviser, self.semantics)
+        parts = (self.policy, self.model, self.reviser, self.semantics, self.tracker)
         return not self.observers and all(part is None or isinstance(part, str) for part in parts)
 
     def to_json(self) -> dict[str, Any] | None:
@@ -153,6 +159,8 @@ class AgentRecipe(AgentConfig):
         for registry, part, options in (*policies, (WORLD_MODELS, self.model, self.model_options)):
             if isinstance(part, str):
                 registry.fitting(part, **options)
+        if isinstance(self.tracker, str):
+            TRACKERS.fitting(self.tracker, **self.tracker_options)
         if isinstance(self.semantics, str):
             if self.semantics_options:
                 SEMANTICS.fitting(self.semantics, **self.semantics_options)
@@ -169,6 +177,7 @@ class AgentRecipe(AgentConfig):
     def sources(self) -> dict[str, str]:
         """Return digests of the user's own source files of all parts, by path."""
         parts = [(WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser)]
+        parts += [(TRACKERS, self.tracker)]
         parts += [(SEMANTICS, None if self.model is None else self.semantics)]
         found: dict[str, str] = {}
         for registry, part in parts:
@@ -179,11 +188,16 @@ class AgentRecipe(AgentConfig):
         return found
 
     def require(self, task: Mapping[str, Any]) -> None:
-        """Require that world model and policies are made for a task that describes itself so.
+        """Require that world model, policies and tracker are made for a task that describes itself so.
 
         Raises:
             ArgumentError: one of them is not.
         """
+        if (self.tracker or self.tracker_options) and not task.get("categories"):
+            raise ArgumentError(
+                f"tracker: task '{task.get('task', 'of this run')}' points nothing out that could be followed; name a "
+                "tracker for task ar alone"
+            )
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
@@ -211,13 +225,42 @@ class AgentRecipe(AgentConfig):
         kind, scheme, host = self.model.partition("://")
         return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
 
-    def _make_policy(self, policy: Any, space: str, task: Task) -> Any:
-        """Return a policy with the options of its name, and the task's; others are made with the agent."""
+    def _make_policies(self, space: str, task: Task) -> tuple[Any, Any]:
+        """Return policy and reviser (None: the policy's or the task's own); the one that revises has the tracker.
+
+        Raises:
+            ArgumentError: there is a tracker, and the policy that revises takes none.
+        """
+        given = {"tracker": self.tracker, "tracker_options": dict(self.tracker_options)}
+        tracker = {name: value for name, value in given.items() if value}
+        if not tracker:
+            return self._make_policy(self.policy, space, task), self._make_policy(self.reviser, space, task)
+        revising = self._find_reviser(task)
+        if not isinstance(revising, str) or "tracker" not in inspect.signature(POLICIES.find(revising)).parameters:
+            raise ArgumentError(
+                f"tracker: policy {revising if isinstance(revising, str) else type(revising).__name__} takes none; "
+                "expected one that revises by name and looks for a target in imagined frames, such as vlm or recogniser"
+            )
+        if revising is self.policy:
+            return self._make_policy(revising, space, task, tracker), None
+        return self._make_policy(self.policy, space, task), self._make_policy(revising, space, task, tracker)
+
+    def _find_reviser(self, task: Task) -> Any:
+        """Return the policy that revises; where none is named, the policy itself if it can, else the task's."""
+        if self.reviser is not None:
+            return self.reviser
+        kind = POLICIES.find(self.policy) if isinstance(self.policy, str) else type(self.policy)
+        if isinstance(kind, type) and issubclass(kind, Policy) and kind.score is Policy.score:
+            return task.defaults.get("revision") or kind.default_revision
+        return self.policy
+
+    def _make_policy(self, policy: Any, space: str, task: Task, more: Mapping[str, Any] = NOTHING) -> Any:
+        """Return a policy with the options of its name, the task's and more; others are made with the agent."""
         sources = (task.policy_options, self.policy_options)
-        if not isinstance(policy, str) or not any(policy in options for options in sources):
+        if not isinstance(policy, str) or not (more or any(policy in options for options in sources)):
             return policy
         options = {name: value for own in sources for name, value in own.get(policy, {}).items()}
-        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
+        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options, **more})
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")

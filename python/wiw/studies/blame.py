@@ -34,6 +34,9 @@ def blame(
     progress: bool = True,
     *,
     retry_errors: bool = False,
+    reviser_options: Mapping[str, Any] | None = None,
+    tracker: str | None = None,
+    tracker_options: Mapping[str, Any] | None = None,
 ) -> Blame:
     """Find the stage that causes the failures of a run: imagination, scoring, proposals; perception, exploration.
 
@@ -55,6 +58,10 @@ def blame(
         workers: processes; None means as many as the run was begun with. Results do not depend on it.
         progress: whether to show bars.
         retry_errors: whether to repeat reruns that ended with an infrastructure error.
+        reviser_options: options of the policy that revises in place of the run's, for what lies elsewhere now: a
+            server's address, a folder of weights. Whatever would change results is refused.
+        tracker: likewise, the tracker by name.
+        tracker_options: likewise.
 
     Raises:
         ArgumentError: an unknown arm, no failure, a number out of range, a task that does not say what success
@@ -73,7 +80,11 @@ def blame(
         store = _store(base, agents)
         named = {name_rerun(arm, rerun): indices for arm, indices in wanted.items() for rerun in list_reruns(base, arm)}
         pending = {name: sorted({*store.pending(name, retry_errors)} & indices) for name, indices in named.items()}
-        run_pending(store, task, agents, pending, workers or base.info["workers"], progress)
+        moved = {
+            name: _replace_options(agent, reviser_options or {}, tracker, tracker_options or {})
+            for name, agent in agents.items()
+        }
+        run_pending(store, task, moved, pending, workers or base.info["workers"], progress)
         found = read_blame(base)
         assert found is not None
         return replace(found, arms=tuple(line for line in found.arms if line.arm in wanted))
@@ -162,6 +173,20 @@ def _with_ground_truth(recipe: AgentRecipe, stages: tuple[str, ...]) -> AgentRec
         return own if recipe.reviser is None else replace(own, reviser=counterpart.policy)
     own = replace(recipe.with_model("oracle"), placebo=None) if "imagination" in stages else recipe
     return replace(own, ground_truth=stages)
+
+
+def _replace_options(
+    recipe: AgentRecipe, reviser_options: Mapping[str, Any], tracker: str | None, tracker_options: Mapping[str, Any]
+) -> AgentRecipe:
+    """Return the agent with other options; that it is the same agent is checked once it is built."""
+    name = recipe.policy if recipe.reviser is None else recipe.reviser
+    policy_options = {**recipe.policy_options, name: {**recipe.policy_options.get(name, {}), **reviser_options}}
+    return replace(
+        recipe,
+        policy_options=policy_options if reviser_options else recipe.policy_options,
+        tracker=tracker or recipe.tracker,
+        tracker_options={**recipe.tracker_options, **tracker_options},
+    )
 
 
 def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:

@@ -159,7 +159,9 @@ def _read_vote(completion: Completion) -> str:
     return "" if structured.find_problem(completion) else completion.text
 
 
-def _make_reply(outcome: tuple[NDArray[np.float64], float] | None, completion: Completion, by: str) -> Reply | None:
+def _make_reply(
+    outcome: tuple[NDArray[np.float64], NDArray[np.float64]] | None, completion: Completion, by: str
+) -> Reply | None:
     if outcome is None:
         return None
     probabilities, raw = outcome

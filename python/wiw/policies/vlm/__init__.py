@@ -395,7 +395,7 @@ class VLM(Policy):
         if not real and not imagined:
             return []
         words = OBSERVATION_WORDS if self.answer_view == "observation" else TARGET_WORDS
-        parts: list[Part] = [self._render_prompt(situation, "answerer", 1, seen=words), *real]
+        parts: list[Part] = [self._fill_template(situation.goal.task, "answerer", words), *real]
         if imagined:
             parts += [self._render_prompt(situation, "answerer_imagined", 1), *imagined]
         seed = derive_seed(situation.key, _ANSWER_SEED)
@@ -448,16 +448,13 @@ class VLM(Policy):
         replies = iter(self.client.ask([request for own in requests for request in own]))
         return [list(islice(replies, len(own))) for own in requests]
 
-    def _render_prompt(
-        self, situation: Situation, name: str, horizon: int, count: int = 1, seen: str = OBSERVATION_WORDS
-    ) -> str:
+    def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
+        return self._fill_template(situation.goal.task, name, OBSERVATION_WORDS, horizon, count)
+
+    def _fill_template(self, task: str, name: str, shown: str, horizon: int = 1, count: int = 1) -> str:
+        """Return a question about images that are `shown`, in words."""
         return self.prompts.render(
-            situation.goal.task,
-            name,
-            obs_key=seen,
-            look_ahead_action_num=horizon,
-            plan_num=count,
-            actions=plans.MEANINGS,
+            task, name, obs_key=shown, look_ahead_action_num=horizon, plan_num=count, actions=plans.MEANINGS
         )
 
     def _describe_reading(self, reply: Reply) -> dict[str, Any]:
