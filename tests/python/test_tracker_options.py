@@ -137,19 +137,8 @@ def test_blame_finds_weights_and_servers_where_they_are_now_and_no_others(
         if log.episodes[0]["metrics"]["success"] == 0:
             break
     shutil.rmtree(gone)
-    assert (
-        main(
-            [
-                "blame",
-                str(run),
-                "--revision-option",
-                f"cache={tmp_path}/replies",
-                "--tracker-option",
-                f"weights={weights}",
-            ]
-        )
-        == 0
-    )
+    elsewhere = ["blame", str(run), "--tracker-option", f"weights={weights}", "--revision-option"]
+    assert main([*elsewhere, f"cache={tmp_path}/replies"]) == 0
     assert "imagination" in capsys.readouterr().out
     shutil.rmtree(run / "blame")
     assert main([*elsewhere, "tries=9"]) != 0
