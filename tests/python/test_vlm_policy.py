@@ -166,6 +166,20 @@ def test_recognition_without_a_world_model_is_two_questions(recognition: Any) ->
     assert [len(images(call)) for call in client.calls] == [2, 2]
 
 
+def test_the_box_stays_on_the_thing_in_frames_that_ignore_the_plan(recognition: Any) -> None:
+    """With `copy` nothing moves though the plan walks: boxes of the strip agree by default, not by reprojection."""
+    spans = {}
+    for tracker in ("flow", "reprojection"):
+        client = MockClient(script)
+        decide_in(recognition, VLM(client, tracker=tracker), "copy")
+        strip = images(client.calls[-2])[2][-prompt_images.VIEW :]
+        frames = [strip[:, k * (prompt_images.VIEW + 4) :][:, : prompt_images.VIEW] for k in range(3)]
+        spans[tracker] = [np.flatnonzero((np.abs(f.astype(int) - (220, 40, 40)).max(-1) < 8).any(0)) for f in frames]
+    looked, told = ([(own[0], own[-1]) for own in spans[tracker]] for tracker in ("flow", "reprojection"))
+    assert np.ptp(looked, axis=0).max() <= 2
+    assert np.ptp(told, axis=0).max() > 50
+
+
 def test_the_category_may_be_asked_from_one_view_centred_on_the_target(recognition: Any) -> None:
     client = MockClient(script)
     decide_in(recognition, VLM(client, answer_view="target"))

@@ -321,7 +321,7 @@ def test_a_server_that_refuses_to_list_tokens_is_asked_for_votes() -> None:
         client = connect(server.url, top_logprobs=0)
         few, many = client.ask([REQUESTS[0], REQUESTS[3]])
     assert few.by == many.by == "votes" and few.probabilities.tolist() == [0, 1, 0]
-    assert len(many.probabilities) == 27 and client.spent["vlm_calls"] == 5 + 2 * 5 + 5
+    assert len(many.probabilities) == 27 and client.spent["vlm_calls"] == 5 + 5
 
 
 def test_answers_are_kept_by_how_they_were_asked_for(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ class ARRules:
     execute: Literal["primitive", "sequence"]
     """Whether the first primitive of the chosen plan is carried out before the next decision, or all of it."""
     confidence: float
-    """An answer more probable than this ends the episode at once."""
+    """An answer more probable than this, before it is normalised (`Answer.confidence`), ends the episode at once."""
     prediction: Literal["last", "surest"]
     """Which answer is the final one; of equally confident ones the earliest."""
     lost: Literal["continue", "stop"]
