@@ -33,18 +33,19 @@ def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = No
     box.
     """
     fronts, masks = _cut_front_views(rollout, track)
-    titles = [f"Imagined action {k}: {word}" for k, word in enumerate(describe_actions(plan.actions[: len(fronts)]), 1)]
+    heads = ["Imagined"] * len(fronts)
     if track is not None and masks is not None:
         boxes = [find_box(mask) for mask in masks]
-        lost = ~track.visible & ~rollout.real
-        titles = [_caption_box(*frame) for frame in zip(titles, boxes, lost, strict=True)]
+        heads = [_describe_box(*frame) for frame in zip(boxes, ~track.visible & ~rollout.real, strict=True)]
         fronts = np.stack([_draw_box(*frame) for frame in zip(fronts, boxes, strict=True)])
+    words = describe_actions(plan.actions[: len(fronts)])
+    titles = [f"{head} action {k}: {word}" for k, (head, word) in enumerate(zip(heads, words, strict=True), 1)]
     return annotate.strip(fronts, titles)
 
 
-def _caption_box(title: str, box: Box | None, lost: bool) -> str:
-    """Say it where there is no box: the tracker has lost the target, or it is elsewhere around the agent."""
-    return title if box is not None else f"{title}, target {'lost' if lost else 'out of view'}"
+def _describe_box(box: Box | None, lost: bool) -> str:
+    """Begin a frame's title: without a box, the tracker has lost the target, or it is elsewhere around the agent."""
+    return "Imagined" if box is not None else "Target lost," if lost else "Target not in view,"
 
 
 def _draw_box(view: Image, box: Box | None) -> Image:
