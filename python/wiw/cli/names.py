@@ -10,11 +10,11 @@ from typing import Any, Literal
 from rich.markup import escape
 from tyro.conf import Positional
 
-What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models"]
+What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models", "prompts"]
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List everything with a name: world models, policies, trackers, tasks, presets, metrics and VLMs.
+    """List everything with a name: world models, policies, trackers, tasks, presets, metrics, VLMs and prompts.
 
     $ wiw list
     $ wiw list world-models
@@ -55,7 +55,7 @@ def _make_table(what: str) -> Any:
         name: lambda table, name=name, registry=registry: _add_registry(table, name, registry)  # type: ignore[misc]
         for name, registry in registries.items()
     }
-    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models}
+    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
     for name in sections if what == "all" else [what]:
         sections[name](table)
     return table
@@ -85,6 +85,17 @@ def _add_vlm_models(table: Any) -> None:
     table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
     for name in vlms.list_names():
         table.add_row(f"  {name}", escape(vlms.describe(name)))
+    table.add_row()
+
+
+def _add_prompts(table: Any) -> None:
+    from wiw.policies.vlm.prompts import SETS, Prompts
+
+    table.add_row(
+        "[bold]Prompts of policy vlm[/]", "[dim]--prompts NAME, or a folder that `wiw prompts import` writes[/]"
+    )
+    for name, (_, line) in SETS.items():
+        table.add_row(f"  {name}", f"{escape(line)} [dim](digest {Prompts(name).digest})[/]")
 
 
 def _first_line(registry: Any, name: str) -> str:

@@ -70,7 +70,7 @@ class VLM(Policy):
     Args:
         vlm: see `wiw.vlm.connect`.
         model: its name there, or a preset (`wiw/configs/vlm`).
-        prompts: folder of templates that replace the shipped ones; see `wiw.policies.vlm.prompts`.
+        prompts: a shipped set, "default" or "minimal", or a folder of templates; see `wiw.policies.vlm.prompts`.
         proposals: "sampled", one question for each plan, or "listed", one question for all of them.
         revision: "write" lets it write the plan to follow after it has seen the futures, as the paper's prompt does;
             "select" lets it choose one of the proposals, with the probabilities as scores. Not for recognition.

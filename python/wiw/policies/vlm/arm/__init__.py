@@ -49,7 +49,7 @@ class ArmVLM(VLM):
         examples = self._render_prompt(situation, "examples", horizon)
         return [
             self._render_prompt(situation, "planner", horizon),
-            examples,
+            *([examples] if examples else []),
             *self._describe_situation(situation, horizon),
         ]
 
