@@ -39,6 +39,7 @@ ROLES = {
 PLACEBOS = {
     "placebo-shuffled": "control: same compute, futures of shuffled actions",
     "placebo-swapped": "control: same compute, futures of another episode",
+    "placebo-blind": "control: same compute, the model is told no plan",
 }
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
 GAINS = {

@@ -45,7 +45,8 @@ def evaluate(
         episodes: how many; None means as many as the task says.
         arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
-            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another.
+            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-blind" one of a text model,
+            "placebo-shuffled:oracle" of another.
             "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
             mapping gives the arms names of their own. None means the agent's own model.
         config: how the run goes.
