@@ -25,6 +25,7 @@ from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
 from wiw.metrics.metric import ANSWER_SCORE, Metric
 from wiw.registry import METRICS
+from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
 from wiw.runs.run import Records, Run
 from wiw.scenes import strip_edits
@@ -113,6 +114,14 @@ class Summary:
 
     unbalanced: int = field(default=0, kw_only=True)
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
+    departures: tuple[Departure, ...] = field(default=(), kw_only=True)
+    """Where the run departs from the paper's protocol."""
+
+    @property
+    def protocol(self) -> str:
+        """Sentence on the departures from the paper's protocol; empty without any."""
+        shown = "; ".join(departure.short for departure in self.departures)
+        return f"not the paper's protocol: {shown}" if shown else ""
 
     @property
     def lines(self) -> tuple[ArmSummary, ...]:
@@ -241,7 +250,7 @@ def summarise_run(run: Run) -> Summary:
         twins=find_twins(episodes),
         judge=run.store.judge,
     )
-    return replace(found, unbalanced=count_unbalanced(run))
+    return replace(found, unbalanced=count_unbalanced(run), departures=read_departures(run.store.info))
 
 
 def count_unbalanced(run: Run) -> int:

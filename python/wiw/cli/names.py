@@ -25,7 +25,7 @@ def list_names(what: Positional[What] = "all", /) -> int:
 
     Args:
         what: Kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
-            machine.
+            machine, presets what each sets and where it departs from the paper.
     """
     from rich.console import Console
 
@@ -56,6 +56,9 @@ def _make_table(what: str) -> Any:
         for name, registry in registries.items()
     }
     sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
+    if what == "presets":
+        _add_presets(table, detailed=True)
+        return table
     for name in sections if what == "all" else [what]:
         sections[name](table)
     return table
@@ -68,7 +71,16 @@ def _add_registry(table: Any, title: str, registry: Any) -> None:
     table.add_row()
 
 
-def _add_presets(table: Any) -> None:
+def _add_settings(table: Any, task: str, preset: str) -> None:
+    from wiw.cli.presets import list_reasons, list_settings
+
+    for line in list_settings(task, preset):
+        table.add_row("", f"sets {escape(line)}")
+    for line in list_reasons(task, preset):
+        table.add_row("", f"[dim]departs from the paper: {escape(line)}[/]")
+
+
+def _add_presets(table: Any, detailed: bool = False) -> None:
     from wiw.registry import TASKS
     from wiw.tasks import presets
 
@@ -76,6 +88,8 @@ def _add_presets(table: Any) -> None:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
         for name in presets.list_presets(task):
             table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
+            if detailed:
+                _add_settings(table, task, name)
     table.add_row()
 
 

@@ -93,8 +93,8 @@ class AgentRecipe(AgentConfig):
         """Return the agent; numbers that are open are the task's."""
         space = self.space or context.task.defaults.get("space") or PRIMITIVES
         model: Any = self.model
-        if self.model_options:
-            model = make_for_space(self.model, space, limits.deadline, **self.model_options)
+        if options := self.resolve_model_options(context.task):
+            model = make_for_space(self.model, space, limits.deadline, **options)
         semantics = None if self.model is None else self.semantics  # nobody would look at them
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
@@ -103,6 +103,14 @@ class AgentRecipe(AgentConfig):
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
         )
+
+    def resolve_model_options(self, task: Task) -> dict[str, Any]:
+        """Return what the world model is made with on a task: the options of its preset, and on top those given."""
+        return {**task.model_options.get(str(self.model), {}), **self.model_options}
+
+    def resolve_policy_options(self, policy: str, task: Task) -> dict[str, Any]:
+        """Return what a named policy is made with on a task, likewise."""
+        return {**task.policy_options.get(policy, {}), **self.policy_options.get(policy, {})}
 
     @property
     def config(self) -> AgentConfig:
@@ -213,10 +221,9 @@ class AgentRecipe(AgentConfig):
 
     def _make_policy(self, policy: Any, space: str, task: Task) -> Any:
         """Return a policy with the options of its name, and the task's; others are made with the agent."""
-        sources = (task.policy_options, self.policy_options)
-        if not isinstance(policy, str) or not any(policy in options for options in sources):
+        if not isinstance(policy, str) or policy not in {*task.policy_options, *self.policy_options}:
             return policy
-        options = {name: value for own in sources for name, value in own.get(policy, {}).items()}
+        options = self.resolve_policy_options(policy, task)
         return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
 
 

@@ -46,6 +46,8 @@ class Task(ABC):
     """How reports speak of its episodes."""
     tables: TableSpec = TableSpec()
     """Contents of the tables and plots of its runs."""
+    preset: str = ""
+    """Name of its preset, or the path of its file; empty for a task without presets."""
     has_guide: bool = False
     """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
 
@@ -77,6 +79,16 @@ class Task(ABC):
     @property
     def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
         """Options that named policies are made with on this task, where a run gives no others."""
+        return {}
+
+    @property
+    def model_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that named world models are made with on this task, where a run gives no others."""
+        return {}
+
+    @property
+    def departures(self) -> Mapping[str, Mapping[str, str]]:
+        """Reasons why its preset departs from the paper (`wiw.tasks.presets.Preset`)."""
         return {}
 
     @property

@@ -57,7 +57,8 @@ class Manipulation(ManipulationSpec, Task):
     Args:
         tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
         seed: of the episodes and of the run.
-        preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
+        preset: "default", "paper", "paper-diffusion", or the path of a YAML file; `rules` overrides it field by field
+            (`ManipulationRules`).
         backend: renderer, "auto", "cpu" or "gpu".
         robot: URDF file of an arm to work with in place of the project's own Panda (`wiw.tabletop.robot`).
         robot_tcp: the link of that file between the finger tips, where its name does not tell.
@@ -90,7 +91,9 @@ class Manipulation(ManipulationSpec, Task):
             )
         self.tasks, self.seed, self.backend = _parse_tasks(tasks), check_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
-        self.rules = presets.load_rules(ManipulationRules, presets.find_owner(type(self)), preset, rules)
+        owner = presets.find_owner(type(self))
+        self.rules = presets.load_rules(ManipulationRules, owner, preset, rules)
+        self.preset, self._preset = presets.make_absolute(preset), presets.load_preset(owner, preset)
 
     @staticmethod
     def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -125,6 +128,21 @@ class Manipulation(ManipulationSpec, Task):
         rules = self.rules
         numbers = {"candidates": rules.candidates, "horizon": rules.horizon, "execute": rules.execute}
         return {**numbers, "space": self.space}
+
+    @property
+    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that the preset gives policies."""
+        return self._preset.policies
+
+    @property
+    def model_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that the preset gives world models."""
+        return self._preset.models
+
+    @property
+    def departures(self) -> Mapping[str, Mapping[str, str]]:
+        """Reasons why the preset departs from the paper."""
+        return self._preset.departures
 
     @property
     def stage(self) -> dict[str, Any]:

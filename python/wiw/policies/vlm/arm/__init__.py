@@ -35,6 +35,7 @@ class ArmVLM(VLM):
     space = GRIPPER_POSES
     frames = FrameSpec("front", (384, 384))
     tasks = ("manipulation",)
+    shows_front = False
     fallback_action = "a pose was drawn"
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -91,9 +92,8 @@ class ArmVLM(VLM):
             choices = tuple(f"plan {number}" for number in range(1, len(proposals) + 1))
             return Request((user(*parts),), choices=choices, **options)
         parts.append(self._render_prompt(situation, "output", horizon))
-        return Request(
-            (user(*parts),), schema=self._get_plan_schema(situation, horizon), max_tokens=MAX_PLAN_TOKENS, **options
-        )
+        options |= {"max_tokens": MAX_PLAN_TOKENS, "temperature": self.revision_temperature}
+        return Request((user(*parts),), schema=self._get_plan_schema(situation, horizon), **options)
 
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
         observation = situation.observation
