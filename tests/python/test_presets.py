@@ -81,7 +81,9 @@ def test_what_is_wrong_in_a_file_is_named(tmp_path: Path, text: str, error: type
 
 
 def test_a_preset_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ArgumentError, match=r"no preset 'offical'; there are default, paper, official, or give the path"):
+    with pytest.raises(
+        ArgumentError, match=r"no preset 'offical'; there are default, paper, official, or give the path"
+    ):
         ImageNav(preset="offical")
     with pytest.raises(FileError, match=r"none\.yaml"):
         ImageNav(preset=tmp_path / "none.yaml")

@@ -512,7 +512,7 @@ def test_presets_give_the_policy_its_memory_and_order(two_rooms: str, tmp_path: 
     assert task.policy_options["vlm"] == {"task": "aeqa", "history": 1, "order": "marked_first"}
     assert task.describe() != AEQA(two_rooms).describe()
     own.write_text("policies: [vlm]\n")
-    with pytest.raises(ArgumentError, match="policies: expected options by policy"):
+    with pytest.raises(ArgumentError, match="policies: expected options by name"):
         presets.load_preset("aeqa", own)
 
 
