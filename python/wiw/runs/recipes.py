@@ -211,13 +211,14 @@ class AgentRecipe(AgentConfig):
 
     @property
     def arm(self) -> str:
-        """Short name of the world model: "none", "warp", the class behind a path, or a server's host and port."""
+        """Short name of the world model: "none", "warp", the class behind a path, or servers' hosts and ports."""
         if self.model is None:
             return "none"
         if not isinstance(self.model, str):
             return (self.model if isinstance(self.model, type) else type(self.model)).__name__.lower()
-        kind, scheme, host = self.model.partition("://")
-        return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
+        kind, scheme, _ = self.model.partition("://")
+        hosts = ";".join(address.partition("://")[2] for address in self.model.split(","))
+        return f"{kind.partition(':')[0]}:{hosts}" if scheme else self.model.rpartition(":")[2]
 
     def _make_policy(self, policy: Any, space: str, task: Task) -> Any:
         """Return a policy with the options of its name, and the task's; others are made with the agent."""
