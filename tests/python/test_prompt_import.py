@@ -13,7 +13,7 @@ from jinja2 import meta
 
 import wiw
 from wiw.cli import main
-from wiw.errors import ArgumentError, PromptError
+from wiw.errors import FileError, PromptError
 from wiw.policies.vlm.prompt_import.latex import convert_latex
 from wiw.policies.vlm.prompt_import.sources import name_template
 from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots, list_tasks
@@ -143,7 +143,7 @@ def test_what_cannot_be_imported_is_named_and_nothing_is_written(
 
 def test_folders_that_will_not_do_are_refused(tmp_path: Path) -> None:
     source = write_paper(tmp_path, ("AR Answerer Prompt", "What?"))
-    with pytest.raises(ArgumentError, match="expected a new or empty folder"):
+    with pytest.raises(FileError, match="expected a folder that is new or empty"):
         wiw.import_prompts(source, tmp_path)
     with pytest.raises(PromptError, match="no such file or folder"):
         wiw.import_prompts(tmp_path / "none", tmp_path / "own")

@@ -93,7 +93,7 @@ class Manipulation(ManipulationSpec, Task):
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
         owner = presets.find_owner(type(self))
         self.rules = presets.load_rules(ManipulationRules, owner, preset, rules)
-        self.preset, self._preset = presets.make_absolute(preset), presets.load_preset(owner, preset)
+        self.preset, self.preset_settings = presets.make_absolute(preset), presets.load_preset(owner, preset)
 
     @staticmethod
     def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -128,21 +128,6 @@ class Manipulation(ManipulationSpec, Task):
         rules = self.rules
         numbers = {"candidates": rules.candidates, "horizon": rules.horizon, "execute": rules.execute}
         return {**numbers, "space": self.space}
-
-    @property
-    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that the preset gives policies."""
-        return self._preset.policies
-
-    @property
-    def model_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that the preset gives world models."""
-        return self._preset.models
-
-    @property
-    def departures(self) -> Mapping[str, Mapping[str, str]]:
-        """Reasons why the preset departs from the paper."""
-        return self._preset.departures
 
     @property
     def stage(self) -> dict[str, Any]:

@@ -60,7 +60,7 @@ class NavigationTask(NavigationSpec, Task):
         owner = presets.find_owner(type(self))
         self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
         self.preset = presets.make_absolute(preset)
-        self._preset = presets.load_preset(owner, preset)
+        self.preset_settings = presets.load_preset(owner, preset)
         self._generator_rules = {name: value for name, value in rules.items() if name not in own}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
         self.scenes, self.seed = absolute(scenes), check_seed(seed)
@@ -130,21 +130,6 @@ class NavigationTask(NavigationSpec, Task):
     def defaults(self) -> dict[str, Any]:
         """Options for `wiw.Agent` that the task prescribes."""
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
-
-    @property
-    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that the preset gives policies."""
-        return self._preset.policies
-
-    @property
-    def model_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that the preset gives world models."""
-        return self._preset.models
-
-    @property
-    def departures(self) -> Mapping[str, Mapping[str, str]]:
-        """Reasons why the preset departs from the paper."""
-        return self._preset.departures
 
     @property
     def file_header(self) -> dict[str, Any]:

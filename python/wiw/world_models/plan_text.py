@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT, TextTemplate, to_text
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError
+from wiw.mapping_files import read_yaml_mapping
 from wiw.types import Control
 from wiw.world_models.clips import Alignment
 
@@ -29,15 +30,7 @@ def read_words(option: Words) -> str | dict[str, Any] | None:
     path = Path(option)
     if path.suffix not in (".yaml", ".yml"):
         return str(option)
-    import yaml
-
-    try:
-        content = yaml.safe_load(path.expanduser().read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FileError(f"template {path}: {error}") from error
-    if not isinstance(content, Mapping):
-        raise FileError(f"template {path}: expected `prompt: ...` and phrases, got {type(content).__name__}")
-    return dict(content)
+    return read_yaml_mapping(path.expanduser(), "`prompt: ...` and phrases of a template")
 
 
 def make_template(words: str | Mapping[str, Any] | None) -> TextTemplate | None:

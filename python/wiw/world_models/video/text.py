@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any, ClassVar, get_args
@@ -78,8 +78,10 @@ class TextVideoModel(VideoModel):
         return self._alignment.choose_frames(control.length)
 
     def describe(self) -> dict[str, Any]:
-        """Return the options, and digests of weights and LoRA."""
-        return {**super().describe(), **{f"lora_digest_{place}": digest for place, digest in self._loras.items()}}
+        """Return the options, less those on wording that are at their defaults, and digests of weights and LoRA."""
+        usual = {each.name: each.default for each in fields(self) if each.name in self.wording_options}
+        said = {name: value for name, value in super().describe().items() if name not in usual or value != usual[name]}
+        return {**said, **{f"lora_digest_{place}": digest for place, digest in self._loras.items()}}
 
     def _load_lora(self, place: str, source: str | Path) -> str:
         """Put a LoRA into a denoiser and return the digest of its file."""

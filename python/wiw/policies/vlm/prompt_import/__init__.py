@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from wiw.errors import ArgumentError, PromptError
+from wiw.errors import PromptError
+from wiw.files import atomic_folder
 from wiw.policies.vlm.prompt_import.slots import convert_slots
 from wiw.policies.vlm.prompt_import.sources import FoundPrompt, read_source
-from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts
+from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots
 
 CARD = "prompts.yaml"
 """Says in a prompt folder where each template came from."""
@@ -49,26 +49,22 @@ def import_prompts(source: str | Path, out: str | Path) -> ImportedPrompts:
     Raises:
         PromptError: no prompts in the source, or one that cannot be read, lacks a slot, has an unknown one, or does not
             render; names file and line.
-        ArgumentError: `out` has content.
+        FileError: `out` has content, or cannot be written.
     """
     target = Path(out).expanduser()
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise ArgumentError(f"{target}: expected a new or empty folder to write prompts to, and it has content")
     found, unused = read_source(Path(source).expanduser())
     templates = {name: convert_slots(name, prompt) for name, prompt in found.items()}
     completed = _complete(templates)
-    with TemporaryDirectory() as folder:  # checked before anything is written where the user looks for it
-        write_templates(Path(folder), {**templates, **{name: text for name, (_, text) in completed.items()}})
-        _require_rendering(Path(folder), found)
-    write_templates(target, {**templates, **{name: text for name, (_, text) in completed.items()}})
-    imported = ImportedPrompts(
-        target,
-        Prompts(target).digest,
-        {name: prompt.place for name, prompt in sorted(found.items())},
-        {name: origin for name, (origin, _) in sorted(completed.items())},
-        tuple(unused),
-    )
-    _write_card(imported)
+    with atomic_folder(target) as draft:
+        write_templates(draft, {**templates, **{name: text for name, (_, text) in completed.items()}})
+        imported = ImportedPrompts(
+            target,
+            _check_rendering(draft, found),
+            {name: prompt.place for name, prompt in sorted(found.items())},
+            {name: origin for name, (origin, _) in sorted(completed.items())},
+            tuple(unused),
+        )
+        _write_card(draft, imported)
     return imported
 
 
@@ -93,18 +89,21 @@ def _complete(templates: Mapping[str, str]) -> dict[str, tuple[str, str]]:
     return completed
 
 
-def _require_rendering(folder: Path, found: Mapping[str, FoundPrompt]) -> None:
-    """Raise PromptError, which names the place in the source, for a template that does not render."""
-    from wiw.policies.vlm.prompts import get_slots
+def _check_rendering(folder: Path, found: Mapping[str, FoundPrompt]) -> str:
+    """Return the digest of a folder's templates.
 
+    Raises:
+        PromptError: one does not render; names the place in the source.
+    """
     prompts = Prompts(folder)
     for name, prompt in found.items():
         task, _, question = name.partition("/")
         if not prompts.render(task, question, **get_slots(task)):
             raise PromptError(f"{prompt.place}: the prompt for {name} is empty")
+    return prompts.digest
 
 
-def _write_card(imported: ImportedPrompts) -> None:
+def _write_card(folder: Path, imported: ImportedPrompts) -> None:
     import yaml
 
     content = {
@@ -113,4 +112,4 @@ def _write_card(imported: ImportedPrompts) -> None:
         "completed": dict(imported.completed),
         "unused": list(imported.unused),
     }
-    (imported.folder / CARD).write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
+    (folder / CARD).write_text(yaml.safe_dump(content, sort_keys=False, width=120), encoding="utf-8")
