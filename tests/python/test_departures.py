@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,16 @@ from wiw.errors import ArgumentError
 from wiw.policies.vlm.prompt_images import resize_view
 from wiw.policies.vlm.prompt_import import CARD
 from wiw.registry import POLICIES, WORLD_MODELS, task_class
+from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures
 from wiw.runs.recipes import AgentRecipe, TaskInMemory
 from wiw.tasks import presets
 from wiw.tasks.ar import AR
 from wiw.tasks.imagenav import ImageNav
 from wiw.tasks.manipulation import Manipulation
+from wiw.types import Key
+from wiw.vlm.messages import Call
+from wiw.vlm.mock import MockClient
 from wiw.world_models.clips import Alignment
 from wiw.world_models.plan_text import make_template
 
@@ -71,7 +76,6 @@ def test_each_rule_that_differs_from_the_papers_has_a_reason(task: str, preset: 
 
 def test_the_published_settings_of_models_reach_them(world_model_options, tmp_path: Path) -> None:
     pytest.importorskip("diffusers")
-    from wiw.runs.compose import RunContext
 
     task = ImageNav("apartments:val", preset="official")
     options = world_model_options("wan2.2-5b")
@@ -102,6 +106,53 @@ def test_views_are_shown_in_the_asked_size(side: int | None) -> None:
     shown = resize_view(view, side)
     assert shown.shape == (side or 480, side or 480, 3)
     assert shown[: len(shown) // 2 - 3].min() == 200 and shown[len(shown) // 2 + 3 :].max() == 0
+
+
+def answer_plans(call: Call) -> str:
+    """Return plans that differ by their seed, so that each is a plan of its own."""
+    turns = ["turn_left"] * (1 + call.seed % 3)
+    return json.dumps({"reason": "", "actions": [*turns, "forward", "forward"][:5]})
+
+
+class Listening(wiw.WorldModel):
+    """Notes what it is asked."""
+
+    accepts = wiw.accepts(control="text", view="perspective", frames=14)
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[tuple[int, ...], str]] = []
+
+    def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
+        rows = zip(observations.image, controls, strict=True)
+        self.asked += [(image.shape, control.text) for image, control in rows]
+        return np.repeat(observations.image[:, None], 14, 1)
+
+
+@pytest.mark.parametrize(
+    ("preset", "side", "revised_at"), [("default", 480, 0.0), ("paper", 384, 0.0), ("official", 512, 1.0)]
+)
+def test_what_is_asked_in_an_image_goal_episode(preset: str, side: int, revised_at: float, two_rooms: str) -> None:
+    """Three plans from front view, panorama and goal; then a plan from the goal and a strip of 384 pixels a plan."""
+    client, model = MockClient(answer_plans), Listening()
+    task = ImageNav(two_rooms, preset=preset)
+    recipe = AgentRecipe("vlm", model, policy_options={"vlm": {"vlm": client}})
+    env = task.environment(depth=True)
+    observation = env.begin(task.episode(0))
+    agent = recipe.build(RunContext(task))
+    agent.decide(observation, env.goal, key=Key(0, 0, 0))
+    *plans, revision = client.calls
+    assert len(plans) == 3 and {call.temperature for call in plans} == {1.0}
+    for call in plans:
+        assert list_shapes(call) == [(side, side, 3), (576, 1024, 3), (side, side, 3)]
+    goal, *strips = list_shapes(revision)
+    assert goal == (side, side, 3) and 1 <= len(strips) <= 3
+    assert all(height > 384 and (width + 4) % 388 == 0 for height, width, _ in strips), "frames of 384, 4 apart"
+    assert revision.temperature == revised_at
+    assert model.asked and all(shape == (480, 480, 3) and text for shape, text in model.asked)
+
+
+def list_shapes(call: Call) -> list[tuple[int, ...]]:
+    return [part.shape for message in call.messages for part in message.content if not isinstance(part, str)]
 
 
 # -- departures of a run -----------------------------------------------------------------------------------------------
