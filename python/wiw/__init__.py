@@ -37,6 +37,7 @@ __all__ = [
     "envs",
     "errors",
     "evaluate",
+    "import_prompts",
     "judge",
     "load_run",
     "make",
@@ -74,6 +75,7 @@ _HOME = {
     "collect_navigation": "wiw.training.collect_navigation",
     "compare": "wiw.studies.compare",
     "evaluate": "wiw.studies.evaluate",
+    "import_prompts": "wiw.policies.vlm.prompt_import",
     "judge": "wiw.studies.judge",
     "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
@@ -135,6 +137,7 @@ if TYPE_CHECKING:
     from wiw.loop.agent import Agent
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
+    from wiw.policies.vlm.prompt_import import import_prompts
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare

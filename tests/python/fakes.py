@@ -166,7 +166,9 @@ def agent_for(task: Any, agent: Any, **limits: Any) -> Agent:
     return agent_recipe(agent).build(RunContext(task), Limits(**limits))
 
 
-def line_task(scenes: str = "", seed: int = 0, preset: str = "paper", backend: str = "auto", **rules: Any) -> LineTask:
+def line_task(
+    scenes: str = "", seed: int = 0, preset: str = "default", backend: str = "auto", **rules: Any
+) -> LineTask:
     """The task as the command line makes it; scenes "slow" takes its time, "broken" cannot start an episode."""
     return LineTask(seed=seed, delay=0.05 * (scenes == "slow"), broken=("0001",) if scenes == "broken" else ())
 

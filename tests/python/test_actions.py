@@ -320,7 +320,12 @@ def test_the_versions_of_generator_and_conditioning_count(made, monkeypatch) -> 
 def test_options_are_those_of_the_generator_and_a_checkpoint(name: str, made) -> None:
     model = wiw.registry.WORLD_MODELS.find(name)
     options = inspect.signature(model).parameters
-    assert list(options) == ["checkpoint", *inspect.signature(model.generator_class).parameters]
+    of_generator = [
+        option
+        for option in inspect.signature(model.generator_class).parameters
+        if option not in model.generator_class.wording_options
+    ]
+    assert list(options) == ["checkpoint", *of_generator]
     assert options["checkpoint"].default is inspect.Parameter.empty and options["weights"].default == ""
     assert options["frames"].default == model.accepts.frames
     assert options["guidance"].default == (3.0 if name == "svd-action" else 1.0)

@@ -132,7 +132,7 @@ def test_a_run_that_was_stopped_goes_on(run: Path, tmp_path: Path, monkeypatch: 
         (["--episode-file", "x.json", "--scene-folder", "y"], "episode_file, scene_folder: this is for"),
         (["--tasks", "juggle"], "push_buttons, slide_block, insert_peg, stack_cups, got juggle"),
         (["--tasks", "slide_block,slide_block"], "different ones"),
-        (["--preset", "official"], "there are paper"),
+        (["--preset", "official"], "there are default, paper"),
         (["--task-option", "actions=0"], "must be positive"),
         (["--task-option", "decisions=3"], "unknown rules decisions; there are actions"),
     ],

@@ -197,7 +197,7 @@ def test_what_placebo_arms_are_of() -> None:
             arm_recipes(agent, [wrong])
     with pytest.raises(ArgumentError, match="placebo='shuffled' needs a world model"):
         AgentRecipe("matcher", placebo="shuffled").build(NOWHERE)
-    with pytest.raises(ArgumentError, match="expected placebo shuffled or swapped, got 'odd'"):
+    with pytest.raises(ArgumentError, match="expected placebo shuffled or swapped or blind, got 'odd'"):
         AgentRecipe("matcher", "copy", placebo="odd").build(NOWHERE)
 
 

@@ -512,8 +512,8 @@ def test_presets_give_the_policy_its_memory_and_order(two_rooms: str, tmp_path: 
     assert task.policy_options["vlm"] == {"task": "aeqa", "history": 1, "order": "marked_first"}
     assert task.describe() != AEQA(two_rooms).describe()
     own.write_text("policies: [vlm]\n")
-    with pytest.raises(ArgumentError, match="policies: expected options by policy"):
-        presets.load_policy_options("aeqa", own)
+    with pytest.raises(ArgumentError, match="policies: expected options by name"):
+        presets.load_preset("aeqa", own)
 
 
 def test_the_order_of_pictures_is_the_presets(two_rooms: str) -> None:

@@ -25,6 +25,7 @@ from wiw.analysis.utility import CEILING, FLOOR, Utility, utility
 from wiw.errors import RegistryError
 from wiw.metrics.metric import ANSWER_SCORE, Metric
 from wiw.registry import METRICS
+from wiw.runs.departures import Departure, read_departures
 from wiw.runs.judges import JudgeRecord
 from wiw.runs.run import Records, Run
 from wiw.scenes import strip_edits
@@ -39,6 +40,7 @@ ROLES = {
 PLACEBOS = {
     "placebo-shuffled": "control: same compute, futures of shuffled actions",
     "placebo-swapped": "control: same compute, futures of another episode",
+    "placebo-blind": "control: same compute, the model is told no plan",
 }
 """Arms with the compute of a world model and uninformative imagination; ":" and a model's name may follow."""
 GAINS = {
@@ -121,6 +123,14 @@ class Summary:
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
     trackers: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     """What located targets in imagined frames, by name, and what it followed: "frames" or "poses"."""
+    departures: tuple[Departure, ...] = field(default=(), kw_only=True)
+    """Where the run departs from the paper's protocol."""
+
+    @property
+    def protocol(self) -> str:
+        """Sentence on the departures from the paper's protocol; empty without any."""
+        shown = "; ".join(departure.short for departure in self.departures)
+        return f"not the paper's protocol: {shown}" if shown else ""
 
     @property
     def lines(self) -> tuple[ArmSummary, ...]:
@@ -254,7 +264,8 @@ def summarise_run(run: Run) -> Summary:
         twins=find_twins(episodes),
         judge=run.store.judge,
     )
-    return replace(found, unbalanced=count_unbalanced(run), trackers=_list_trackers(run))
+    departures = read_departures(run.store.info)
+    return replace(found, unbalanced=count_unbalanced(run), trackers=_list_trackers(run), departures=departures)
 
 
 def _list_trackers(run: Run) -> dict[str, str]:

@@ -43,6 +43,22 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
     print(file=sys.stderr, flush=True)
 
 
+def announce_protocol(task: Task, arms: Mapping[str, Any]) -> None:
+    """Print what a task's preset sets, and where a run of these arms departs from the paper, with reasons."""
+    from wiw.cli.presets import list_settings
+    from wiw.runs.departures import find_departures
+    from wiw.tasks.presets import find_owner
+
+    if task.preset:
+        print(f"preset {task.preset}")
+        for line in list_settings(find_owner(type(task)), task.preset):
+            print(f"  sets {line}")
+    found = find_departures(task, arms)
+    print("departs from the paper" if found else "nothing departs from the paper")
+    for departure in found:
+        print(f"  {printable(departure)}")
+
+
 def count_noun(count: int, noun: str) -> str:
     """Return "1 episode" or "3 episodes"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"

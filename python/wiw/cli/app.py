@@ -26,6 +26,7 @@ from wiw.cli.judge import judge
 from wiw.cli.names import list_names
 from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
+from wiw.cli.prompts import import_prompts
 from wiw.cli.quality import quality
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
@@ -128,6 +129,13 @@ GROUPS: Mapping[str, Group] = {
             (export_data, "export", "Write navigation or manipulation data as a LeRobot dataset, format v3.0."),
             (import_data, "import", "Write the collection that a LeRobot dataset was exported from."),
         ),
+    ),
+    "prompts": Group(
+        "Import the prompts of your own copy of the paper.",
+        """Import the prompts of your own copy of the paper for policy vlm. `wiw list prompts` lists the shipped sets.
+
+  $ wiw prompts import paper/main.tex --out prompts/paper""",
+        ((import_prompts, "import", "Write a folder of prompts from LaTeX source or published code."),),
     ),
 }
 

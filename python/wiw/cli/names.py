@@ -10,11 +10,11 @@ from typing import Any, Literal
 from rich.markup import escape
 from tyro.conf import Positional
 
-What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models"]
+What = Literal["all", "world-models", "policies", "trackers", "tasks", "presets", "metrics", "vlm-models", "prompts"]
 
 
 def list_names(what: Positional[What] = "all", /) -> int:
-    """List everything with a name: world models, policies, trackers, tasks, presets, metrics and VLMs.
+    """List everything with a name: world models, policies, trackers, tasks, presets, metrics, VLMs and prompts.
 
     $ wiw list
     $ wiw list world-models
@@ -25,7 +25,7 @@ def list_names(what: Positional[What] = "all", /) -> int:
 
     Args:
         what: Kind of names; world-models also shows each model's inputs, its weights, and what is missing on this
-            machine.
+            machine, presets what each sets and where it departs from the paper.
     """
     from rich.console import Console
 
@@ -55,7 +55,10 @@ def _make_table(what: str) -> Any:
         name: lambda table, name=name, registry=registry: _add_registry(table, name, registry)  # type: ignore[misc]
         for name, registry in registries.items()
     }
-    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models}
+    sections |= {"presets": _add_presets, "vlm-models": _add_vlm_models, "prompts": _add_prompts}
+    if what == "presets":
+        _add_presets(table, detailed=True)
+        return table
     for name in sections if what == "all" else [what]:
         sections[name](table)
     return table
@@ -68,7 +71,16 @@ def _add_registry(table: Any, title: str, registry: Any) -> None:
     table.add_row()
 
 
-def _add_presets(table: Any) -> None:
+def _add_settings(table: Any, task: str, preset: str) -> None:
+    from wiw.cli.presets import list_reasons, list_settings
+
+    for line in list_settings(task, preset):
+        table.add_row("", f"sets {escape(line)}")
+    for line in list_reasons(task, preset):
+        table.add_row("", f"[dim]departs from the paper: {escape(line)}[/]")
+
+
+def _add_presets(table: Any, detailed: bool = False) -> None:
     from wiw.registry import TASKS
     from wiw.tasks import presets
 
@@ -76,6 +88,8 @@ def _add_presets(table: Any) -> None:
         table.add_row(f"[bold]Presets of {task}[/]", "[dim]--preset NAME, or a YAML file of your own[/]")
         for name in presets.list_presets(task):
             table.add_row(f"  {name}", escape(presets.describe_preset(task, name)))
+            if detailed:
+                _add_settings(table, task, name)
     table.add_row()
 
 
@@ -85,6 +99,17 @@ def _add_vlm_models(table: Any) -> None:
     table.add_row("[bold]Models for policy vlm[/]", "[dim]--vlm-model NAME; docs/vlm.md says how to serve them[/]")
     for name in vlms.list_names():
         table.add_row(f"  {name}", escape(vlms.describe(name)))
+    table.add_row()
+
+
+def _add_prompts(table: Any) -> None:
+    from wiw.policies.vlm.prompts import SETS, Prompts
+
+    table.add_row(
+        "[bold]Prompts of policy vlm[/]", "[dim]--prompts NAME, or a folder that `wiw prompts import` writes[/]"
+    )
+    for name, (_, line) in SETS.items():
+        table.add_row(f"  {name}", f"{escape(line)} [dim](digest {Prompts(name).digest})[/]")
 
 
 def _first_line(registry: Any, name: str) -> str:

@@ -50,8 +50,8 @@ class TaskFlags:
     robot: Annotated[Path | None, arg(metavar="URDF")] = None
     """For manipulation: description of an arm to work with; the Franka Panda, of simple shapes, if not given."""
     preset: Annotated[str | None, arg(metavar="NAME|FILE")] = None
-    """Rules of the task: paper, official (its published code), or a YAML file of your own; paper if not given. See `wiw
-    list`."""
+    """All that a number depends on: default, paper, official (its published code), or a YAML file of your own; what the
+    command line says goes before it. See `wiw list presets`."""
     task_option: Options = ()
     """A rule of the preset, such as decisions=10, or another option of the task, such as categories=bed,sofa; may be
     given again."""
@@ -100,8 +100,9 @@ class AgentFlags:
     """Its name at the server, or a preset of `wiw list`; not needed where the server has one model."""
     vlm_prices: Annotated[Path | None, arg(metavar="FILE")] = None
     """YAML file of `model: [read, written]`, dollars per million tokens, for the costs."""
-    prompts: Folder = None
-    """Templates in the place of the shipped ones, as in wiw/policies/vlm/prompts."""
+    prompts: Annotated[str | None, arg(metavar="NAME|DIR")] = None
+    """For policy vlm: a set of prompts, default or minimal, or a folder of your own, such as `wiw prompts import`
+    writes."""
     semantics: MaybeName = None
     """Tells world models that need it what each pixel is: simulator, rednet, or path.py:Class."""
     semantics_option: Options = ()
@@ -135,12 +136,19 @@ class AgentFlags:
     def _vlm_options(self, policies: Sequence[str]) -> dict[str, Any]:
         """Return options of policy vlm; its own address, so that the record says where it asked."""
         flags = {"vlm": self.vlm, "model": self.vlm_model, "prices": self.vlm_prices, "prompts": self.prompts}
-        options = {name: value for name, value in flags.items() if value is not None}
+        options = {name: _make_absolute(name, value) for name, value in flags.items() if value is not None}
         if "vlm" not in policies:
             if options:
                 raise ArgumentError(
                     "--vlm, --vlm-model, --vlm-prices and --prompts are for policy vlm: give --policy vlm"
                 )
             return {}
-        paths = {name: str(value.expanduser().resolve()) for name, value in options.items() if isinstance(value, Path)}
-        return {"vlm": {"vlm": "http://localhost:8000/v1", **options, **paths}}
+        return {"vlm": {"vlm": "http://localhost:8000/v1", **options}}
+
+
+def _make_absolute(name: str, value: Any) -> str:
+    """Return an option of policy vlm, with its path, if it is one, made absolute."""
+    from wiw.policies.vlm.prompts import SETS
+
+    is_path = isinstance(value, Path) or (name == "prompts" and value not in SETS)
+    return str(Path(value).expanduser().resolve()) if is_path else str(value)

@@ -30,6 +30,7 @@ def run(
     arms: Annotated[str | None, arg(metavar="[NAME=]MODEL[?KEY=VALUE],...")] = None,
     rules: Annotated[TaskFlags, arg(name="")] = TASK,
     report: bool = True,
+    dry_run: bool = False,
     search: Annotated[AgentConfig, arg(name="")] = SEARCH,
     config: Annotated[RunConfig, arg(name="")] = SETTINGS,
 ) -> int:
@@ -43,6 +44,7 @@ def run(
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
+    $ wiw run ar --preset official --policy vlm --world-model svd --dry-run
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
@@ -51,14 +53,16 @@ def run(
         parts: The agent.
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
-            other plans, or from elsewhere; placebo-shuffled:MODEL names another. NAME=MODEL?KEY=VALUE names an arm and
+            other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
+            names another. NAME=MODEL?KEY=VALUE names an arm and
             gives its model options, several with & between them (in quotes), besides those of --world-model-option.
         rules: What it is run on.
         report: Whether to write report.html at the end.
+        dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.
         search: Numbers of the search.
         config: How the run goes.
     """
-    from wiw.cli.announcement import announce
+    from wiw.cli.announcement import announce, announce_protocol
     from wiw.runs.arm_text import parse_arm
     from wiw.runs.recipes import arm_recipes
 
@@ -68,7 +72,11 @@ def run(
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search, policies)
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
     settings = replace(config, seed=seed, out=folder)
-    announce(recipe.build(), arm_recipes(agent, names), settings)
+    built, recipes = recipe.build(), arm_recipes(agent, names)
+    announce(built, recipes, settings)
+    if dry_run:
+        announce_protocol(built, recipes)
+        return 0
     from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
 
     return finish(stoppable(lambda: evaluate(recipe, agent, arms=names, config=settings), folder), report)

@@ -2,8 +2,8 @@
 """Placebos at equal compute: the world model does as much work, but its rollouts do not depend on the plan.
 
 "shuffled" imagines plans made of the same primitives in another order and shows their futures as the plans' own.
-"swapped" imagines the very plans, but from the first observation of another episode. A world model whose score a
-placebo reaches has helped by something else than foresight.
+"swapped" imagines the very plans, but from the first observation of another episode. "blind" asks a model that is told
+plans in words without any. A world model whose score a placebo reaches has helped by something else than foresight.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from wiw.loop.imagine import make_model_spec
 from wiw.loop.model_imaginer import as_imaginer
 from wiw.types import Key, Proposal
 
-PLACEBOS = ("shuffled", "swapped")
+PLACEBOS = ("shuffled", "swapped", "blind")
 DRAWS = 64
 """Orders that are tried for one that costs as much as the plans themselves."""
 _PURPOSE = 0x706C6163
@@ -97,6 +97,31 @@ class SwappedPlacebo(Placebo):
         """Drop the observation stored for an episode."""
         super().forget(key)
         self._moments.forget(key)
+
+
+class BlindPlacebo(Placebo):
+    """Imagines the plans with an empty prompt: what a model that is told plans in words makes of the view alone.
+
+    Args:
+        model: a world model with control "text", or an imaginer of one.
+
+    Raises:
+        ArgumentError: a model that is told plans otherwise.
+    """
+
+    kind = "blind"
+
+    def __init__(self, model: Any) -> None:
+        super().__init__(model)
+        if self.accepts.control != "text":
+            raise ArgumentError(
+                "placebo-blind asks a world model with an empty prompt: expected one with control 'text', got "
+                f"'{self.accepts.control}'; placebo-shuffled and placebo-swapped take any"
+            )
+
+    def imagine(self, request: Request) -> Imagination:
+        """Imagine the plans without their words."""
+        return super().imagine(replace(request, wordless=True))
 
 
 NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made of none; use 'swapped'"

@@ -54,6 +54,8 @@ class Request:
     frames: FrameSpec
     """How the reviser wants the frames."""
     clock: Clock
+    wordless: bool = False
+    """Whether a model with control "text" is given an empty prompt."""
 
 
 class Imagination(ABC):

@@ -78,7 +78,7 @@ def imagine_primitives(model: WorldModel, request: Request) -> ImaginedPrimitive
             observations = _at_start(conditioning, part, answers, accepts)
             if histories is not None:
                 observations = replace(observations, history=histories.before(part, answers))
-            controls = _controls(accepts, part)
+            controls = _controls(accepts, part, request.wordless)
         with clock("world_model"):
             found = ask(model, observations, controls, seeds[part.rows])
             answers.append(_require_own_memory(found, answers, model))
@@ -179,13 +179,14 @@ def _slice_of(rows: NDArray[np.int64]) -> slice | NDArray[np.int64]:
     return slice(first, last + 1) if last - first + 1 == len(rows) else rows
 
 
-def _controls(accepts: Accepts, part: Any) -> list[Control]:
+def _controls(accepts: Accepts, part: Any, wordless: bool) -> list[Control]:
+    tells = accepts.control == "text" and not wordless
     return [
         Control(
             actions=actions,
             trajectory=trajectory,
             viewpoints=viewpoints,
-            text=action.to_text(actions[:length], accepts.template) if accepts.control == "text" else "",
+            text=action.to_text(actions[:length], accepts.template) if tells else "",
             ids=_ids(accepts, actions),
             length=int(length),
             shared=int(shared),

@@ -83,14 +83,15 @@ def _rows(accepts: Accepts, request: Request) -> tuple[list[_Row], list[list[int
             name = plan.actions.tobytes(), plan.text
             if name not in known:
                 known[name] = len(rows)
-                control = _control(accepts, plan, request.observations[episode].pose)
+                control = _control(accepts, plan, request.observations[episode].pose, request.wordless)
                 rows.append(_Row(episode, plan.actions, control, seed_of(request.keys[episode], number)))
         places.append([known[plan.actions.tobytes(), plan.text] for plan in plans])
     return rows, places
 
 
-def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64]) -> Control:
+def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64], wordless: bool) -> Control:
     """Return the plan at the length that the model imagines, or at its own."""
+    tells = accepts.control == "text" and not wordless
     poses = plan.actions
     if accepts.frames:
         poses = action.resample(poses, accepts.frames - 1, start=here)
@@ -99,7 +100,7 @@ def _control(accepts: Accepts, plan: Proposal, here: NDArray[np.float64]) -> Con
         actions=np.full(count, int(action.NULL), np.int8),
         trajectory=np.zeros((count, 3)),
         viewpoints=np.broadcast_to(np.eye(4), (count, 4, 4)),
-        text=plan.text or action.to_text(plan.actions) if accepts.control == "text" else "",
+        text=plan.text or action.to_text(plan.actions) if tells else "",
         ids=np.concatenate([here[None], poses]) if accepts.control == "action" else None,
         length=count,
     )

@@ -151,7 +151,8 @@ def stack_tables(
 def summary_tables(summary: Summary, width: int) -> Any:
     """Return what rich prints into `width` columns."""
     gap = " " if width >= ROOMY else "\n"
-    parts: list[Any] = [*_arm_tables(summary, width)]
+    parts: list[Any] = [Text(summary.protocol, style="dim")] if summary.protocol else []
+    parts += _arm_tables(summary, width)
     if summary.utilities:
         parts.append(_utilities(summary))
     for breakdown in summary.breakdowns:

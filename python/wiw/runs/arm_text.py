@@ -65,12 +65,13 @@ def check_arm_name(name: str, text: str | None = None) -> None:
 
 
 def split_arms(text: str) -> list[str]:
-    """Return the arms of a list with commas between them; commas in brackets belong to a value: size=[480, 480].
+    """Return the arms of a list with commas between them; those in brackets belong to a value: size=[480, 480], and one
+    before ws:// to a list of servers.
 
     Raises:
         ArgumentError: there are none.
     """
-    arms = [arm.strip() for arm in re.split(r",(?![^\[]*\])", text) if arm.strip()]
+    arms = [arm.strip() for arm in re.split(r",(?!\s*wss?://)(?![^\[]*\])", text) if arm.strip()]
     if not arms:
         raise ArgumentError(f"arms: expected one or several, as in none,copy,warp or {EXAMPLE}, got '{text}'")
     return arms

@@ -11,7 +11,7 @@ from wiw.errors import ArgumentError
 from wiw.experiments.fidelity import FidelityObserver
 from wiw.experiments.gating import Gated
 from wiw.experiments.ground_truth import TruePlans, TrueScores, sort_stages
-from wiw.experiments.placebos import NO_POSES, PLACEBOS, ShuffledPlacebo, SwappedPlacebo
+from wiw.experiments.placebos import NO_POSES, PLACEBOS, BlindPlacebo, ShuffledPlacebo, SwappedPlacebo
 from wiw.experiments.semantics import SIMULATOR, Labelled
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
@@ -114,6 +114,8 @@ def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContex
         raise ArgumentError(f"expected placebo {' or '.join(PLACEBOS)}, got '{placebo}'")
     if placebo == "swapped":
         return SwappedPlacebo(imaginer, NextEpisodes(context, imaginer))
+    if placebo == "blind":
+        return BlindPlacebo(imaginer)
     if space != PRIMITIVES:
         raise ArgumentError(NO_POSES)
     return ShuffledPlacebo(imaginer)

@@ -99,8 +99,8 @@ class AgentRecipe(AgentConfig):
         """Return the agent; numbers that are open are the task's."""
         space = self.space or context.task.defaults.get("space") or PRIMITIVES
         model: Any = self.model
-        if self.model_options:
-            model = make_for_space(self.model, space, limits.deadline, **self.model_options)
+        if options := self.resolve_model_options(context.task):
+            model = make_for_space(self.model, space, limits.deadline, **options)
         semantics = None if self.model is None else self.semantics  # nobody would look at them
         if semantics is not None and self.semantics_options:
             semantics = SEMANTICS.make(self.semantics, **self.semantics_options)
@@ -109,6 +109,14 @@ class AgentRecipe(AgentConfig):
         return compose(
             AgentSpec(policy, model, reviser, self.config, tuple(self.observers)), experiment, limits, context
         )
+
+    def resolve_model_options(self, task: Task) -> dict[str, Any]:
+        """Return what the world model is made with on a task: the options of its preset, and on top those given."""
+        return {**task.model_options.get(str(self.model), {}), **self.model_options}
+
+    def resolve_policy_options(self, policy: str, task: Task) -> dict[str, Any]:
+        """Return what a named policy is made with on a task, likewise."""
+        return {**task.policy_options.get(policy, {}), **self.policy_options.get(policy, {})}
 
     @property
     def config(self) -> AgentConfig:
@@ -217,13 +225,14 @@ class AgentRecipe(AgentConfig):
 
     @property
     def arm(self) -> str:
-        """Short name of the world model: "none", "warp", the class behind a path, or a server's host and port."""
+        """Short name of the world model: "none", "warp", the class behind a path, or servers' hosts and ports."""
         if self.model is None:
             return "none"
         if not isinstance(self.model, str):
             return (self.model if isinstance(self.model, type) else type(self.model)).__name__.lower()
-        kind, scheme, host = self.model.partition("://")
-        return f"{kind.partition(':')[0]}:{host}" if scheme else self.model.rpartition(":")[2]
+        kind, scheme, _ = self.model.partition("://")
+        hosts = ";".join(address.partition("://")[2] for address in self.model.split(","))
+        return f"{kind.partition(':')[0]}:{hosts}" if scheme else self.model.rpartition(":")[2]
 
     def _make_policies(self, space: str, task: Task) -> tuple[Any, Any]:
         """Return policy and reviser (None: the policy's or the task's own); the one that revises has the tracker.
@@ -256,11 +265,10 @@ class AgentRecipe(AgentConfig):
 
     def _make_policy(self, policy: Any, space: str, task: Task, more: Mapping[str, Any] = NOTHING) -> Any:
         """Return a policy with the options of its name, the task's and more; others are made with the agent."""
-        sources = (task.policy_options, self.policy_options)
-        if not isinstance(policy, str) or not (more or any(policy in options for options in sources)):
+        if not isinstance(policy, str) or not (more or policy in {*task.policy_options, *self.policy_options}):
             return policy
-        options = {name: value for own in sources for name, value in own.get(policy, {}).items()}
-        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options, **more})
+        options = {**self.resolve_policy_options(policy, task), **more}
+        return POLICIES.make(policy, **{**space_option(POLICIES, policy, space), **options})
 
 
 _FIELDS = tuple(field.name for field in fields(AgentRecipe) if field.name != "observers")

@@ -15,6 +15,7 @@ from wiw.errors import Error, StoreError
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import ResumeConfig, RunConfig, read_resume_settings, take_settings
+from wiw.runs.departures import describe_departures
 from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
@@ -45,7 +46,8 @@ def evaluate(
         episodes: how many; None means as many as the task says.
         arms: world models to run on the same episodes with this agent's policies, by name, class or instance, or
             "policy+model" for one with another built-in policy, such as "heuristic+none"; "placebo-shuffled" and
-            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-shuffled:oracle" of another.
+            "placebo-swapped" are placebos of the agent's model (else of warp), "placebo-blind" one of a text model,
+            "placebo-shuffled:oracle" of another.
             "small=warpnet?weights=small.npz" names an arm and gives its model options, as on the command line; a
             mapping gives the arms names of their own. None means the agent's own model.
         config: how the run goes.
@@ -153,6 +155,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "sources": sources_of(task, agents),
+            "departures": describe_departures(built, agents),
             "pictures": pool_episodes(episodes, settings.count_pictured(count)),
             "keep_images": settings.count_pictured(count),
             "scenes": used,

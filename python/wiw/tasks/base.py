@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
+from wiw.tasks.presets import Preset
 from wiw.types import PRIMITIVES, Episode, TableSpec, Wording
 
 if TYPE_CHECKING:
@@ -46,6 +47,10 @@ class Task(ABC):
     """How reports speak of its episodes."""
     tables: TableSpec = TableSpec()
     """Contents of the tables and plots of its runs."""
+    preset: str = ""
+    """Name of its preset, or the path of its file; empty for a task without presets."""
+    preset_settings: Preset = Preset()
+    """All that its preset sets."""
     has_guide: bool = False
     """Whether its environments' `guide` tells what plans are truly worth, which `wiw blame` asks."""
 
@@ -77,7 +82,17 @@ class Task(ABC):
     @property
     def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
         """Options that named policies are made with on this task, where a run gives no others."""
-        return {}
+        return self.preset_settings.policies
+
+    @property
+    def model_options(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options that named world models are made with on this task, where a run gives no others."""
+        return self.preset_settings.models
+
+    @property
+    def departures(self) -> Mapping[str, Mapping[str, str]]:
+        """Reasons why its preset departs from the paper."""
+        return self.preset_settings.departures
 
     @property
     def default_episodes(self) -> int:

@@ -57,7 +57,8 @@ class Manipulation(ManipulationSpec, Task):
     Args:
         tasks: "all", or names of `TABLETOP_TASKS`; episodes take them in turn.
         seed: of the episodes and of the run.
-        preset: "paper", or the path of a YAML file; `rules` overrides it field by field (`ManipulationRules`).
+        preset: "default", "paper", "paper-diffusion", or the path of a YAML file; `rules` overrides it field by field
+            (`ManipulationRules`).
         backend: renderer, "auto", "cpu" or "gpu".
         robot: URDF file of an arm to work with in place of the project's own Panda (`wiw.tabletop.robot`).
         robot_tcp: the link of that file between the finger tips, where its name does not tell.
@@ -90,7 +91,9 @@ class Manipulation(ManipulationSpec, Task):
             )
         self.tasks, self.seed, self.backend = _parse_tasks(tasks), check_seed(seed), backend
         self.robot = load_panda() if robot is None else load_robot(robot, robot_tcp)
-        self.rules = presets.load_rules(ManipulationRules, presets.find_owner(type(self)), preset, rules)
+        owner = presets.find_owner(type(self))
+        self.rules = presets.load_rules(ManipulationRules, owner, preset, rules)
+        self.preset, self.preset_settings = presets.make_absolute(preset), presets.load_preset(owner, preset)
 
     @staticmethod
     def make_portable(options: Mapping[str, Any]) -> dict[str, Any]:

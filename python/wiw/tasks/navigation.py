@@ -28,7 +28,7 @@ class NavigationTask(NavigationSpec, Task):
         scenes: scene spec, e.g. "apartments:val", "apartments:test:40", or the path of a mesh or SDF world; where
             Habitat's navigation mesh lies beside it ("house.navmesh" for "house.glb"), that one is used.
         seed: seed of the generated episodes and of the run.
-        preset: "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
+        preset: "default", "paper", "official", or the path of a YAML file; `rules` overrides it field by field.
         episode_file: a JSON episode file to use instead of generating; habitat-lab's and World-in-World's are read too.
         scene_folder: folder that scene paths in an episode file are relative to; if not given, the folder of a file of
             wiw, else the present one.
@@ -59,7 +59,8 @@ class NavigationTask(NavigationSpec, Task):
         """Rules that were given as options."""
         owner = presets.find_owner(type(self))
         self.rules: Any = presets.load_rules(self.rules_class, owner, preset, self.overridden)
-        self._policy_options = presets.load_policy_options(owner, preset)
+        self.preset = presets.make_absolute(preset)
+        self.preset_settings = presets.load_preset(owner, preset)
         self._generator_rules = {name: value for name, value in rules.items() if name not in own}
         self.generator: Any = presets.load_rules(self.generator_class, "", presets.DEFAULT, self._generator_rules)
         self.scenes, self.seed = absolute(scenes), check_seed(seed)
@@ -131,11 +132,6 @@ class NavigationTask(NavigationSpec, Task):
         return {"candidates": self.rules.candidates, "horizon": self.rules.horizon, "execute": self.rules.execute}
 
     @property
-    def policy_options(self) -> Mapping[str, Mapping[str, Any]]:
-        """Options that the preset gives policies."""
-        return self._policy_options
-
-    @property
     def file_header(self) -> dict[str, Any]:
         """Header of a file of its episodes."""
         return {"seed": self.seed, "scenes": self.scenes}
@@ -148,7 +144,9 @@ class NavigationTask(NavigationSpec, Task):
         if self.episode_file:
             source = {"episode_file": self.episode_file}
         backend = resolve_backend(self.backend)
-        return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules)}
+        given = {"policies": self.policy_options, "models": self.model_options}
+        options = {name: value for name, value in given.items() if value}
+        return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules), **options}
 
     def environment(self, depth: bool = False) -> NavigationEnv:
         """Return a gymnasium environment of this task; `depth` adds it to the observations."""

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Presets: rules of a task in a YAML file, shipped in `wiw/configs/<preset>/<task>.yaml` or written by the user.
+"""Presets: all that a task's numbers depend on, in a YAML file: shipped as `wiw/configs/<preset>/<task>.yaml`, or the
+user's.
 
-base: official        # a shipped preset whose rules hold where this file says nothing; `paper` if left out
+base: official        # a shipped preset that holds where this file says nothing; `default` if left out
 about: our long run   # one line for `wiw list`
-decisions: 40
+decisions: 40         # rules of the task
 policies:             # options of policies by name, where the command line gives no others
   vlm: {history: 0}
+models:               # options of world models, likewise; or a YAML file beside this one
+  wan2.1: {frames: 33}
+departures:           # why it departs from the paper, by whom that concerns (`CONCERNS`); null: it no longer does
+  rules: {decisions: "we have more time"}
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import MISSING, Field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -20,15 +25,55 @@ from wiw.mapping_files import read_yaml_mapping
 from wiw.suggestions import did_you_mean
 
 FOLDER = Path(__file__).parents[1] / "configs"
-DEFAULT = "paper"
+DEFAULT, PAPER = "default", "paper"
+HEADER = ("base", "about", "policies", "models", "departures")
+"""Keys that are no rules."""
+CONCERNS = ("rules", "vlm", "models", "text models")
+"""Whom a departure concerns: every run, runs with policy `vlm`, with a world model, with one that is told words."""
 
 Rules = TypeVar("Rules")
+
+
+Options = Mapping[str, Mapping[str, Any]]
+"""Options of parts by their names."""
+
+
+@dataclass(frozen=True)
+class Preset:
+    """All that a preset sets, those that it is based on included."""
+
+    rules: Mapping[str, Any] = field(default_factory=dict)
+    policies: Options = field(default_factory=dict)
+    models: Options = field(default_factory=dict)
+    departures: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    """Reasons for departures from the paper, by whom they concern (`CONCERNS`) and what they are about."""
+
+
+def load_preset(task: str, preset: str | Path) -> Preset:
+    """Return what a preset sets, by name or by the path of a YAML file.
+
+    Raises:
+        ArgumentError: no such preset, or a section of another form; names the file.
+        FileError: a file cannot be read, or does not hold a mapping.
+    """
+    rules: dict[str, Any] = {}
+    policies: dict[str, dict[str, Any]] = {}
+    models: dict[str, dict[str, Any]] = {}
+    reasons: dict[str, dict[str, Any]] = {}
+    for path in _chain(task, preset):
+        content = _read(path)
+        rules |= _without_header(content)
+        _add_options(policies, _read_options(content, "policies", path))
+        _add_options(models, _read_options(content, "models", path))
+        _add_options(reasons, _read_departures(content, path))
+    given = {who: {topic: str(why) for topic, why in own.items() if why} for who, own in reasons.items()}
+    return Preset(rules, policies, models, given)
 
 
 def list_presets(task: str) -> list[str]:
     """Return the shipped presets of a task, the default first."""
     found = sorted(path.parent.name for path in FOLDER.glob(f"*/{task}.yaml"))
-    return sorted(found, key=lambda name: name != DEFAULT)
+    return sorted(found, key=lambda name: (name != DEFAULT, name != PAPER))
 
 
 def describe_preset(task: str, preset: str) -> str:
@@ -67,25 +112,6 @@ def load_rules(cls: type[Rules], task: str, preset: str | Path, overrides: Mappi
         ships = f"; give `base: {DEFAULT}`" if list_presets(task) else f", or give {cls.__name__} defaults"
         raise ArgumentError(f"preset '{preset}' of {task} leaves open {', '.join(missing)}{ships}")
     return cls(**values)
-
-
-def load_policy_options(task: str, preset: str | Path) -> dict[str, dict[str, Any]]:
-    """Return the options that a preset gives policies, by name, on top of those of the presets it is based on.
-
-    Raises:
-        ArgumentError: no such preset, or something else than options by name; names the file.
-        FileError: see `load_rules`.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for path in _chain(task, preset):
-        policies = _read(path).get("policies", {})
-        if not isinstance(policies, Mapping) or not all(isinstance(own, Mapping) for own in policies.values()):
-            raise ArgumentError(
-                f"{path}: policies: expected options by policy, `vlm: {{history: 0}}`, got {policies!r}"
-            )
-        for policy, options in policies.items():
-            found[str(policy)] = {**found.get(str(policy), {}), **options}
-    return found
 
 
 def rule_names(cls: type) -> list[str]:
@@ -158,7 +184,37 @@ def _read(path: Path) -> Mapping[str, Any]:
 
 
 def _without_header(content: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if name not in ("base", "about", "policies")}
+    return {name: value for name, value in content.items() if name not in HEADER}
+
+
+def _read_options(content: Mapping[str, Any], section: str, path: Path) -> Options:
+    """Return a section with options of parts, from a file of its own where it names one."""
+    options = content.get(section, {})
+    if isinstance(options, str):
+        path = path.parent / options
+        options = _read(path)
+    if not isinstance(options, Mapping) or not all(isinstance(own, Mapping) for own in options.values()):
+        raise ArgumentError(f"{path}: {section}: expected options by name, `NAME: {{option: 0}}`, got {options!r}")
+    return options
+
+
+def _add_options(known: dict[str, dict[str, Any]], more: Options) -> None:
+    for name, options in more.items():
+        known[str(name)] = {**known.get(str(name), {}), **options}
+
+
+def _read_departures(content: Mapping[str, Any], path: Path) -> Options:
+    reasons = content.get("departures", {})
+    fits = isinstance(reasons, Mapping) and all(
+        who in CONCERNS and isinstance(own, Mapping) and all(isinstance(why, str | None) for why in own.values())
+        for who, own in reasons.items()
+    )
+    if not fits:
+        raise ArgumentError(
+            f"{path}: departures: expected reasons by whom they concern ({', '.join(CONCERNS)}), such as "
+            f"`rules: {{decisions: why}}`, got {reasons!r}"
+        )
+    return dict(reasons)
 
 
 def _typed(kind: Any, value: Any, where: str) -> Any:

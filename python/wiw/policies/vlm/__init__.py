@@ -74,11 +74,15 @@ class VLM(Policy):
     Args:
         vlm: see `wiw.vlm.connect`.
         model: its name there, or a preset (`wiw/configs/vlm`).
-        prompts: folder of templates that replace the shipped ones; see `wiw.policies.vlm.prompts`.
+        prompts: a shipped set, "default" or "minimal", or a folder of templates; see `wiw.policies.vlm.prompts`.
         proposals: "sampled", one question for each plan, or "listed", one question for all of them.
         revision: "write" lets it write the plan to follow after it has seen the futures, as the paper's prompt does;
             "select" lets it choose one of the proposals, with the probabilities as scores. Not for recognition.
-        temperature: of sampled plans; everything else is asked at 0.
+        temperature: of sampled plans.
+        revision_temperature: of the plan that is written after futures were seen; choices are read from
+            log-probabilities, which no temperature changes.
+        view_size: pixels a side of the real front view and the goal image in navigation and recognition; None shows
+            them as observed. Imagined frames have 384.
         tries: times a question is put before its answer counts as unusable.
         tracker: finds the target in imagined frames (`wiw list trackers`); name or instance, None for a task that
             points nothing out.
@@ -102,6 +106,8 @@ class VLM(Policy):
     """Tasks that it has prompts for."""
     tracks: bool = True
     """Whether there are tasks among them that point something out."""
+    shows_front = True
+    """Whether it is shown the agent's front view alone, rather than views of its own."""
     fallback_action = "a primitive was drawn"
     """Description of the fallback where no plan can be used."""
 
@@ -120,19 +126,25 @@ class VLM(Policy):
         rounds: bool = False,
         cache: str | Path = "auto",
         prices: str | Path | None = None,
+        revision_temperature: float = 0.0,
+        view_size: int | None = None,
         **client: Any,
     ) -> None:
         if (
             proposals not in ("sampled", "listed")
             or revision not in ("write", "select")
             or answer_view not in ("observation", "target")
-            or temperature < 0
+            or min(temperature, revision_temperature) < 0
             or tries < 1
         ):
             raise ArgumentError(
                 "policy vlm: expected proposals sampled or listed, revision write or select, answer_view observation "
-                f"or target, temperature >= 0 and tries >= 1, got {proposals}, {revision}, {answer_view}, "
-                f"{temperature}, {tries}"
+                f"or target, temperatures >= 0 and tries >= 1, got {proposals}, {revision}, {answer_view}, "
+                f"{temperature}, {revision_temperature}, {tries}"
+            )
+        if view_size is not None and (view_size < 1 or not self.shows_front):
+            raise ArgumentError(
+                f"policy vlm: expected view_size of at least 1, for tasks {', '.join(VLM.tasks)}, got {view_size}"
             )
         _require_packages()
         self.prompts = Prompts(prompts)
@@ -141,6 +153,7 @@ class VLM(Policy):
         self.client = connect(vlm, **{**kept, **presets.get_client_options(model), **client})
         self.proposals, self.revision, self.temperature, self.tries = proposals, revision, temperature, tries
         self.answer_view, self.rounds = answer_view, rounds
+        self.revision_temperature, self.view_size = revision_temperature, view_size
         self.tracker = TRACKERS.make(tracker, **(tracker_options or {})) if tracker and self.tracks else None
         self.needs = () if self.tracker is None else tuple(self.tracker.needs)
         self._journal: dict[tuple[int, int], list[Exchange]] = {}
@@ -156,6 +169,8 @@ class VLM(Policy):
             "temperature": self.temperature,
             "tries": self.tries,
             **({} if self.tracker is None else self._describe_recognition(self.tracker)),
+            **({"revision_temperature": self.revision_temperature} if self.revision_temperature else {}),
+            **({"view_size": self.view_size} if self.view_size else {}),
         }
 
     def _describe_recognition(self, tracker: Tracker) -> dict[str, Any]:
@@ -222,10 +237,14 @@ class VLM(Policy):
 
     def _build_plan_prompt(self, situation: Situation, horizon: int) -> list[Part]:
         """Return the text and images before the request for plans."""
-        front, panorama = prompt_images.render_observation(situation.observation)
+        front, panorama = prompt_images.render_observation(situation.observation, self.view_size)
         words = self._render_prompt(situation, "planner", horizon)
         parts: list[Part] = [words, "Front view:", front, "Panorama:", panorama]
-        return parts if situation.goal.image is None else [*parts, "Goal image:", situation.goal.image]
+        return parts if situation.goal.image is None else [*parts, "Goal image:", self._render_goal(situation.goal)]
+
+    def _render_goal(self, goal: Goal) -> prompt_images.Image:
+        assert goal.image is not None
+        return prompt_images.resize_view(goal.image, self.view_size)
 
     def _get_plan_schema(self, situation: Situation, longest: int, count: int = 1) -> type[BaseModel]:
         return plans.plan_schema(longest, count)
@@ -313,13 +332,16 @@ class VLM(Policy):
         self, situation: Situation, proposals: Sequence[Proposal], rollouts: Sequence[Rollout]
     ) -> Request:
         """Ask which of the proposals to follow, or for another plan."""
-        assert situation.goal.image is not None
         strips = [
             prompt_images.render_plan_strip(plan, rollout) for plan, rollout in zip(proposals, rollouts, strict=True)
         ]
         horizon = max(situation.memory.horizon, *(len(plan.actions) for plan in proposals))
         name = "chooser" if self.revision == "select" else "planner_imagined"
-        parts: list[Part] = [self._render_prompt(situation, name, horizon), "Goal image:", situation.goal.image]
+        parts: list[Part] = [
+            self._render_prompt(situation, name, horizon),
+            "Goal image:",
+            self._render_goal(situation.goal),
+        ]
         parts += _caption_strips(proposals, strips)
         seed = derive_seed(situation.key, REVISION_SEED)
         if self.revision == "select":
@@ -328,7 +350,10 @@ class VLM(Policy):
             )
             return Request((user(*parts),), choices=choices, seed=seed, tries=self.tries)
         parts.append(self._render_prompt(situation, "output", horizon))
-        return Request((user(*parts),), schema=plans.plan_schema(horizon), seed=seed, tries=self.tries)
+        schema = plans.plan_schema(horizon)
+        return Request(
+            (user(*parts),), schema=schema, seed=seed, tries=self.tries, temperature=self.revision_temperature
+        )
 
     def _read_scores(self, situation: Situation, proposals: Sequence[Proposal], reply: Reply) -> NDArray[np.float64]:
         memory: Memory = situation.memory
@@ -355,7 +380,7 @@ class VLM(Policy):
 
     def _build_move_request(self, situation: Situation, imagined: Sequence[Part]) -> Request:
         """Ask for the next primitive."""
-        front, panorama = prompt_images.render_observation(situation.observation)
+        front, panorama = prompt_images.render_observation(situation.observation, self.view_size)
         parts: list[Part] = [self._render_prompt(situation, "planner", 1), "Front view:", front, "Panorama:", panorama]
         if imagined:
             parts += [self._render_prompt(situation, "planner_imagined", 1), *imagined]

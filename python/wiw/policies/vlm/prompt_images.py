@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cache
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,10 +23,21 @@ VIEW = 384
 Image = NDArray[np.uint8]
 
 
-def render_observation(observation: Observation) -> tuple[Image, Image]:
-    """Return front view and panorama, with the target's box where there is a target."""
+def render_observation(observation: Observation, side: int | None = None) -> tuple[Image, Image]:
+    """Return front view, of so many pixels a side, and panorama, with the target's box where there is a target."""
     shown = observation.as_dict()
-    return shown["front"], shown["panorama"]
+    return resize_view(shown["front"], side), shown["panorama"]
+
+
+def resize_view(view: Image, side: int | None) -> Image:
+    """Return a square view with so many pixels a side; as it is where none are given."""
+    if side is None or view.shape[:2] == (side, side):
+        return view
+    return np.asarray(cv2.resize(view, (side, side), interpolation=_choose_interpolation(view, side)), np.uint8)
+
+
+def _choose_interpolation(view: Image, side: int) -> int:
+    return cv2.INTER_AREA if side < view.shape[0] else cv2.INTER_CUBIC
 
 
 def render_plan_strip(plan: Proposal, rollout: Rollout, track: Track | None = None) -> Image:

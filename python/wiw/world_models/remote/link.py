@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import random
 import threading
 import time
@@ -35,6 +36,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.1, 5.0
 HANDSHAKE = 10.0
 HEARTBEAT, SILENCE = 10.0, 30.0
 """Seconds between pings, and without an answer to one until the connection counts as lost."""
+GLANCE = 0.2
+"""Seconds between two looks at whether the connection is still there, for those who wait no longer than it is."""
 BREACHES = frozenset({"type", "dtype", "nan", "shape", "frames", "frame 0", "channels", "scale", "contract"})
 """Kinds of `ContractError`."""
 
@@ -62,11 +65,13 @@ class Link:
         self._proxy: Any = None if _is_loopback(address) else True
         self._open: dict[bytes, _Question] = {}
         self._welcome: Future[Welcome] = Future()
-        self._last_error = "not connected yet"
+        self.last_error = "not connected yet"
+        """Why the latest connection ended."""
         self._closed = False
         self._loop = asyncio.new_event_loop()
         self._wanted = asyncio.Event()
         self._outbox: asyncio.Queue[_Question] | None = None
+        self._lost_at = time.monotonic()
         self._thread = threading.Thread(target=self._run, daemon=True, name="wiw remote")
         self._thread.start()
 
@@ -83,14 +88,28 @@ class Link:
             return self._welcome.result(seconds)
         except LateError:
             raise RemoteError(
-                f"nobody serves a world model at {self.address}: {self._last_error}", "connection"
+                f"nobody serves a world model at {self.address}: {self.last_error}", "connection"
             ) from None
 
-    def ask(self, rows: Sequence[bytes], give_up: float) -> list[Frames]:
+    @property
+    def is_connected(self) -> bool:
+        """Whether questions reach the server at present."""
+        return self._outbox is not None
+
+    def wake(self) -> None:
+        """Connect again where the connection was lost; nobody waits for it."""
+        self._call_soon(self._wanted.set)
+
+    def ask(self, rows: Sequence[bytes], give_up: float, lost: float = math.inf) -> list[Frames]:
         """Return the frames of each row, in order.
 
+        Args:
+            rows: as `pack_row` packs them.
+            give_up: when to wait no longer, as `time.monotonic()` tells it.
+            lost: seconds without a connection after which it waits no longer either.
+
         Raises:
-            RemoteError: not all are there at the time `give_up` (`time.monotonic()`), or the server refuses one.
+            RemoteError: not all are there in time ("connection" where there is none), or the server refuses one.
             ContractError: the served model broke its contract.
         """
         if self._closed:
@@ -100,11 +119,28 @@ class Link:
         self._call_soon(lambda: asked.set_result([self._submit(question) for question in questions]))
         try:
             questions = asked.result(max(0.0, give_up - time.monotonic()))
-            return [question.answer.result(max(0.0, give_up - time.monotonic())) for question in questions]
+            return [self._await_answer(question, give_up, lost) for question in questions]
         except LateError:
             raise self._build_deadline_error() from None
         finally:
             self._call_soon(lambda: self._drop_questions(questions))
+
+    def _await_answer(self, question: _Question, give_up: float, lost: float) -> Frames:
+        """Return the answer to a question.
+
+        Raises:
+            LateError: it did not come in time.
+            RemoteError: the connection has been lost for too long.
+        """
+        while True:
+            left = give_up - time.monotonic()
+            try:
+                return question.answer.result(max(0.0, left if math.isinf(lost) else min(left, GLANCE)))
+            except LateError:
+                if left <= 0:
+                    raise
+                if not self.is_connected and time.monotonic() - self._lost_at >= lost:
+                    raise RemoteError(f"{self.address} is gone: {self.last_error}", "connection") from None
 
     def close(self) -> None:
         """End the connection and the thread, and tell those who still wait."""
@@ -120,7 +156,7 @@ class Link:
 
     def _build_deadline_error(self) -> RemoteError:
         if self._outbox is None:
-            return RemoteError(f"{self.address} could not be reached in time: {self._last_error}", "connection")
+            return RemoteError(f"{self.address} could not be reached in time: {self.last_error}", "connection")
         return RemoteError(f"no answer from {self.address} in time; the server is there, but busy or hung", "deadline")
 
     def _call_soon(self, work: Any) -> None:
@@ -154,9 +190,9 @@ class Link:
             except InvalidStatus as error:
                 if error.response.status_code in (401, 403):
                     self._fail_all(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
-                self._last_error = str(error)
+                self.last_error = str(error)
             except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
-                self._last_error = f"{type(error).__name__}: {error}"
+                self.last_error = f"{type(error).__name__}: {error}"
             if not self._open and self._welcome.done():
                 self._wanted.clear()
                 continue
@@ -211,7 +247,7 @@ class Link:
             for task in done:
                 task.result()
         finally:
-            self._outbox = None
+            self._outbox, self._lost_at = None, time.monotonic()
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
@@ -287,7 +323,7 @@ class Link:
 
     def _fail_all(self, error: RemoteError) -> None:
         """Raise the error in all waiting callers."""
-        self._last_error = str(error)
+        self.last_error = str(error)
         if not self._welcome.done():
             self._welcome.set_exception(error)
         for question in self._open.values():

@@ -21,6 +21,7 @@ from wiw.world_models.base import Accepts, WorldModel, seconds_left
 from wiw.world_models.remote.declaration import parse_declaration, parse_description
 from wiw.world_models.remote.limits import most_bytes
 from wiw.world_models.remote.link import Link
+from wiw.world_models.remote.links import Links
 
 TOKEN = "WIW_TOKEN"
 """Environment variable with the server's token."""
@@ -36,18 +37,22 @@ class Remote(WorldModel):
     """A served world model: "remote:ws://HOST:PORT", where `wiw serve MODEL` runs.
 
     Args:
-        address: "ws://HOST:PORT", or "wss://..." for a server behind TLS.
+        address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
+            rows of each call, and go on without one that dies.
         token: the server's; None means that of the environment variable WIW_TOKEN.
         patience: seconds that the first connection may take.
 
     Raises:
-        ArgumentError: no such address.
-        RemoteError: nobody answers there, or another version, or the token is wrong.
+        ArgumentError: no such address, or one twice.
+        RemoteError: nobody answers there, or another version, or the token is wrong; of several servers, one serves
+            another model than the first.
     """
 
     def __init__(self, address: str, token: str | None = None, patience: float = 15.0) -> None:
         self._arguments = (address, token, patience)
-        self._link = Link(_check_address(address), token if token is not None else os.environ.get(TOKEN))
+        key = token if token is not None else os.environ.get(TOKEN)
+        links = [Link(each, key) for each in _check_addresses(address)]
+        self._link = links[0] if len(links) == 1 else Links(links)
         self._close = weakref.finalize(self, self._link.close)
         try:
             self._welcome = self._link.welcome(patience)
@@ -109,6 +114,13 @@ class Remote(WorldModel):
     def close(self) -> None:
         """End the connection; the model cannot be asked any more."""
         self._close()
+
+
+def _check_addresses(text: str) -> list[str]:
+    addresses = [_check_address(each.strip()) for each in text.split(",")]
+    if len(set(addresses)) < len(addresses):
+        raise ArgumentError(f"remote: expected different addresses, got '{text}'")
+    return addresses
 
 
 def _check_address(address: str) -> str:

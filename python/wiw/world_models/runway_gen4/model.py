@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -15,7 +17,8 @@ from wiw.errors import ArgumentError
 from wiw.types import Conditioning, Control
 from wiw.world_models import devices
 from wiw.world_models.base import Requirements, WorldModel, accepts
-from wiw.world_models.clips import frames_after_actions
+from wiw.world_models.clips import EVEN, Alignment, frames_after_actions
+from wiw.world_models.plan_text import make_template, read_words, write_prompt
 from wiw.world_models.runway_gen4.tasks import Tasks
 from wiw.world_models.runway_gen4.videos import encode_data_uri, fetch_video
 
@@ -39,6 +42,7 @@ class RunwayGen4(WorldModel):
         frames: of a rollout, the observation included: the most actions that a clip is asked to show, and one more.
         batch: rows that are begun at once.
         budget: credits after which nothing more is begun; None is without end.
+        template, alignment: as of `TextVideoModel`; clips count as having `frames` frames.
         poll: seconds between two looks at the tasks.
         patience: seconds after which a task that has not ended counts as lost.
         url: of the service; RUNWAYML_BASE_URL if not given, else Runway's own.
@@ -58,6 +62,8 @@ class RunwayGen4(WorldModel):
     size: tuple[int, int] = (480, 480)
     frames: int = 25
     batch: int = 4
+    template: str | Path | Mapping[str, Any] | None = None
+    alignment: str = EVEN
     budget: float | None = None
     poll: float = 5.0
     patience: float = 600.0
@@ -83,7 +89,16 @@ class RunwayGen4(WorldModel):
                 f"{self.size!r}"
             )
         self.size = (int(sides[0]), int(sides[1]))
-        self.accepts = replace(type(self).accepts, size=self.size, frames=self.frames, best_batch=self.batch)
+        self.template = read_words(self.template)
+        self._words = make_template(self.template)
+        self._alignment = Alignment.parse(self.alignment, self.frames)
+        self.accepts = replace(
+            type(self).accepts,
+            size=self.size,
+            frames=self._alignment.frames,
+            best_batch=self.batch,
+            template=self._words,
+        )
         devices.require(self.requires)
         self._tasks = Tasks(self.url, self.poll, self.patience, self.budget)
 
@@ -95,7 +110,7 @@ class RunwayGen4(WorldModel):
     def rollout(
         self, observations: Conditioning, controls: Sequence[Control], seeds: NDArray[np.uint64]
     ) -> NDArray[np.uint8]:
-        """Return one clip per row, evenly sampled; padding repeats the last frame of the plan.
+        """Return one clip per row; by default evenly sampled, where padding repeats the last frame of the plan.
 
         Raises:
             InfrastructureError: the service refused, failed or took too long, or the budget is spent.
@@ -104,24 +119,32 @@ class RunwayGen4(WorldModel):
             self._make_order(image, control, int(seed))
             for image, control, seed in zip(observations.image, controls, seeds, strict=True)
         ]
-        frames = np.empty((len(controls), self.frames, *observations.image.shape[1:]), np.uint8)
+        frames = np.empty((len(controls), self.accepts.frames, *observations.image.shape[1:]), np.uint8)
         for row, (url, control) in enumerate(zip(self._tasks.outputs(orders), controls, strict=True)):
             clip = fetch_video(url, self.size)
-            frames[row] = clip[frames_after_actions(control.length, len(clip), self.frames)]
+            frames[row] = clip[self._choose_frames(control.length, len(clip))]
         frames[:, 0] = observations.image
         return frames
 
+    def _choose_frames(self, length: int, clip: int) -> NDArray[np.int64]:
+        """Return which frame of a clip of the service each frame of the rollout is."""
+        pace = self._alignment.pace
+        if pace is None:
+            return frames_after_actions(length, clip, self.frames)
+        return Alignment(clip, pace * Fraction(clip - 1, self.frames - 1)).choose_frames(length)
+
     def _make_order(self, image: NDArray[np.uint8], control: Control, seed: int) -> dict[str, Any]:
         """Return what the service is asked for one row."""
-        if len(control.text.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
+        prompt = write_prompt(control, self._words, self._alignment)
+        if len(prompt.encode("utf-16-le")) > 2 * LONGEST_PROMPT:
             raise ArgumentError(
                 f"RunwayGen4: the service takes prompts of up to {LONGEST_PROMPT} characters, and {control.length} "
-                f"actions take {len(control.text)}; lower frames (now {self.frames})"
+                f"actions take {len(prompt)}; lower frames (now {self.frames})"
             )
         return {
             "model": self.model,
             "prompt_image": encode_data_uri(image),
-            "prompt_text": control.text,
+            "prompt_text": prompt,
             "ratio": f"{SIDE}:{SIDE}",
             "duration": self.duration,
             "seed": seed % 2**32,

@@ -12,20 +12,20 @@ from typing import Any
 from wiw.errors import ArgumentError, DependencyError
 from wiw.types import Control
 from wiw.world_models.base import accepts
-from wiw.world_models.video.model import VideoModel, declare_requirements
+from wiw.world_models.video.model import declare_requirements
+from wiw.world_models.video.text import TextVideoModel
 
 HUB = "nvidia/Cosmos-Predict2-2B-Video2World"
 
 
 @dataclass(kw_only=True, eq=False)
-class CosmosPredict2(VideoModel):
+class CosmosPredict2(TextVideoModel):
     """Cosmos-Predict2 2B: the front view and the plan in words become a clip (NVIDIA 2025).
 
     Args:
         guardrail: whether NVIDIA's filter looks at prompts and frames. It has to be said: the licence of the weights
             ends for who takes the filter away without one of their own, and the filter is a package
             (`cosmos_guardrail`) with gated weights and needs of its own.
-        negative: what the clip is steered away from, in words.
         fps: frames a second that the clip is made for.
     """
 
@@ -40,7 +40,7 @@ class CosmosPredict2(VideoModel):
     guidance: float = 7.0
     frames: int = 33
     guardrail: bool | None = None
-    negative: str = "static, motion blur, shaky footage, low resolution, distorted, flickering, jump cuts"
+    negative_prompt: str = "static, motion blur, shaky footage, low resolution, distorted, flickering, jump cuts"
     fps: int = 16
 
     def __post_init__(self) -> None:
@@ -65,8 +65,8 @@ class CosmosPredict2(VideoModel):
         """Give a picture and a prompt per row."""
         return {
             "image": list(images),
-            "prompt": [control.text for control in controls],
-            "negative_prompt": [self.negative] * len(images),
+            "prompt": [self.write_prompt(control) for control in controls],
+            "negative_prompt": [self.negative_prompt] * len(images),
             "fps": self.fps,
         }
 

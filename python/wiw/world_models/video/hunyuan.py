@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from wiw.errors import ArgumentError
 from wiw.types import Control
 from wiw.world_models.base import accepts
-from wiw.world_models.video.model import Clips, VideoModel, declare_requirements
+from wiw.world_models.video.model import Clips, declare_requirements
+from wiw.world_models.video.text import TextVideoModel
 
 HUB = "hunyuanvideo-community/HunyuanVideo-I2V"
 DROPPED = 4
@@ -19,12 +21,16 @@ DROPPED = 4
 
 
 @dataclass(kw_only=True, eq=False)
-class Hunyuan(VideoModel):
+class Hunyuan(TextVideoModel):
     """HunyuanVideo I2V 13B: the front view and the plan in words become a clip (Kong et al. 2024).
 
     Both kinds of checkpoint run: those that replace the first token by the observation, and those that concatenate it
     (33 channels; use guidance=1 with them). The latter lose the first frames, so more are asked for, and the clip is
     sampled evenly from the observation to its end.
+
+    Args:
+        negative_guidance: scale of guidance away from `negative_prompt`, above 1 where there is one: the networks run
+            twice. `guidance` is a number that they are told, and steers away from nothing.
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
@@ -37,11 +43,22 @@ class Hunyuan(VideoModel):
     steps: int = 30
     guidance: float = 6.0
     frames: int = 33
+    negative_guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if bool(self.negative_prompt) != (self.negative_guidance > 1):
+            raise ArgumentError(
+                "Hunyuan: expected a negative_prompt and negative_guidance above 1, or neither, got "
+                f"'{self.negative_prompt}' and {self.negative_guidance}"
+            )
+        super().__post_init__()
 
     def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
         """Give one row's picture and prompt, and as many frames as leave `frames` after the dropped ones."""
         frames = self.frames + (DROPPED if self._concatenates else 0)
-        return {"image": images[0], "prompt": controls[0].text, "num_frames": frames}
+        away = {"negative_prompt": self.negative_prompt, "true_cfg_scale": self.negative_guidance}
+        asked = {"image": images[0], "prompt": self.write_prompt(controls[0]), "num_frames": frames}
+        return {**asked, **(away if self.negative_prompt else {})}
 
     def generate(self, images: Sequence[Any], controls: Sequence[Control], generators: Sequence[Any]) -> Clips:
         """Return the clip; where its beginning was dropped, the frame nearest to each moment from start to end."""

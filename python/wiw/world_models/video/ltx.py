@@ -10,20 +10,18 @@ from typing import Any
 from wiw.errors import ArgumentError
 from wiw.types import Control
 from wiw.world_models.base import accepts
-from wiw.world_models.video.model import Clips, VideoModel, declare_requirements
+from wiw.world_models.video.model import Clips, declare_requirements
+from wiw.world_models.video.text import TextVideoModel
 
 HUB = "Lightricks/LTX-Video"
 
 
 @dataclass(kw_only=True, eq=False)
-class LTX(VideoModel):
+class LTX(TextVideoModel):
     """LTX-Video 2B: the front view and the plan in words become a clip (HaCohen et al. 2024).
 
     Decoders since 0.9.1 take away the last bit of noise themselves. The pipeline draws it from one generator, where the
     decoder is, so it takes one row at a time with them.
-
-    Args:
-        negative: what the clip is steered away from, in words.
     """
 
     accepts = accepts(control="text", view="perspective", frames=33, cacheable=True)
@@ -38,7 +36,7 @@ class LTX(VideoModel):
     steps: int = 50
     guidance: float = 3.0
     frames: int = 33
-    negative: str = "worst quality, inconsistent motion, blurry, jittery, distorted"
+    negative_prompt: str = "worst quality, inconsistent motion, blurry, jittery, distorted"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,8 +51,8 @@ class LTX(VideoModel):
         """Give a picture and a prompt per row, and how much noise is left to the decoders that take it away."""
         return {
             "image": list(images),
-            "prompt": [control.text for control in controls],
-            "negative_prompt": [self.negative] * len(images),
+            "prompt": [self.write_prompt(control) for control in controls],
+            "negative_prompt": [self.negative_prompt] * len(images),
             "decode_timestep": 0.05,
             "decode_noise_scale": 0.025,
             "max_sequence_length": 256,

@@ -87,6 +87,8 @@ class VideoModel(WorldModel):
     """Whether frame k of a clip follows action k, however long the plan: for models that do not read it."""
     immaterial: ClassVar[tuple[str, ...]] = ("weights", "revision", "offload", "batch")
     """Options that frames do not depend on: where the weights lie, which have a digest, and how they are run."""
+    wording_options: ClassVar[tuple[str, ...]] = ()
+    """Options on how a plan is put into words and shown, which a model that is told actions does not have."""
 
     weights: str
     revision: str | None = None
@@ -161,16 +163,19 @@ class VideoModel(WorldModel):
             DeviceMemoryError: the GPU's memory is full.
             ContractError: the networks gave NaN or another number of frames.
         """
-        frames = np.empty((len(controls), self.frames, *observations.image.shape[1:]), np.uint8)
+        frames = np.empty((len(controls), self.accepts.frames, *observations.image.shape[1:]), np.uint8)
         for rows in self.batches(len(controls)):
             clips = self.make_clips(observations.image[rows], controls[rows], seeds[rows])
             for frame, clip, control in zip(frames[rows], clips, controls[rows], strict=True):
-                indices: Any = slice(None)
-                if not self.frame_per_action:
-                    indices = frames_after_actions(control.length, self.frames, self.frames)
-                frame[:] = np.rint(clip[indices] * 255)
+                frame[:] = np.rint(clip[self.choose_frames(control)] * 255)
         frames[:, 0] = observations.image
         return frames
+
+    def choose_frames(self, control: Control) -> Any:
+        """Return which frame of the clip each frame of the rollout is, as an index."""
+        if self.frame_per_action:
+            return slice(None)
+        return frames_after_actions(control.length, self.frames, self.frames)
 
     def batches(self, rows: int) -> Iterator[slice]:
         """Yield the slices of so many rows that the pipeline takes in one call each."""

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from wiw.types import Control
 from wiw.world_models.base import accepts
-from wiw.world_models.video.model import VideoModel, declare_requirements
+from wiw.world_models.video.model import declare_requirements
+from wiw.world_models.video.text import TextVideoModel
 
 HUB_21 = "Wan-AI/Wan2.1-I2V-14B-480P-Diffusers"
 HUB_22_5B = "Wan-AI/Wan2.2-TI2V-5B-Diffusers"
@@ -17,12 +19,8 @@ HUB_22_A14B = "Wan-AI/Wan2.2-I2V-A14B-Diffusers"
 
 
 @dataclass(kw_only=True, eq=False)
-class Wan(VideoModel):
-    """The front view and the plan in words become a clip (Wan team 2025).
-
-    Args:
-        negative: what the clip is steered away from, in words.
-    """
+class Wan(TextVideoModel):
+    """The front view and the plan in words become a clip (Wan team 2025)."""
 
     accepts = accepts(control="text", view="perspective", frames=25, cacheable=True)
     pipeline_class = "WanImageToVideoPipeline"
@@ -32,11 +30,11 @@ class Wan(VideoModel):
     steps: int = 30
     guidance: float = 5.0
     frames: int = 25
-    negative: str = "static, blurry, low quality, worst quality, distorted, overexposed, subtitles, people"
+    negative_prompt: str = "static, blurry, low quality, worst quality, distorted, overexposed, subtitles, people"
 
     def arguments(self, images: Sequence[Any], controls: Sequence[Control]) -> dict[str, Any]:
         """Give one row's picture and prompt."""
-        return {"image": images[0], "prompt": controls[0].text, "negative_prompt": self.negative}
+        return {"image": images[0], "prompt": self.write_prompt(controls[0]), "negative_prompt": self.negative_prompt}
 
 
 @dataclass(kw_only=True, eq=False)
@@ -66,10 +64,21 @@ class Wan22(Wan):
     """Wan 2.2 I2V A14B: the front view and the plan in words become a clip (Wan team 2025).
 
     Two experts share the work: one for the noisy steps, one for the others.
+
+    Args:
+        lora_2: LoRA of the second expert; `lora` is the first one's.
     """
 
     requires = declare_requirements(HUB_22_A14B, packages=("ftfy",))
     index_flags = {"expand_timesteps": False, "boundary_ratio": True}  # noqa: RUF012
+    wording_options = (*TextVideoModel.wording_options, "lora_2")
+    immaterial = (*TextVideoModel.immaterial, "lora_2")
 
     weights: str = HUB_22_A14B
     guidance: float = 3.5
+    lora_2: str | Path | None = None
+
+    def list_loras(self) -> dict[str, str | Path]:
+        """Return the LoRA files of the two experts."""
+        second: dict[str, str | Path] = {} if self.lora_2 is None else {"transformer_2": self.lora_2}
+        return {**super().list_loras(), **second}

@@ -36,13 +36,14 @@ class ArmVLM(VLM):
     frames = FrameSpec("front", (384, 384))
     tasks = ("manipulation",)
     tracks = False
+    shows_front = False
     fallback_action = "a pose was drawn"
 
     def _build_plan_prompt(self, situation: Situation, horizon: int) -> list[Part]:
         examples = self._render_prompt(situation, "examples", horizon)
         return [
             self._render_prompt(situation, "planner", horizon),
-            examples,
+            *([examples] if examples else []),
             *self._describe_situation(situation, horizon),
         ]
 
@@ -84,9 +85,8 @@ class ArmVLM(VLM):
             choices = tuple(f"plan {number}" for number in range(1, len(proposals) + 1))
             return Request((user(*parts),), choices=choices, **options)
         parts.append(self._render_prompt(situation, "output", horizon))
-        return Request(
-            (user(*parts),), schema=self._get_plan_schema(situation, horizon), max_tokens=MAX_PLAN_TOKENS, **options
-        )
+        options |= {"max_tokens": MAX_PLAN_TOKENS, "temperature": self.revision_temperature}
+        return Request((user(*parts),), schema=self._get_plan_schema(situation, horizon), **options)
 
     def _render_prompt(self, situation: Situation, name: str, horizon: int, count: int = 1) -> str:
         observation = situation.observation

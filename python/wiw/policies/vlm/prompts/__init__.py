@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Prompt templates: one folder per task, one Jinja file per question, with the paper's slots; a user's own may replace
-them.
+"""Prompt templates: one folder per task, one Jinja file per question, with the paper's slots.
+
+There are sets of them. `default` lies here; `minimal`, in a folder of its own, has slots and schemas and gives no
+advice. A user's own folder may replace either (`wiw.policies.vlm.prompt_import` makes one of a copy of the paper).
 
 Slots of all tasks: `look_ahead_action_num` (actions of a plan) and `plan_num` (number of plans requested). Navigation
 and recognition: `obs_key` (the observation in words) and `actions` (name to meaning). Manipulation: `position_bins`,
@@ -25,6 +27,12 @@ from wiw.vlm import template_worker
 from wiw.vlm.template_filler import TemplateFiller
 
 FOLDER = Path(__file__).parent
+DEFAULT = "default"
+SETS: dict[str, tuple[Path, str]] = {
+    DEFAULT: (FOLDER, "the project's own wording, with advice on how to explore, approach and grasp"),
+    "minimal": (FOLDER / "minimal", "slots and schemas of the answers, and no advice"),
+}
+"""The shipped sets: folder and one line. A template that a set lacks is the default's."""
 SLOTS: dict[str, Any] = {
     "obs_key": "front view",
     "look_ahead_action_num": 5,
@@ -74,24 +82,29 @@ class Prompts:
     """Templates of all tasks: a user's where there are any, else those shipped with the package.
 
     Args:
-        folder: with templates as `<task>/<name>.j2`, named like the shipped ones; None means the shipped ones.
+        source: name of a shipped set (`SETS`), or a folder with templates as `<task>/<name>.j2`, named like the shipped
+            ones; what a folder lacks is the default's.
 
     Raises:
-        PromptError: no such folder, no templates in it, a template under an unknown name, with an unknown slot, or one
-            that cannot be read.
+        PromptError: no such set or folder, no templates in it, a template under an unknown name, with an unknown slot,
+            or one that cannot be read.
     """
 
-    def __init__(self, folder: str | Path | None = None) -> None:
-        self.folder = None if folder is None else Path(folder).expanduser()
-        self._templates = {
-            path.relative_to(FOLDER).as_posix(): (path, _read_source(path)) for path in _list_templates(FOLDER)
-        }
+    def __init__(self, source: str | Path | None = None) -> None:
+        self.source: str | Path = DEFAULT if source is None else source
         self._filling = TemplateFiller()
-        if self.folder is not None:
-            self._templates |= self._load_own(self.folder)
+        self._templates = _read_templates(FOLDER)
+        self._own: frozenset[str] = frozenset()
+        if isinstance(self.source, str) and self.source in SETS:
+            self._templates |= _read_templates(SETS[self.source][0])
+        else:
+            self.source = Path(self.source).expanduser()
+            own = self._load_own(self.source)
+            self._templates |= own
+            self._own = frozenset(own)
 
     def __reduce__(self) -> Any:
-        return Prompts, (self.folder,)
+        return Prompts, (self.source,)
 
     def render(self, task: str, name: str, **slots: Any) -> str:
         """Return a prompt with its slots filled.
@@ -100,11 +113,11 @@ class Prompts:
             ArgumentError: a task without prompts.
             PromptError: a user's template cannot be filled within the limits on time, memory and length.
         """
-        template = self._templates.get(f"{task}/{name}.j2")
-        if template is None:
+        place = f"{task}/{name}.j2"
+        if place not in self._templates:
             raise ArgumentError(f"policy vlm: no prompt '{name}' for task '{task}'; there are some for {list_tasks()}")
-        path, source = template
-        own = self.folder is not None and path.is_relative_to(self.folder)
+        path, source = self._templates[place]
+        own = place in self._own
         text = self._filling.fill(path, source, slots) if own else template_worker.fill_template(source, slots)
         return text.strip()
 
@@ -115,16 +128,23 @@ class Prompts:
         return blake2b("".join(parts).encode(), digest_size=8).hexdigest()
 
     def _load_own(self, folder: Path) -> dict[str, tuple[Path, str]]:
-        found = {path.relative_to(folder).as_posix(): path for path in _list_templates(folder)}
-        if not found:
-            raise PromptError(f"{folder}: expected templates such as {folder / 'ar/planner.j2'}, found none")
-        for name, path in found.items():
+        own = _read_templates(folder)
+        if not own:
+            raise PromptError(
+                f"{folder}: expected one of the sets {', '.join(SETS)}, or a folder with templates such as "
+                f"{folder / 'ar/planner.j2'}; found none"
+            )
+        for name, (path, source) in own.items():
             if name not in self._templates:
                 raise PromptError(f"{path}: no prompt has this name; there are {', '.join(sorted(self._templates))}")
-        own = {name: (path, _read_source(path)) for name, path in found.items()}
-        for path, source in own.values():  # tried on, so that what is wrong is known before the first question
+            # tried on, so that what is wrong is known before the first question
             self._filling.fill(path, source, get_slots(path.parent.name), check=True)
         return own
+
+
+def _read_templates(folder: Path) -> dict[str, tuple[Path, str]]:
+    """Return path and source of each template of a folder, by `<task>/<name>.j2`."""
+    return {path.relative_to(folder).as_posix(): (path, _read_source(path)) for path in _list_templates(folder)}
 
 
 def _list_templates(folder: Path) -> list[Path]:

@@ -75,6 +75,7 @@ class QuestionVLM(VLM):
     frames = FrameSpec("panorama", (432, 768), ends=True)
     tasks = ("aeqa",)
     tracks = False
+    shows_front = False
 
     def __init__(
         self,
@@ -248,7 +249,8 @@ class QuestionVLM(VLM):
         assert memory.sight is not None
         parts.append(self._render_prompt(situation, "output_imagined", memory.horizon))
         schema = commands.command_schema(commands.list_marks(memory.sight.marked), answers=False)
-        return Request((user(*parts),), schema=schema, max_tokens=MAX_PLAN_TOKENS, **options)
+        options |= {"max_tokens": MAX_PLAN_TOKENS, "temperature": self.revision_temperature}
+        return Request((user(*parts),), schema=schema, **options)
 
     def _read_revision(self, situation: Situation, replies: Sequence[Reply]) -> list[Command]:
         """Return the command that a revision has written, if it was asked for one."""

@@ -167,7 +167,9 @@ class ActionConditioned(WorldModel):
 
     def __reduce__(self) -> Any:
         """Pickle the options: another process loads the weights itself."""
-        return partial(type(self), checkpoint=self.checkpoint, **self.generator.options), ()
+        own = inspect.signature(type(self)).parameters
+        options = {name: value for name, value in self.generator.options.items() if name in own}
+        return partial(type(self), checkpoint=self.checkpoint, **options), ()
 
 
 def _extend_signature(cls: type[ActionConditioned]) -> inspect.Signature:
@@ -175,7 +177,9 @@ def _extend_signature(cls: type[ActionConditioned]) -> inspect.Signature:
     signature = inspect.signature(cls.generator_class)
     defaults = {"weights": "", "size": None, "frames": cls.accepts.frames, **cls.defaults}
     options = [
-        option.replace(default=defaults.get(name, option.default)) for name, option in signature.parameters.items()
+        option.replace(default=defaults.get(name, option.default))
+        for name, option in signature.parameters.items()
+        if name not in cls.generator_class.wording_options
     ]
     checkpoint = inspect.Parameter("checkpoint", inspect.Parameter.KEYWORD_ONLY, annotation="str")
     return signature.replace(parameters=[checkpoint, *options])

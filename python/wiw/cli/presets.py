@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a preset sets and where it departs from the paper, as lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from wiw.tasks.presets import DEFAULT, Preset, load_preset
+
+
+def list_settings(task: str, preset: str | Path) -> list[str]:
+    """Return what a preset sets otherwise than the default: a line for rules, and one for each policy and model."""
+    ours, base = load_preset(task, preset), load_preset(task, DEFAULT)
+    rules = _list_changes(ours.rules, base.rules)
+    parts = [
+        f"{name}: {changes}"
+        for kind in ("policies", "models")
+        for name, options in getattr(ours, kind).items()
+        if (changes := _list_changes(options, getattr(base, kind).get(name, {})))
+    ]
+    return [*([f"rules: {rules}"] if rules else []), *parts]
+
+
+def list_reasons(task: str, preset: str | Path) -> Iterator[str]:
+    """Yield where a preset departs from the paper, a line each, with whom that concerns and the reason."""
+    ours, paper = load_preset(task, preset), load_preset(task, "paper")
+    for who, reasons in ours.departures.items():
+        for topic, reason in reasons.items():
+            yield f"{topic}{_show_values(ours, paper, who, topic)}, for {who}: {reason}"
+
+
+def _show_values(ours: Preset, paper: Preset, who: str, topic: str) -> str:
+    """Return the values of a setting, where a departure is about one."""
+    values = [each.rules if who == "rules" else each.policies.get(who, {}) for each in (ours, paper)]
+    if topic not in values[0]:
+        return ""
+    return f" {values[0][topic]} (paper: {values[1].get(topic, 'open')})"
+
+
+def _list_changes(options: Mapping[str, Any], base: Mapping[str, Any]) -> str:
+    changed = {name: value for name, value in options.items() if name not in base or base[name] != value}
+    return ", ".join(f"{name} {_show(value)}" for name, value in changed.items())
+
+
+def _show(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"'{value.get('prompt', '...')}'"
+    return "(none)" if value == "" else str(value)

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a run departs from the paper's protocol, so that no number is set beside the paper's by mistake."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from wiw.loop.config import AgentConfig
+from wiw.policies.vlm.prompt_import import CARD
+from wiw.registry import POLICIES, WORLD_MODELS
+from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe
+from wiw.tasks import presets
+from wiw.tasks.base import Task
+from wiw.tasks.presets import PAPER, Preset
+
+EPISODES = {
+    "ar": (551, "Matterport3D"),
+    "imagenav": (144, "HM3D"),
+    "aeqa": (184, "HM3D"),
+    "manipulation": (200, "RLBench"),
+}
+"""Episodes of the paper's tasks, and where they take place."""
+POLICY_NAMES = {
+    "ar": ("vlm", "heuristic"),
+    "imagenav": ("vlm", "heuristic"),
+    "aeqa": ("vlm",),
+    "manipulation": ("vlm", "diffuser"),
+}
+"""The paper's base policies."""
+REVISER = "vlm"
+"""The paper's revision policy."""
+UNCOUNTED = (*ELSEWHERE, "model", "prompts", "task", "space")
+"""Options of policy `vlm` that are no part of the protocol, or are looked at by themselves."""
+
+
+@dataclass(frozen=True)
+class Departure:
+    """One thing that differs from the paper's protocol."""
+
+    topic: str
+    found: str = ""
+    """The run's value beside the paper's; empty for what is no setting."""
+    reason: str = ""
+
+    @property
+    def short(self) -> str:
+        """Topic and values."""
+        return f"{self.topic} {self.found}" if self.found else self.topic
+
+    def __str__(self) -> str:
+        return f"{self.short}: {self.reason}" if self.reason else self.short
+
+
+def find_departures(task: Task, agents: Mapping[str, Any]) -> tuple[Departure, ...]:
+    """Return where a run of these agents departs from the paper; nothing for a task that is none of the paper's.
+
+    Args:
+        task: as built.
+        agents: recipes by arm.
+    """
+    if task.name not in EPISODES:
+        return ()
+    recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
+    paper = _load_protocol(task, recipes)
+    found = [*_compare_rules(task, paper), *_compare_episodes(task)]
+    found += [Departure("agent", "of another method")] if len(recipes) < len(agents) else []
+    for recipe in recipes:
+        found += [*_compare_agent(task, recipe), *_compare_vlm(task, recipe, paper)]
+    settings = {*paper.rules, *_get_vlm_defaults()}  # a reason for one counts where its value is another
+    for who in _list_concerned(recipes):
+        own = task.departures.get(who, {})
+        found += [Departure(topic, "", why) for topic, why in own.items() if topic not in settings]
+    return tuple(dict.fromkeys(found))
+
+
+def describe_departures(task: Task, agents: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return the departures for a run's manifest."""
+    return [asdict(departure) for departure in find_departures(task, agents)]
+
+
+def read_departures(manifest: Mapping[str, Any]) -> tuple[Departure, ...]:
+    """Return the departures that a run's manifest names; none for a run from before they were recorded."""
+    return tuple(Departure(**each) for each in manifest.get("departures", ()))
+
+
+def _load_protocol(task: Task, recipes: list[AgentRecipe]) -> Preset:
+    """Return the paper's preset of a task; it has one of its own for the diffusion policy."""
+    owner, diffusion = presets.find_owner(type(task)), f"{PAPER}-diffusion"
+    diffuses = any(recipe.policy == "diffuser" for recipe in recipes) and diffusion in presets.list_presets(owner)
+    return presets.load_preset(owner, diffusion if diffuses else PAPER)
+
+
+def _get_vlm_defaults() -> dict[str, Any]:
+    return {name: each.default for name, each in inspect.signature(POLICIES.find("vlm")).parameters.items()}
+
+
+def _list_concerned(recipes: list[AgentRecipe]) -> Iterator[str]:
+    """Yield whom of `presets.CONCERNS` these agents are."""
+    yield "rules"
+    if any(_asks_vlm(recipe) for recipe in recipes):
+        yield "vlm"
+    models = [recipe.model for recipe in recipes if recipe.model is not None and recipe.model not in REFERENCES]
+    if models:
+        yield "models"
+    if any(_is_told_words(model) for model in models):
+        yield "text models"
+
+
+def _is_told_words(model: Any) -> bool:
+    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
+    return bool(getattr(getattr(found, "accepts", None), "control", "") == "text")
+
+
+def _asks_vlm(recipe: AgentRecipe) -> bool:
+    return "vlm" in (recipe.policy, recipe.reviser)
+
+
+def _compare_rules(task: Task, paper: Preset) -> Iterator[Departure]:
+    said, reasons = task.describe(), task.departures.get("rules", {})
+    for name, value in paper.rules.items():
+        if said.get(name) != value:
+            yield _differ(name, said.get(name), value, reasons)
+
+
+def _compare_episodes(task: Task) -> Iterator[Departure]:
+    count, place = EPISODES[task.name]
+    file, scenes = task.describe().get("episode_file"), task.describe().get("scenes")
+    if task.name == "manipulation":
+        return
+    if file is None:
+        yield Departure("episodes", f"generated in {scenes} (paper: {count} of {place})")
+    elif task.default_episodes != count:
+        yield Departure("episodes", f"{task.default_episodes} of {Path(file).name} (paper: {count} of {place})")
+
+
+def _compare_agent(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
+    ours, theirs = (config.resolve(task.defaults).complete().describe() for config in (recipe.config, AgentConfig()))
+    for name, value in theirs.items():
+        if ours.get(name) != value and not (name == "width" and ours["depth"] == 1):
+            yield _differ(name, ours.get(name), value, {})
+    names = POLICY_NAMES[task.name]
+    policy = recipe.policy if isinstance(recipe.policy, str) else type(recipe.policy).__name__
+    if policy not in names:
+        yield Departure("policy", f"{policy} (paper: {', '.join(names)})")
+    elif recipe.model is not None and (recipe.reviser or policy) != REVISER:
+        yield Departure("revision", f"{recipe.reviser or task.defaults.get('revision', policy)} (paper: {REVISER})")
+
+
+def _compare_vlm(task: Task, recipe: AgentRecipe, paper: Preset) -> Iterator[Departure]:
+    """Yield the options of policy `vlm` that are others than the paper's, or than their defaults where it is silent."""
+    if not _asks_vlm(recipe):
+        return
+    ours, reasons = recipe.resolve_policy_options("vlm", task), task.departures.get("vlm", {})
+    ours |= {"tracker": recipe.tracker} if recipe.tracker else {}
+    defaults = _get_vlm_defaults()
+    theirs = {**defaults, **paper.policies.get("vlm", {})}
+    for name in dict.fromkeys([*paper.policies.get("vlm", {}), *ours]):
+        if name not in UNCOUNTED and (value := ours.get(name, defaults.get(name))) != theirs.get(name):
+            yield _differ(name, value, theirs.get(name), reasons)
+    yield from _compare_prompts(ours.get("prompts"), reasons.get("prompts", ""))
+
+
+def _compare_prompts(prompts: Any, reason: str) -> Iterator[Departure]:
+    if prompts is not None and (Path(prompts) / CARD).is_file():
+        return
+    yield Departure("prompts", f"{prompts or 'default'} (paper: its own)", reason)
+
+
+def _differ(topic: str, ours: Any, theirs: Any, reasons: Mapping[str, str]) -> Departure:
+    found = "open" if ours is None else ours
+    return Departure(topic, f"{found} (paper: {theirs})", reasons.get(topic, ""))

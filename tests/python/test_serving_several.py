@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several servers of one model answer as one would, whichever of them are there."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import wiw
+from wiw.errors import ArgumentError, ContractError, RemoteError
+from wiw.runs.arm_text import split_arms
+from wiw.runs.recipes import AgentRecipe
+from wiw.serving.background import serve_in_background
+from wiw.types import Conditioning, Control
+from wiw.world_models.base import answer_deadline
+from wiw.world_models.remote import links
+from wiw.world_models.remote.model import Remote
+
+SIZE = (8, 16)
+
+
+class Counting(wiw.WorldModel):
+    """Frames are a function of image and seed; counts its rows and may wait at a gate."""
+
+    accepts = wiw.accepts("trajectory", size=SIZE, best_batch=4)
+
+    def __init__(self, name: str = "counting 1", gate: threading.Event | None = None) -> None:
+        self.name, self.gate, self.rows, self.begun = name, gate, 0, threading.Event()
+
+    def rollout(self, observations: Conditioning, controls: Any, seeds: Any) -> Any:
+        self.begun.set()
+        if self.gate is not None:
+            self.gate.wait(20)
+        self.rows += len(controls)
+        frames = np.repeat(observations.image[:, None], len(controls[0].actions) + 1, 1)
+        frames[:, 1:] += (seeds % np.uint64(97)).astype(np.uint8)[:, None, None, None, None]
+        return frames
+
+    def fingerprint(self) -> str:
+        return self.name
+
+
+def make_rows(count: int) -> tuple[Conditioning, list[Control], Any]:
+    image = np.broadcast_to(np.arange(count, dtype=np.uint8)[:, None, None, None], (count, *SIZE, 3)).copy()
+    control = Control(np.ones(2, np.int8), np.zeros((2, 3)), np.tile(np.eye(4), (2, 1, 1)), length=2)
+    return Conditioning(image), [control] * count, np.arange(count, dtype=np.uint64)
+
+
+@contextlib.contextmanager
+def serve(*models: wiw.WorldModel) -> Iterator[tuple[Remote, list[Any]]]:
+    with contextlib.ExitStack() as stack:
+        servers = [stack.enter_context(serve_in_background(model)) for model in models]
+        client = Remote(",".join(server.address for server in servers))
+        stack.callback(client.close)
+        yield client, servers
+
+
+def test_rows_are_spread_and_answered_as_by_one() -> None:
+    models, given = [Counting(), Counting(), Counting()], make_rows(50)
+    with serve(*models) as (client, _):
+        np.testing.assert_array_equal(client.rollout(*given), Counting().rollout(*given))
+        assert client.accepts.best_batch >= 3 * Counting.accepts.best_batch
+        assert client.fingerprint() == "counting 1"
+    assert min(model.rows for model in models) >= 4, "each has had its share"
+    assert sum(model.rows for model in models) == 50, "and no row is computed twice"
+
+
+class Relay:
+    """A port that leads to a server until it is cut, as by a machine that dies at its work."""
+
+    def __init__(self, address: str) -> None:
+        self._target = int(address.rpartition(":")[2])
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self._open = [self._listening]
+        self.address = f"ws://127.0.0.1:{self._listening.getsockname()[1]}"
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def _accept(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                near, _ = self._listening.accept()
+                far = socket.create_connection(("127.0.0.1", self._target))
+                self._open += [near, far]
+                for pair in ((near, far), (far, near)):
+                    threading.Thread(target=self._pump, args=pair, daemon=True).start()
+
+    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := source.recv(1 << 16):
+                sink.sendall(data)
+
+    def cut(self) -> None:
+        for each in self._open:
+            with contextlib.suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+            each.close()
+
+
+def test_a_server_that_dies_at_its_work_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "LOST", 0.3)
+    gate, given = threading.Event(), make_rows(12)
+    staying, dying = Counting(), Counting(gate=gate)
+    found: list[Any] = []
+    with serve_in_background(staying) as first, serve_in_background(dying) as second:
+        relay = Relay(second.address)
+        client = Remote(f"{first.address},{relay.address}")
+        asking = threading.Thread(target=lambda: found.append(client.rollout(*given)))
+        asking.start()
+        assert dying.begun.wait(10)
+        relay.cut()
+        asking.join(20)
+        np.testing.assert_array_equal(found[0], Counting().rollout(*given))
+        assert staying.rows == 12 and dying.rows == 0, "its rows went to the other"
+        more = make_rows(20)
+        began = time.monotonic()
+        np.testing.assert_array_equal(client.rollout(*more), Counting().rollout(*more))
+        assert time.monotonic() - began < 5, "the one that is gone is not waited for"
+        client.close()
+        gate.set()
+
+
+def test_another_model_is_refused_at_the_start() -> None:
+    other = r"serves another model than ws://.*fingerprint other, expected counting 1"
+    with pytest.raises(RemoteError, match=other), serve(Counting(), Counting("other")):
+        pass
+    nameless = "several servers are used only for a model that can be told from another"
+    with pytest.raises(RemoteError, match=nameless), serve(Counting(""), Counting("")):
+        pass
+
+
+def test_without_any_server_the_call_ends_at_its_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(links, "LOST", 0.2)
+    with serve_in_background(Counting()) as one, serve_in_background(Counting()) as other:
+        client = Remote(f"{one.address},{other.address}")
+    with answer_deadline(1.0), pytest.raises(RemoteError, match="no server could be reached in time: ws://"):
+        client.rollout(*make_rows(4))
+    client.close()
+
+
+def test_a_breach_of_the_contract_is_told_as_by_one() -> None:
+    class Wrong(Counting):
+        def rollout(self, observations: Any, controls: Any, seeds: Any) -> Any:
+            return np.zeros((len(controls), 1, 2, 2, 3), np.uint8)
+
+    with serve(Wrong(), Wrong()) as (client, _), pytest.raises(ContractError):
+        client.rollout(*make_rows(8))
+
+
+def test_addresses_are_checked() -> None:
+    with pytest.raises(ArgumentError, match="expected different addresses"):
+        Remote("ws://127.0.0.1:1,ws://127.0.0.1:1")
+    with pytest.raises(ArgumentError, match="expected an address such as ws://"):
+        Remote("ws://127.0.0.1:1,gpu-b")
+
+
+def test_several_servers_are_one_arm() -> None:
+    text = "remote:ws://a:1,ws://b:2"
+    assert split_arms(f"none,{text},copy") == ["none", text, "copy"]
+    assert split_arms("a=warpnet?size=[4, 8],wss") == ["a=warpnet?size=[4, 8]", "wss"]
+    assert AgentRecipe("matcher", text).arm == "remote:a:1;b:2"
+    assert AgentRecipe("matcher", "remote:ws://a:1").arm == "remote:a:1"
