@@ -41,6 +41,7 @@ __all__ = [
     "load_run",
     "make",
     "make_vec",
+    "merge",
     "metrics",
     "nav",
     "panorama",
@@ -78,6 +79,7 @@ _HOME = {
     "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
     "make_vec": "wiw.registry",
+    "merge": "wiw.runs.merge",
     "policy": "wiw.registry",
     "power": "wiw.analysis.power",
     "quality": "wiw.studies.quality",
@@ -135,6 +137,7 @@ if TYPE_CHECKING:
     from wiw.loop.agent import Agent
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
+    from wiw.runs.merge import merge
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare

@@ -23,6 +23,7 @@ from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
 from wiw.cli.judge import judge
+from wiw.cli.merge import merge
 from wiw.cli.names import list_names
 from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
@@ -64,6 +65,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
+    (merge, "merge", "Merge the shards of a run, run on several machines, into one run."),
     (blame, "blame", "Find the stage that causes a run's failures."),
     (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),

@@ -16,6 +16,7 @@ from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import ResumeConfig, RunConfig
+from wiw.runs.shards import Shard
 
 AGENT, TASK, SEARCH, SETTINGS, UNCHANGED = AgentFlags(), TaskFlags(), AgentConfig(), RunConfig(), ResumeConfig()
 """What holds where the command line says nothing."""
@@ -43,6 +44,7 @@ def run(
     $ wiw run imagenav --episode-file val.json.gz --scene-folder scans
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
+    $ wiw run imagenav --arms none,warp --episodes 400 --shard 3/8 --out runs/a/3 --resume
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
@@ -54,7 +56,7 @@ def run(
             other plans, or from elsewhere; placebo-shuffled:MODEL names another. NAME=MODEL?KEY=VALUE names an arm and
             gives its model options, several with & between them (in quotes), besides those of --world-model-option.
         rules: What it is run on.
-        report: Whether to write report.html at the end.
+        report: Whether to write report.html at the end; none of a shard.
         search: Numbers of the search.
         config: How the run goes.
     """
@@ -67,6 +69,8 @@ def run(
     policies = [parse_arm(name).model.partition("+")[0] for name in names or []]
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search, policies)
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
+    if config.out is None and config.shard is not None:
+        folder = folder / Shard.parse(config.shard).folder
     settings = replace(config, seed=seed, out=folder)
     announce(recipe.build(), arm_recipes(agent, names), settings)
     from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
@@ -80,6 +84,7 @@ def resume(
     *,
     workers: MaybeCount = None,
     retry_errors: bool = False,
+    scratch: Annotated[Path | None, arg(metavar="DIR")] = None,
     report: bool = True,
     config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
 ) -> int:
@@ -94,13 +99,15 @@ def resume(
         run: The run's folder.
         workers: Processes; as many as it was begun with if not given.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
+        scratch: Folder on a local disk, such as /tmp, where the store is written while the run goes on; needed where
+            the run's folder is on a network file system.
         report: Whether to write report.html at the end.
         config: What may change.
     """
     from wiw.studies.evaluate import resume_run
 
-    changes = config.to_json()
-    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors, **changes), run), report)
+    again = {"retry_errors": retry_errors, "scratch": scratch, **config.to_json()}
+    return finish(stoppable(lambda: resume_run(run, workers, **again), run), report)
 
 
 def finish(log: Any, report: bool, remark: str = "") -> int:
@@ -120,7 +127,9 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
         )
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
-    if report:
+    if log.store.shard is not None:
+        print(f"shard   {log.store.shard}; merge all of them with `wiw merge`")
+    elif report:
         print(f"report  {log.report(remark=remark)}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0

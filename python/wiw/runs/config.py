@@ -12,6 +12,7 @@ from tyro.conf import arg
 
 from wiw.errors import ArgumentError
 from wiw.loop.limits import Limits
+from wiw.runs.shards import Shard
 from wiw.types import check_seed
 
 
@@ -38,8 +39,13 @@ class RunConfig(Limits):
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
     """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
     0.2 MB per decision."""
+    shard: Annotated[str | None, arg(metavar="I/N")] = None
+    """Part I of N of the episodes, in a store of its own; `wiw merge` makes one run of the stores of all parts."""
+    scratch: Annotated[Path | str | None, arg(metavar="DIR")] = None
+    """Folder on a local disk, such as /tmp, where the store is written while the run goes on; it is copied to --out
+    every minute and at the end. Needed where --out is on a network file system."""
     resume: bool = False
-    """Whether to resume the run in `out`."""
+    """Whether to resume the run in `out`, if one is there."""
     progress: bool = True
     """Whether to show progress bars."""
 
@@ -51,6 +57,8 @@ class RunConfig(Limits):
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
         if self.seed is not None:
             check_seed(self.seed)
+        if self.shard is not None:
+            Shard.parse(self.shard)
 
     def count_pictured(self, episodes: int) -> int:
         """Return how many of a run's episodes keep pictures."""

@@ -96,17 +96,28 @@ def run_pending(
     )
     board = make_board(progress and any(pending.values()))
     try:
+        if any(pending.values()):
+            store.begin_session()
         for arm, indices in pending.items():
             store.discard(arm, indices)
         built = task.build()
         writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
         _run_jobs(spec, episodes, pending, writer, workers)
-        drop_spare_pictures(store)
-        draw_scene_maps(store, built)
-        film_episodes(store, built)
+        if store.shard is None:
+            choose_pictures(store, built)
     finally:
         board.close()
         store.close()
+
+
+def choose_pictures(store: RunStore, task: Any) -> None:
+    """Keep the pictures of the episodes that tell most, and draw their scenes and films.
+
+    Of a shard's store they are chosen once it is merged, among the episodes of all.
+    """
+    drop_spare_pictures(store)
+    draw_scene_maps(store, task)
+    film_episodes(store, task)
 
 
 def _count_ended(store: RunStore, pending: Mapping[str, list[int]]) -> dict[str, ArmProgress]:
