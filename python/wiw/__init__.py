@@ -55,6 +55,7 @@ __all__ = [
     "scale",
     "scenes",
     "show",
+    "status",
     "types",
     "verify",
     "world_model",
@@ -85,6 +86,7 @@ _HOME = {
     "quality": "wiw.studies.quality",
     "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
+    "status": "wiw.runs.status",
     "verify": "wiw.runs.verify",
     "world_model": "wiw.registry",
 }
@@ -138,6 +140,7 @@ if TYPE_CHECKING:
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
     from wiw.runs.merge import merge
+    from wiw.runs.status import status
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare

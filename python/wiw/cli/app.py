@@ -34,6 +34,7 @@ from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
+from wiw.cli.status import status
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
@@ -65,6 +66,7 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
+    (status, "status", "Show how far runs are, while they are being run or after."),
     (merge, "merge", "Merge the shards of a run, run on several machines, into one run."),
     (blame, "blame", "Find the stage that causes a run's failures."),
     (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),

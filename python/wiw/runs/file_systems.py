@@ -13,12 +13,11 @@ from pathlib import Path
 MOUNTS = Path("/proc/self/mountinfo")
 """Mounted file systems, as Linux lists them; see proc(5)."""
 NETWORK = frozenset(
-    ("afs", "beegfs", "ceph", "cifs", "davfs", "fhgfs", "glusterfs", "gpfs", "lustre", "ncpfs", "nfs", "nfs4", "ocfs2")
-    + ("orangefs", "panfs", "pvfs2", "smb3", "smbfs", "wekafs")
-    + tuple(
-        f"fuse.{name}"
-        for name in ("beegfs", "ceph", "ceph-fuse", "gcsfuse", "glusterfs", "goofys", "juicefs", "mount-s3", "rclone")
-        + ("s3fs", "sshfs")
+    (
+        *("afs", "beegfs", "ceph", "cifs", "davfs", "fhgfs", "glusterfs", "gpfs", "lustre", "ncpfs", "nfs", "nfs4"),
+        *("ocfs2", "orangefs", "panfs", "pvfs2", "smb3", "smbfs", "wekafs"),
+        *("fuse.beegfs", "fuse.ceph", "fuse.ceph-fuse", "fuse.gcsfuse", "fuse.glusterfs", "fuse.goofys"),
+        *("fuse.juicefs", "fuse.mount-s3", "fuse.rclone", "fuse.s3fs", "fuse.sshfs"),
     )
 )
 """Types of file systems that several machines may write."""

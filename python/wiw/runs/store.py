@@ -10,8 +10,6 @@ from __future__ import annotations
 import fcntl
 import json
 import math
-import os
-import platform
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -26,6 +24,7 @@ from wiw.runs.faults import explain_faults, find_remedy
 from wiw.runs.file_systems import find_network
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
+from wiw.runs.processes import describe_process
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
 from wiw.runs.scratch import ScratchCopy
 from wiw.runs.shapes import check_decision, check_types, parse_column
@@ -357,6 +356,11 @@ class RunStore:
             for row in named
         ]
 
+    def count_ended(self) -> tuple[int, int]:
+        """Return how many episodes of all arms have ended, and how many of these with an error."""
+        (counted,) = self._rows("SELECT count(*) AS n, coalesce(sum(status = 'error'), 0) AS errors FROM outcome")
+        return counted["n"], counted["errors"]
+
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Return the decisions of ended episodes in order, of all or of one arm or episode."""
         rows = self._rows(
@@ -526,8 +530,7 @@ class RunStore:
 
     def begin_session(self) -> None:
         """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""
-        (ended,) = self._rows("SELECT count(*) AS n FROM outcome")
-        session = {"begun": _now(), "host": platform.node(), "process": os.getpid(), "ended": ended["n"]}
+        session = {"begun": _now(), "ended": self.count_ended()[0], **describe_process()}
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "session": session}),))
         if self._copy is not None:
