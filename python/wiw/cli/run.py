@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -17,6 +17,9 @@ from wiw.cli.terminal import printable
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import ResumeConfig, RunConfig
 from wiw.runs.shards import Shard
+
+if TYPE_CHECKING:
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe
 
 AGENT, TASK, SEARCH, SETTINGS, UNCHANGED = AgentFlags(), TaskFlags(), AgentConfig(), RunConfig(), ResumeConfig()
 """What holds where the command line says nothing."""
@@ -60,6 +63,35 @@ def run(
         search: Numbers of the search.
         config: How the run goes.
     """
+    made = prepare_run(task, parts, arms, rules, search, config)
+    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
+
+    folder = Path(made.settings.out or "")
+    work = lambda: evaluate(made.task, made.agent, arms=made.arms, config=made.settings)  # noqa: E731
+    return finish(stoppable(work, folder), report)
+
+
+@dataclass(frozen=True)
+class PreparedRun:
+    """A run as its flags describe it."""
+
+    task: TaskRecipe
+    agent: AgentRecipe
+    arms: list[str] | None
+    settings: RunConfig
+    """With seed and folder."""
+    count: int
+    """Episodes."""
+
+
+def prepare_run(
+    task: str, parts: AgentFlags, arms: str | None, rules: TaskFlags, search: AgentConfig, config: RunConfig
+) -> PreparedRun:
+    """Check the flags of a run, announce it, and return what they describe.
+
+    Raises:
+        Error: a part that is not known or does not fit, or a setting out of range.
+    """
     from wiw.cli.announcement import announce
     from wiw.runs.arm_text import parse_arm
     from wiw.runs.recipes import arm_recipes
@@ -71,11 +103,10 @@ def run(
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
     if config.out is None and config.shard is not None:
         folder = folder / Shard.parse(config.shard).folder
-    settings = replace(config, seed=seed, out=folder)
-    announce(recipe.build(), arm_recipes(agent, names), settings)
-    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
-
-    return finish(stoppable(lambda: evaluate(recipe, agent, arms=names, config=settings), folder), report)
+    settings, built = replace(config, seed=seed, out=folder), recipe.build()
+    announce(built, arm_recipes(agent, names), settings)
+    count = built.default_episodes if config.episodes is None else config.episodes
+    return PreparedRun(recipe, agent, names, settings, count)
 
 
 def resume(

@@ -82,7 +82,7 @@ async def _live(server: Any, name: str) -> None:
         else:
             serving.cancel()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR2):
         loop.add_signal_handler(number, stop)
     showing = asyncio.ensure_future(_show(server, name, ready))
     try:

@@ -43,7 +43,8 @@ class RunConfig(Limits):
     """Part I of N of the episodes, in a store of its own; `wiw merge` makes one run of the stores of all parts."""
     scratch: Annotated[Path | str | None, arg(metavar="DIR")] = None
     """Folder on a local disk, such as /tmp, where the store is written while the run goes on; it is copied to --out
-    every minute and at the end. Needed where --out is on a network file system."""
+    every minute and at the end. Needed where --out is on a network file system. auto: the system's own for temporary
+    files, or the job's."""
     resume: bool = False
     """Whether to resume the run in `out`, if one is there."""
     progress: bool = True

@@ -20,6 +20,7 @@ from wiw.registry import POLICIES, TASKS, WORLD_MODELS
 from wiw.runs.execute import choose_pictures, recipes_of
 from wiw.runs.rows import to_json
 from wiw.runs.run import find_stores
+from wiw.runs.scratch import find_local_folder
 from wiw.runs.store import RunStore
 from wiw.runs.verify import list_differences, read_facts
 from wiw.world_models.base import Requirements
@@ -91,7 +92,8 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         parts = [stack.enter_context(RunStore.read(folder)) for folder in find_stores(stores)]
         require_equal_manifests(parts)
         takes, repeated, unlike = _choose_sources(parts)
-        local = scratch or stack.enter_context(tempfile.TemporaryDirectory(prefix="wiw-merge-"))
+        own = scratch or find_local_folder()
+        local = stack.enter_context(tempfile.TemporaryDirectory(prefix="wiw-merge-", dir=own))
         created = min(part.created for part in parts)
         target = RunStore.create(out, parts[0].config, _merge_info(parts), parts[0].episodes(), local, created)
         try:

@@ -8,8 +8,10 @@ absent, and needs no log beside it, so it can be read anywhere.
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import tempfile
 import time
 from contextlib import closing, suppress
 from hashlib import blake2b
@@ -26,6 +28,7 @@ class ScratchCopy:
 
     def __init__(self, home: Path, scratch: Path) -> None:
         own = home.expanduser().resolve()
+        scratch = find_local_folder() if str(scratch) == "auto" else scratch
         digest = blake2b(str(own).encode(), digest_size=6).hexdigest()
         self.home = home
         self.path = scratch.expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
@@ -82,6 +85,11 @@ class ScratchCopy:
         except sqlite3.DatabaseError:  # cut off while it was fetched
             return False
         return begun_here == begun and ended_here > ended
+
+
+def find_local_folder() -> Path:
+    """Return where temporary files belong: the folder of the SLURM job where the cluster makes one, else $TMPDIR."""
+    return Path(os.environ.get("SLURM_TMPDIR") or tempfile.gettempdir())
 
 
 def write_whole(connection: sqlite3.Connection, path: Path) -> None:

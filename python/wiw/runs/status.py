@@ -80,7 +80,7 @@ class RunStatus:
         return None if self.missing or len(known) < len(left) else max(known, default=0.0)
 
     def __str__(self) -> str:
-        rows = [("shard", "episodes", "errors", "state", "last write", "left", "store")]
+        rows: list[tuple[str, ...]] = [("shard", "episodes", "errors", "state", "last write", "left", "store")]
         rows += [_format_row(store) for store in self.stores]
         left = _format_seconds(self.seconds_left)
         share = 100 * self.ended / max(1, self.total)

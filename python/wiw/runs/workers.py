@@ -282,7 +282,8 @@ def _run_worker(pipe: Connection) -> None:
 
     It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    for number in (signal.SIGINT, signal.SIGUSR2):  # reach the whole group, or all of a job; the parent decides
+        signal.signal(number, signal.SIG_IGN)
     try:
         _serve(pipe)
     except (EOFError, BrokenPipeError):
