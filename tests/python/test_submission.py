@@ -174,6 +174,34 @@ def test_without_slurm_or_submitit_it_is_said(tmp_path, monkeypatch):
         read_jobs(tmp_path)
 
 
+def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
+    out = tmp_path / "run"
+    (tmp_path / "short.yaml").write_text("base: paper\ndecisions: 1\n")
+    asked = ["imagenav", "--scenes", two_rooms, "--preset", tmp_path / "short.yaml", "--policy", "heuristic"]
+    asked += ["--revision", "matcher", "--episodes", 2, "--candidates", 1, "--world-model", "warp", "--backend", "cpu"]
+    asked += ["--arms", "none,warp"]
+    jobs = ["--shards", 1, "--servers", 1, "--server-gpus", 0, "--cluster", "local", "--out", out]
+    assert main(["submit", *map(str, [*asked, *jobs])]) == 0
+    lines = [shlex.split(line)[1:] for line in capsys.readouterr().out.splitlines() if line.startswith("wiw ")]
+    assert [line[0] for line in lines] == ["serve", "run"]
+    file = out / "servers/1.json"
+    wait_for(file.exists)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600 and json.loads(file.read_text())["token"]
+    wait_for(lambda: [job.state for job in find_states(out)] == ["RUNNING", "ENDED"], 120)
+    assert main(["run", *map(str, asked), "--out", str(tmp_path / "whole"), "--no-report"]) == 0
+    assert wiw.merge([out], out).complete, logs(out)
+    one, other = load_run(out), load_run(tmp_path / "whole")
+    assert one.arms == other.arms == ["none", "warp"]
+    assert one.store.config["arms"][1]["agent"]["model"] == f"remote:{file.parent}"
+    assert [row["scores"] for row in one.decisions] == [row["scores"] for row in other.decisions]
+    assert main(["submit", *map(str, [*asked, *jobs])]) == 0  # nothing is left, though a server is there
+    assert len(cancel(out)) == 1
+    wait_for(ended(out))
+    assert not file.exists()
+    with pytest.raises(ArgumentError, match="--servers serve --world-model"):
+        submit(tmp_path / "other", "--servers", 1, "--debug")
+
+
 SBATCH = """
 import os, re, subprocess, sys
 script = sys.argv[1]

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg
 
 from wiw.cli.command_line import format_flags
 from wiw.cli.parts import AgentFlags, TaskFlags
-from wiw.cli.run import AGENT, SEARCH, SETTINGS, TASK, prepare_run
+from wiw.cli.run import AGENT, SEARCH, SETTINGS, TASK, PreparedRun, prepare_run
 from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
@@ -20,6 +20,10 @@ from wiw.runs.shards import Shard
 from wiw.runs.submission import ClusterConfig
 
 CLUSTER = ClusterConfig()
+SERVERS = "servers"
+"""Folder in that of the run in which servers announce themselves."""
+IDLE = "1800"
+"""Seconds without a client after which a server ends."""
 
 
 def submit(
@@ -27,6 +31,9 @@ def submit(
     /,
     *,
     shards: Annotated[int, arg(metavar="N")] = 8,
+    servers: Annotated[int, arg(metavar="N")] = 0,
+    server_gpus: Annotated[int, arg(metavar="N")] = 1,
+    server_partition: Annotated[str | None, arg(metavar="NAME")] = None,
     jobs: Annotated[ClusterConfig, arg(name="")] = CLUSTER,
     dry_run: bool = False,
     parts: Annotated[AgentFlags, arg(name="")] = AGENT,
@@ -39,6 +46,7 @@ def submit(
 
     $ wiw submit imagenav --arms none,warp --episodes 400 --shards 8 --partition cpu --out runs/a
     $ wiw submit imagenav --world-model svd --shards 4 --partition gpu --gpus 1 --minutes 720 --out runs/b
+    $ wiw submit imagenav --world-model svd --shards 16 --partition cpu --servers 4 --server-partition gpu --out runs/d
     $ wiw submit imagenav --arms none,warp --episodes 8 --shards 2 --cluster local --out runs/c
     $ wiw status runs/a
     $ wiw merge runs/a --out runs/a
@@ -51,6 +59,10 @@ def submit(
     Args:
         task: See `wiw list`.
         shards: Number of parts of the episodes, each a job.
+        servers: Jobs of their own that serve --world-model to all shards; none, and each shard has its own model, if
+            not given. A server ends after half an hour without a client.
+        server_gpus: GPUs of such a job.
+        server_partition: Its SLURM partition; --partition if not given.
         jobs: What a job asks of the cluster.
         dry_run: Whether to print the commands and submit nothing.
         parts: The agent.
@@ -67,14 +79,21 @@ def submit(
     prepared = prepare_run(task, parts, arms, rules, search, config)
     folder, count = Path(prepared.settings.out or ""), prepared.count
     Shard(1, shards).select(count)
+    serving = _write_servers(folder, parts, servers, jobs.cluster)
+    if serving:
+        parts, arms = replace(parts, world_model=_remote(folder), world_model_option=()), _ask_servers(prepared, folder)
     parted = [Shard(number, shards) for number in range(1, shards + 1)]
     commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
-    _require_alone(folder, list(commands.values()))
+    active = _require_alone(folder, [*serving, *commands.values()])
     left = [command for shard, command in commands.items() if not _is_done(folder / shard.folder)]
-    for command in left:
+    absent = [command for command in serving if left and tuple(command) not in active]
+    for command in [*absent, *left]:
         print(shlex.join(["wiw", *command]))
     if left and not dry_run:
-        submitted = submit_commands(folder, left, jobs, f"wiw-{folder.name}")
+        name = f"wiw-{folder.name}"
+        own = replace(jobs, gpus=server_gpus, partition=server_partition or jobs.partition)
+        begun = submit_commands(folder, absent, own, f"{name}-server") if absent else []
+        submitted = submit_commands(folder, left, jobs, name, begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
     print(f"then    wiw status {folder}\n        wiw merge {folder} --out {folder}")
     return 0
@@ -111,11 +130,11 @@ def _write_command(
     return ["run", task, *named, *(part for each in (*flags, own) for part in format_flags(each))]
 
 
-def _require_alone(folder: Path, commands: list[list[str]]) -> None:
-    """Check that a run is submitted as it was before, and that nothing else writes its shards.
+def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ...]]:
+    """Check that a run is submitted as it was before, and that nothing else writes its shards; return active servers.
 
     Raises:
-        ArgumentError: other commands were submitted for it before, or jobs of it still wait or run.
+        ArgumentError: other commands were submitted for it before, or shards of it still wait or run.
     """
     from wiw.runs.submission import find_active, read_jobs
 
@@ -125,11 +144,42 @@ def _require_alone(folder: Path, commands: list[list[str]]) -> None:
             f"submit: {folder} was submitted with other flags, such as: {shlex.join(['wiw', *before[-1]])}; give the "
             "same ones, or another --out"
         )
-    if active := find_active(folder):
+    active = find_active(folder)
+    if shards := [job for job in active if job.arguments[0] == "run"]:
         raise ArgumentError(
-            f"submit: job {active[0].id} of {folder} is {active[0].state}, and {len(active)} in all; wait for them, or "
+            f"submit: job {shards[0].id} of {folder} is {shards[0].state}, and {len(shards)} in all; wait for them, or "
             f"`wiw cancel {folder}` first"
         )
+    return {job.arguments for job in active}
+
+
+def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) -> list[list[str]]:
+    """Return the commands of servers of the world model.
+
+    Raises:
+        ArgumentError: there is no world model.
+    """
+    if count and parts.world_model == "none":
+        raise ArgumentError("submit: --servers serve --world-model, and none is given; name one, or leave them out")
+    options = [part for option in parts.world_model_option for part in ("--world-model-option", option)]
+    listen = ["--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE]
+    return [
+        ["serve", parts.world_model, *options, *listen, "--announce", str(folder / SERVERS / f"{number}.json")]
+        for number in range(1, count + 1)
+    ]
+
+
+def _remote(folder: Path) -> str:
+    return f"remote:{(folder / SERVERS).expanduser().resolve()}"
+
+
+def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
+    """Return the arms of a run with the served model in place of its own, under the same name."""
+    from wiw.runs.arm_text import parse_arm
+
+    own = str(prepared.agent.model)
+    served = f"{prepared.agent.arm}={_remote(folder)}"
+    return ",".join(served if text == own else str(parse_arm(text)) for text in prepared.arms or [own])
 
 
 def _is_done(shard: Path) -> bool:

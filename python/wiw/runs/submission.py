@@ -169,7 +169,11 @@ class SubmittedJob:
 
 
 def submit_commands(
-    run: str | Path, commands: Sequence[Sequence[str]], config: ClusterConfig, name: str = "wiw"
+    run: str | Path,
+    commands: Sequence[Sequence[str]],
+    config: ClusterConfig,
+    name: str = "wiw",
+    after: Sequence[SubmittedJob] = (),
 ) -> list[SubmittedJob]:
     """Submit commands of wiw as one array of jobs, and note them in the run's folder.
 
@@ -178,6 +182,7 @@ def submit_commands(
         commands: arguments of `wiw`, as in ["run", "imagenav", "--shard", "1/8"].
         config: what each job asks for.
         name: of the jobs.
+        after: SLURM jobs that must have begun before any of these does, such as servers.
 
     Raises:
         DependencyError: submitit is not installed.
@@ -188,7 +193,8 @@ def submit_commands(
     try:
         timeouts = {} if config.cluster == "local" else {"slurm_max_num_timeout": config.requeues}
         executor = submitit.AutoExecutor(folder / LOGS, cluster=config.cluster, **timeouts)
-        executor.update_parameters(**config.list_parameters(name))
+        begun = {"slurm_dependency": ":".join(("after", *(job.id for job in after)))} if after else {}
+        executor.update_parameters(**config.list_parameters(name), **(begun if config.cluster == "slurm" else {}))
         with executor.batch():
             made = [executor.submit(JobCommand(arguments)) for arguments in commands]
     except (RuntimeError, OSError, submitit.core.utils.FailedSubmissionError) as error:
