@@ -104,18 +104,18 @@ def run_pending(
         writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
         _run_jobs(spec, episodes, pending, writer, workers)
         if store.shard is None:
-            choose_pictures(store, built)
+            drop_spare_pictures(store)
+            draw_pictures(store, built)
     finally:
         board.close()
         store.close()
 
 
-def choose_pictures(store: RunStore, task: Any) -> None:
-    """Keep the pictures of the episodes that tell most, and draw their scenes and films.
+def draw_pictures(store: RunStore, task: Any) -> None:
+    """Draw scenes and films of the episodes that have pictures.
 
-    Of a shard's store they are chosen once it is merged, among the episodes of all.
+    For a shard that is done once it is merged: these episodes are chosen among those of all shards.
     """
-    drop_spare_pictures(store)
     draw_scene_maps(store, task)
     film_episodes(store, task)
 

@@ -17,7 +17,8 @@ from typing import Any
 
 from wiw.errors import Error, StoreError
 from wiw.registry import POLICIES, TASKS, WORLD_MODELS
-from wiw.runs.execute import choose_pictures, recipes_of
+from wiw.runs.execute import draw_pictures, recipes_of
+from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.rows import to_json
 from wiw.runs.run import find_stores
 from wiw.runs.scratch import find_local_folder
@@ -92,14 +93,16 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         parts = [stack.enter_context(RunStore.read(folder)) for folder in find_stores(stores)]
         require_equal_manifests(parts)
         takes, repeated, unlike = _choose_sources(parts)
-        own = scratch or find_local_folder()
+        own = find_local_folder() if scratch is None else Path(scratch)
+        own.mkdir(parents=True, exist_ok=True)
         local = stack.enter_context(tempfile.TemporaryDirectory(prefix="wiw-merge-", dir=own))
         created = min(part.created for part in parts)
         target = RunStore.create(out, parts[0].config, _merge_info(parts), parts[0].episodes(), local, created)
         try:
             for part, episodes in zip(parts, takes, strict=True):
                 target.take_episodes(part, episodes)
-            undrawn = _choose_pictures(target)
+            drop_spare_pictures(target)
+            undrawn = _draw_pictures(target)
             left = {arm["name"]: len(target.pending(arm["name"])) for arm in target.config["arms"]}
         except BaseException:
             target.abandon()
@@ -226,11 +229,11 @@ def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
     return info
 
 
-def _choose_pictures(store: RunStore) -> str:
-    """Choose pictures and draw maps and films as at the end of a run; return why that cannot be done here."""
+def _draw_pictures(store: RunStore) -> str:
+    """Draw maps and films as at the end of a run; return why that cannot be done here."""
     try:
         task, _ = recipes_of(store)
-        choose_pictures(store, task.build())
+        draw_pictures(store, task.build())
     except Error as error:
         return str(error)
     return ""
