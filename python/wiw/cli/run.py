@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -116,6 +116,8 @@ def resume(
     workers: MaybeCount = None,
     retry_errors: bool = False,
     scratch: Annotated[Path | None, arg(metavar="DIR")] = None,
+    engine: Literal["processes", "ray"] | None = None,
+    address: Annotated[str | None, arg(metavar="ADDRESS")] = None,
     report: bool = True,
     config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
 ) -> int:
@@ -132,12 +134,15 @@ def resume(
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
         scratch: Folder on a local disk, such as /tmp, where the store is written while the run goes on; needed where
             the run's folder is on a network file system.
+        engine: As for `wiw run`; what it was begun with if not given.
+        address: Ray cluster; the one it was begun with if not given.
         report: Whether to write report.html at the end.
         config: What may change.
     """
     from wiw.studies.evaluate import resume_run
 
-    again = {"retry_errors": retry_errors, "scratch": scratch, **config.to_json()}
+    place = {name: value for name, value in (("engine", engine), ("address", address)) if value is not None}
+    again = {"retry_errors": retry_errors, "scratch": scratch, "engine": place, **config.to_json()}
     return finish(stoppable(lambda: resume_run(run, workers, **again), run), report)
 
 

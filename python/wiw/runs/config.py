@@ -17,7 +17,19 @@ from wiw.types import check_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig(Limits):
+class EngineConfig:
+    """What runs the episodes, and where."""
+
+    engine: Literal["processes", "ray"] = "processes"
+    """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
+    address: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Ray cluster, such as auto or HOST:6379; one of this machine alone if not given."""
+    worker_gpus: Annotated[float, arg(metavar="N")] = 0
+    """GPUs of an actor of Ray."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Limits, EngineConfig):
     """How a run goes, whatever agents it compares. All randomness is keyed by (seed, episode, decision, candidate):
     neither `workers` nor `live` changes a result.
 
@@ -58,8 +70,17 @@ class RunConfig(Limits):
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
         if self.seed is not None:
             check_seed(self.seed)
+        if self.worker_gpus < 0:
+            raise ArgumentError(f"evaluate: expected worker_gpus of at least 0, got {self.worker_gpus}")
+        if self.engine != "ray" and (self.address is not None or self.worker_gpus):
+            raise ArgumentError("evaluate: address and worker_gpus are for engine ray: give --engine ray (engine=)")
         if self.shard is not None:
             Shard.parse(self.shard)
+
+    @property
+    def place(self) -> EngineConfig:
+        """What runs the episodes, and where."""
+        return EngineConfig(**{field.name: getattr(self, field.name) for field in fields(EngineConfig)})
 
     def count_pictured(self, episodes: int) -> int:
         """Return how many of a run's episodes keep pictures."""

@@ -14,7 +14,7 @@ from typing import Any
 from wiw.errors import Error, StoreError
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
-from wiw.runs.config import ResumeConfig, RunConfig, read_resume_settings, take_settings
+from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
@@ -92,6 +92,7 @@ def resume_run(
     progress: bool = True,
     retry_errors: bool = False,
     scratch: str | Path | None = None,
+    engine: Mapping[str, Any] | None = None,
     **settings: Any,
 ) -> RunLog:
     """Go on with a run of named parts: only episodes that have not ended are run.
@@ -102,6 +103,7 @@ def resume_run(
         progress: whether to show bars.
         retry_errors: whether to rerun episodes that ended with an infrastructure error.
         scratch: folder on a local disk in which the store is written; see `RunConfig`.
+        engine: values of `EngineConfig` in place of those that the run was begun with, such as {"engine": "processes"}.
         settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
 
     Raises:
@@ -128,7 +130,9 @@ def resume_run(
         raise
     require_left(built, store, agents, retry_errors)
     store.change_settings(changes)
-    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
+    place = EngineConfig(**{**store.info.get("engine", {}), **({} if engine is None else engine)})
+    workers = workers or store.info["workers"]
+    return _finish(store, task, agents, workers, progress, place, retry_errors=retry_errors)
 
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
@@ -171,14 +175,15 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             **({} if settings.shard is None else {"shard": settings.shard}),
             "live": settings.live,
             "workers": settings.workers,
+            "engine": asdict(settings.place),
             "limits": settings.to_json(),
             "command": sys.argv,
             "preparation_seconds": time.perf_counter() - started,
         }
         store = RunStore.create(folder, config, info, episodes, settings.scratch)
         with remove_if_empty(store):
-            return _finish(store, task, agents, settings.workers, settings.progress)
-    return _finish(store, task, agents, settings.workers, settings.progress)
+            return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
+    return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
 
 
 def _take_over(store: RunStore, settings: RunConfig) -> None:
@@ -205,11 +210,12 @@ def _finish(
     agents: Mapping[str, Any],
     workers: int,
     progress: bool,
+    place: EngineConfig,
     *,
     retry_errors: bool = False,
 ) -> RunLog:
     """Run what is missing, close the store and open it for reading."""
     pending = {arm: store.pending(arm, retry_errors) for arm in agents}
     home = store.home
-    run_pending(store, task, agents, pending, workers, progress)
+    run_pending(store, task, agents, pending, workers, progress, place)
     return RunLog(RunStore.read(home))
