@@ -170,7 +170,8 @@ def edit(run, statement):
 def test_an_episode_in_two_stores_counts_once(tmp_path):
     parts = run_shards(tmp_path / "parts", 2)
     shutil.copytree(parts[0], tmp_path / "copy")
-    found = wiw.merge([*parts, tmp_path / "copy"], tmp_path / "merged")
+    found = wiw.merge([*parts, tmp_path / "parts", tmp_path / "copy"], tmp_path / "merged")
+    assert found.stores == 3  # named twice
     assert (found.ended, found.repeated, found.unlike) == (7, 3, ())
     edit(tmp_path / "copy", "UPDATE decision SET note = 'edited' WHERE episode = 1 AND decision = 0")
     found = wiw.merge([*parts, tmp_path / "copy"], tmp_path / "first")
@@ -295,6 +296,11 @@ def test_two_processes_do_not_share_a_scratch_copy(tmp_path):
         pytest.raises(StoreError, match="being written by another process"),
     ):
         RunStore.resume(tmp_path / "run", scratch=local)
+    with (
+        RunStore.resume(tmp_path / "run"),
+        pytest.raises(StoreError, match="being written by another process"),
+    ):
+        RunStore.resume(tmp_path / "run", scratch=local)  # which would be lost when the other one's is closed
 
 
 def test_a_merge_that_is_cut_off_leaves_nothing(tmp_path, monkeypatch):

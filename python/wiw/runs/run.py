@@ -84,12 +84,13 @@ class Run:
 
 
 def find_stores(runs: Sequence[str | Path]) -> list[Path]:
-    """Return the folders with a store: those given, and of folders without one those right inside.
+    """Return the folders with a store, each once: those given, and of folders without one those right inside.
 
     Raises:
         StoreError: neither a folder nor those inside have a store.
     """
-    return [store for run in runs for store in _stores_of(Path(run).expanduser())]
+    found = [store for run in runs for store in _stores_of(Path(run).expanduser())]
+    return list({store.resolve(): store for store in reversed(found)}.values())[::-1]
 
 
 def _stores_of(run: Path) -> Iterator[Path]:

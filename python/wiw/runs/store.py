@@ -12,7 +12,7 @@ import json
 import math
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -105,8 +105,8 @@ class RunStore:
                 f"{store_path(run)} holds a run already; continue it with `wiw resume {store_path(run).parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
             )
-        _make_folder(path)
-        lock = _lock(path)
+        _make_folder(store_path(run))
+        lock = _lock(path) if copy is None else _lock_both(copy)
         if copy is not None:
             copy.discard()
         store = cls(path, _connect(path, lock), lock, copy)
@@ -206,8 +206,7 @@ class RunStore:
     @classmethod
     def _take_in(cls, copy: ScratchCopy) -> RunStore:
         """Open a store for writing on a local disk."""
-        _make_folder(copy.path)
-        lock = _lock(copy.path)
+        lock = _lock_both(copy)
         try:
             with explain_faults(copy.home):
                 copy.take_in()
@@ -608,25 +607,15 @@ class RunStore:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
     def abandon(self) -> None:
-        """Close a store that is written on a local disk, and remove it without copying it to its own folder."""
-        copy, self._copy = self._copy, None
-        self.close()
-        if copy is not None:
-            copy.remove()
+        """Close a new store that is written on a local disk, and remove it without copying it to its own folder."""
+        home = self.home
+        self._end(keep=False)
+        if not home.exists():
+            _remove(home)
 
     def close(self) -> None:
         """Close the file and let others write; a store on a local disk is copied to its own folder, and removed."""
-        copy, self._copy = self._copy, None
-        try:
-            if copy is not None:
-                copy.copy(self._connection)
-        finally:
-            self._connection.close()
-            if self._lock is not None:
-                self._lock.close()
-                self._lock = None
-        if copy is not None:
-            copy.remove()
+        self._end(keep=True)
 
     def __enter__(self) -> RunStore:
         return self
@@ -635,6 +624,20 @@ class RunStore:
         self.close()
 
     # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _end(self, keep: bool) -> None:
+        copy, self._copy = self._copy, None
+        try:
+            if copy is not None and keep:
+                copy.copy(self._connection)
+            self._connection.close()
+            if copy is not None:
+                copy.remove()
+        finally:
+            self._connection.close()
+            if self._lock is not None:
+                self._lock.close()
+                self._lock = None
 
     def _discard_partial(self) -> None:
         with self._writing() as connection:
@@ -703,12 +706,17 @@ def remove_if_empty(begun: RunStore) -> Iterator[None]:
                 "AS n"
             )
             if counted["n"] == 0:
-                for name in ("", "-wal", "-shm"):
-                    path.with_name(path.name + name).unlink(missing_ok=True)
-                path.with_suffix(".lock").unlink(missing_ok=True)
-                with suppress(OSError):  # other files are in it
-                    path.parent.rmdir()
+                _remove(path)
         raise
+
+
+def _remove(path: Path) -> None:
+    """Remove a store, and its folder if nothing else is in it."""
+    for name in ("", "-wal", "-shm"):
+        path.with_name(path.name + name).unlink(missing_ok=True)
+    path.with_suffix(".lock").unlink(missing_ok=True)
+    with suppress(OSError):  # other files are in it
+        path.parent.rmdir()
 
 
 def _make_folder(path: Path) -> None:
@@ -796,6 +804,16 @@ def _lock(path: Path) -> Any:
 def _now() -> str:
     """Return the time, ISO 8601 in UTC."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _lock_both(copy: ScratchCopy) -> ExitStack:
+    """Lock a store on a local disk, and its own file where that is on one too: somebody may write it there."""
+    with ExitStack() as locks:
+        for path in (copy.path, copy.home):
+            if path is copy.path or find_network(path) is None:
+                _make_folder(path)
+                locks.enter_context(_lock(path))
+        return locks.pop_all()
 
 
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:

@@ -30,8 +30,8 @@ from wiw.files import atomic_file
 
 SIGNAL_DELAY = 90
 """Seconds before the time limit at which SLURM sends SIGUSR2."""
-PATIENCE = 30.0
-"""Seconds that a command has for stopping; `wiw run` takes 5 at most."""
+PATIENCE = 45.0
+"""Seconds that a command has for stopping; `wiw run` takes 5 at most, `wiw serve` 30 unless it is told otherwise."""
 FILE_NAME = "jobs.json"
 LOGS = "jobs"
 """Folder in that of the run with submitit's files and the output of jobs."""
