@@ -42,6 +42,7 @@ __all__ = [
     "load_run",
     "make",
     "make_vec",
+    "merge",
     "metrics",
     "nav",
     "panorama",
@@ -55,6 +56,7 @@ __all__ = [
     "scale",
     "scenes",
     "show",
+    "status",
     "types",
     "verify",
     "world_model",
@@ -80,11 +82,13 @@ _HOME = {
     "load_run": "wiw.studies.run_log",
     "make": "wiw.registry",
     "make_vec": "wiw.registry",
+    "merge": "wiw.runs.merge",
     "policy": "wiw.registry",
     "power": "wiw.analysis.power",
     "quality": "wiw.studies.quality",
     "scale": "wiw.studies.scale",
     "show": "wiw.viz.show",
+    "status": "wiw.runs.status",
     "verify": "wiw.runs.verify",
     "world_model": "wiw.registry",
 }
@@ -138,6 +142,8 @@ if TYPE_CHECKING:
     from wiw.metrics.metric import Metric
     from wiw.policies.base import Policy
     from wiw.policies.vlm.prompt_import import import_prompts
+    from wiw.runs.merge import merge
+    from wiw.runs.status import status
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare

@@ -48,7 +48,7 @@ class Victims:
         self._server.wait(20)
 
 
-def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, **_):
+def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, shard=None, scratch=None, **_):
     """Begins a run or goes on with it; names each episode in `reported` once the store has said that it is kept."""
     from fakes import LineAgent, LineTask
 
@@ -66,7 +66,8 @@ def evaluate(out, episodes=EPISODES, reported=None, keep_images=2, **_):
 
         RunStore.write = write_and_tell
     arms = {"none": LineAgent(0.5), "warp": LineAgent(0.8)}
-    run_arms(LineTask(), arms, episodes, out=out, progress=False, resume=True, keep_images=keep_images)
+    place = {"out": out, "shard": shard, "scratch": scratch}
+    run_arms(LineTask(), arms, episodes, **place, progress=False, resume=True, keep_images=keep_images)
 
 
 def report(out, target, **_):

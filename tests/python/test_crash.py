@@ -17,12 +17,13 @@ import numpy as np
 import pytest
 from crash_victims import EPISODES, Victims, evaluate
 
+import wiw
 from wiw.errors import FileError, StoreError
 from wiw.files import atomic_file, atomic_folder
 from wiw.runs.store import RunStore, store_path
 from wiw.studies.run_log import load_run
 
-KILLS_OF_RUNS, KILLS_OF_EXPORTS = 140, 60
+KILLS_OF_RUNS, KILLS_OF_SHARDS, KILLS_OF_EXPORTS = 140, 10, 60
 HERE = Path(__file__).parent
 
 
@@ -83,6 +84,21 @@ def test_runs_killed_at_random_moments_lose_no_ended_episode(victims, reference,
         assert facts(out) == expected
         shutil.rmtree(out, ignore_errors=True)
     assert runs >= KILLS_OF_RUNS / 7
+
+
+def test_shards_killed_at_random_moments_are_merged_into_the_run_of_one_process(victims, reference, tmp_path):
+    """One shard writes in its own folder, the other on a disk of its own that is copied after each episode."""
+    draw, kills, parts = random.Random(2), 0, [{"shard": "1/2"}, {"shard": "2/2", "scratch": str(tmp_path / "disk")}]
+    whole_time = seconds(victims, "evaluate", tmp_path / "warm", **parts[1])
+    for number, part in enumerate(parts):
+        for _ in range(KILLS_OF_SHARDS):
+            kills += (
+                victims.run("evaluate", tmp_path / f"run/{number}", kill_after=draw.uniform(0, whole_time), **part) != 0
+            )
+        assert victims.run("evaluate", tmp_path / f"run/{number}", **part) == 0, victims.said
+    assert kills > KILLS_OF_SHARDS / 2
+    assert wiw.merge([tmp_path / "run"], tmp_path / "merged").complete
+    assert facts(tmp_path / "merged") == facts(reference) and list((tmp_path / "disk").iterdir()) == []
 
 
 def contents(target):

@@ -60,7 +60,7 @@ def rooms(two_rooms: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ROOMS", two_rooms)
 
 
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75)])
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 75), (signal.SIGUSR2, 75)])
 def test_a_run_that_is_stopped_inside_a_model_says_so(tmp_path: Path, sent: int, code: int) -> None:
     process = start_run(tmp_path, "with_opencv()")
     while not (tmp_path / "mark").exists() and process.poll() is None:

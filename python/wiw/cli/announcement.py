@@ -36,6 +36,7 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
         "task": f"{said.get('task', task.name)}: {trials}, seed {config.seed}",
         "arms": f"{', '.join(arms)} ({'policy' if len(policies) == 1 else 'policies'} {', '.join(policies)})",
         "workers": str(config.workers),
+        **({} if config.shard is None else {"shard": config.shard}),
         "run": str(config.out),
     }
     for name, line in lines.items():

@@ -23,6 +23,7 @@ from wiw.cli.doctor import doctor
 from wiw.cli.episodes import episodes
 from wiw.cli.export import export
 from wiw.cli.judge import judge
+from wiw.cli.merge import merge
 from wiw.cli.names import list_names
 from wiw.cli.numbers import make_registry
 from wiw.cli.power import power
@@ -34,7 +35,9 @@ from wiw.cli.scale import scale
 from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
-from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
+from wiw.cli.status import status
+from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_stop_signals
+from wiw.cli.submit import cancel, submit
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
@@ -58,13 +61,18 @@ on a task, for one world model or several on the same episodes, and measures how
 `wiw COMMAND --help` explains each command with examples. `--debug` shows the whole traceback of an error.
 
 Exit codes: 0 done, 1 the run is invalid (verify: something differs; judge: marks are missing), 2 error, 130 stopped by
-Ctrl-C, 75 stopped by SIGTERM, within 5 seconds. A stopped run keeps everything recorded; `wiw resume` continues it."""
+Ctrl-C, 75 stopped by SIGTERM or SIGUSR2, within 5 seconds. A stopped run keeps everything recorded; `wiw resume`
+continues it."""
 
 COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (demo, "demo", "Watch it work: a few arms on a handful of episodes, a table and a report."),
     (list_names, "list", "List world models, policies, trackers, tasks, presets and metrics."),
     (run, "run", "Run an agent on a task, with one world model or several."),
     (resume, "resume", "Resume a run that was stopped."),
+    (status, "status", "Show how far runs are, while they are being run or after."),
+    (submit, "submit", "Run an agent in shards, as an array of SLURM jobs."),
+    (cancel, "cancel", "Cancel the jobs of a run."),
+    (merge, "merge", "Merge the shards of a run, run on several machines, into one run."),
     (blame, "blame", "Find the stage that causes a run's failures."),
     (judge, "judge", "Judge the stored answers of a run again, by rules or a language model."),
     (compare, "compare", "Compare two runs on the same episodes."),
@@ -174,7 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"wiw {wiw.__version__}")
         return 0
     try:
-        with raise_on_sigterm():
+        with raise_on_stop_signals():
             return _dispatch(given) or 0
     except Error as error:
         if debug:

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -16,6 +17,11 @@ from wiw.cli.stop import stoppable
 from wiw.cli.terminal import printable
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import ResumeConfig, RunConfig
+from wiw.runs.shards import Shard
+
+if TYPE_CHECKING:
+    from wiw.runs.recipes import AgentRecipe, TaskRecipe
+    from wiw.tasks.base import Task
 
 AGENT, TASK, SEARCH, SETTINGS, UNCHANGED = AgentFlags(), TaskFlags(), AgentConfig(), RunConfig(), ResumeConfig()
 """What holds where the command line says nothing."""
@@ -45,6 +51,7 @@ def run(
     $ wiw run ar --policy vlm --vlm http://localhost:8000/v1 --world-model warp
     $ wiw run manipulation --tasks push_buttons,stack_cups --episodes 40 --arms none,copy,oracle
     $ wiw run ar --preset official --policy vlm --world-model svd --dry-run
+    $ wiw run imagenav --arms none,warp --episodes 400 --shard 3/8 --out runs/a/3 --resume
 
     Ctrl-C (exit code 130) or SIGTERM (75, within 5 seconds) stops a run without loss; `wiw resume` continues it.
 
@@ -57,12 +64,52 @@ def run(
             names another. NAME=MODEL?KEY=VALUE names an arm and
             gives its model options, several with & between them (in quotes), besides those of --world-model-option.
         rules: What it is run on.
-        report: Whether to write report.html at the end.
+        report: Whether to write report.html at the end; none of a shard.
         dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.
         search: Numbers of the search.
         config: How the run goes.
     """
-    from wiw.cli.announcement import announce, announce_protocol
+    from wiw.cli.announcement import announce_protocol
+
+    made = prepare_run(task, parts, arms, rules, search, config)
+    if dry_run:
+        announce_protocol(made.built, made.recipes)
+        return 0
+    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
+
+    folder = Path(made.settings.out or "")
+    work = lambda: evaluate(made.task, made.agent, arms=made.arms, config=made.settings)  # noqa: E731
+    return finish(stoppable(work, folder), report)
+
+
+@dataclass(frozen=True)
+class PreparedRun:
+    """A run as its flags describe it."""
+
+    task: TaskRecipe
+    agent: AgentRecipe
+    arms: list[str] | None
+    settings: RunConfig
+    """With seed and folder."""
+    built: Task
+    recipes: Mapping[str, Any]
+    """Agents by arm."""
+
+    @property
+    def count(self) -> int:
+        """Number of episodes."""
+        return self.built.default_episodes if self.settings.episodes is None else self.settings.episodes
+
+
+def prepare_run(
+    task: str, parts: AgentFlags, arms: str | None, rules: TaskFlags, search: AgentConfig, config: RunConfig
+) -> PreparedRun:
+    """Check the flags of a run, announce it, and return what they describe.
+
+    Raises:
+        Error: a part that is not known or does not fit, or a setting out of range.
+    """
+    from wiw.cli.announcement import announce
     from wiw.runs.arm_text import parse_arm
     from wiw.runs.recipes import arm_recipes
 
@@ -71,15 +118,11 @@ def run(
     policies = [parse_arm(name).model.partition("+")[0] for name in names or []]
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search, policies)
     folder = Path(config.out or Path("runs") / f"{task.rpartition(':')[2]}-{datetime.now():%Y%m%d-%H%M%S}")
-    settings = replace(config, seed=seed, out=folder)
-    built, recipes = recipe.build(), arm_recipes(agent, names)
+    if config.out is None and config.shard is not None:
+        folder = folder / Shard.parse(config.shard).folder
+    settings, built, recipes = replace(config, seed=seed, out=folder), recipe.build(), arm_recipes(agent, names)
     announce(built, recipes, settings)
-    if dry_run:
-        announce_protocol(built, recipes)
-        return 0
-    from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
-
-    return finish(stoppable(lambda: evaluate(recipe, agent, arms=names, config=settings), folder), report)
+    return PreparedRun(recipe, agent, names, settings, built, recipes)
 
 
 def resume(
@@ -88,6 +131,9 @@ def resume(
     *,
     workers: MaybeCount = None,
     retry_errors: bool = False,
+    scratch: Annotated[Path | None, arg(metavar="DIR")] = None,
+    engine: Literal["processes", "ray"] | None = None,
+    address: Annotated[str | None, arg(metavar="ADDRESS")] = None,
     report: bool = True,
     config: Annotated[ResumeConfig, arg(name="")] = UNCHANGED,
 ) -> int:
@@ -102,13 +148,18 @@ def resume(
         run: The run's folder.
         workers: Processes; as many as it was begun with if not given.
         retry_errors: Whether to rerun episodes that ended with an infrastructure error.
+        scratch: Folder on a local disk, such as /tmp, where the store is written while the run goes on; needed where
+            the run's folder is on a network file system.
+        engine: As for `wiw run`; what it was begun with if not given.
+        address: Ray cluster; the one it was begun with if not given.
         report: Whether to write report.html at the end.
         config: What may change.
     """
     from wiw.studies.evaluate import resume_run
 
-    changes = config.to_json()
-    return finish(stoppable(lambda: resume_run(run, workers, retry_errors=retry_errors, **changes), run), report)
+    place = {name: value for name, value in (("engine", engine), ("address", address)) if value is not None}
+    again = {"retry_errors": retry_errors, "scratch": scratch, "engine": place, **config.to_json()}
+    return finish(stoppable(lambda: resume_run(run, workers, **again), run), report)
 
 
 def finish(log: Any, report: bool, remark: str = "") -> int:
@@ -128,7 +179,9 @@ def finish(log: Any, report: bool, remark: str = "") -> int:
         )
         print(f"Once the cause is fixed:  wiw resume {log.path} --retry-errors", file=sys.stderr)
     print(f"\nset-up  {log.store.info.get('preparation_seconds', 0.0):.1f} s for scenes and episodes")
-    if report:
+    if log.store.shard is not None:
+        print(f"shard   {log.store.shard}; merge all of them with `wiw merge`")
+    elif report:
         print(f"report  {log.report(remark=remark)}")
     print(f"run     {log.path}")
     return 1 if numbers.invalid else 0

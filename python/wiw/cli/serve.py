@@ -5,14 +5,20 @@ from __future__ import annotations
 
 import asyncio
 import os
+import platform
+import secrets
 import signal
 import sys
+import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated, Any
+from urllib.parse import urlsplit
 
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, model_options
+from wiw.wire.address_book import ServerAddress, announced
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
@@ -31,6 +37,8 @@ def serve(
     certificate: Annotated[Path | None, arg(metavar="FILE")] = None,
     key: Annotated[Path | None, arg(metavar="FILE")] = None,
     grace: Annotated[float, arg(metavar="SECONDS")] = 30.0,
+    announce: Annotated[Path | None, arg(metavar="FILE")] = None,
+    idle: Annotated[float | None, arg(metavar="SECONDS")] = None,
 ) -> int:
     """Serve a world model to runs in other processes or on other machines.
 
@@ -39,6 +47,9 @@ def serve(
 
     $ WIW_TOKEN=secret wiw serve my_model.py:MyModel --host 0.0.0.0
     $ WIW_TOKEN=secret wiw run imagenav --world-model remote:ws://gpu-machine:8765
+
+    $ wiw serve svd --host 0.0.0.0 --port 0 --announce servers/1.json --idle 1800
+    $ wiw run imagenav --arms none,svd=remote:servers
 
     The server batches the rows of all episodes of all clients. If it is killed, clients wait for it to come back, as
     long as their deadlines allow, and repeat unanswered requests. On SIGTERM or Ctrl-C it finishes the accepted rows
@@ -56,21 +67,32 @@ def serve(
         certificate: PEM file, for wss.
         key: PEM file of the certificate's key, if it is not in the same file.
         grace: Time limit in seconds for finishing the accepted rows.
+        announce: File (.json) in which to announce address and token as long as it serves; clients are given its
+            folder. Only its owner can read it. Without --token one is made up.
+        idle: Seconds without any client after which the server ends; never if not given.
     """
     from wiw.registry import world_model
     from wiw.serving.server import Server, Settings
 
-    settings = Settings(host, port, token or os.environ.get("WIW_TOKEN"), queue, window, certificate, key, grace)
+    secret = token or os.environ.get("WIW_TOKEN") or (secrets.token_urlsafe() if announce is not None else None)
+    settings = Settings(host, port, secret, queue, window, certificate, key, grace)
     server = Server(world_model(model, **model_options(model, world_model_option)), settings)
-    asyncio.run(_live(server, model))
+    asyncio.run(_live(server, model, announce, idle))
     return 0
 
 
-async def _live(server: Any, name: str) -> None:
-    """Serve until a signal arrives, and print status lines."""
+async def _live(server: Any, name: str, announce: Path | None, idle: float | None) -> None:
+    """Serve until a signal arrives or nobody has asked for long, announce the server, and print status lines."""
     loop, signals = asyncio.get_running_loop(), 0
     ready = asyncio.Event()
-    serving = asyncio.ensure_future(server.run(ready.set))
+    announcing = ExitStack()
+
+    def begin() -> None:
+        if announce is not None:
+            announcing.enter_context(announced(_find_address(server), announce))
+        ready.set()
+
+    serving = asyncio.ensure_future(server.run(begin))
 
     def stop() -> None:
         nonlocal signals
@@ -82,16 +104,37 @@ async def _live(server: Any, name: str) -> None:
         else:
             serving.cancel()
 
-    for number in (signal.SIGTERM, signal.SIGINT):
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR2):
         loop.add_signal_handler(number, stop)
-    showing = asyncio.ensure_future(_show(server, name, ready))
+    beside = [asyncio.ensure_future(_show(server, name, ready))]
+    beside += [] if idle is None else [asyncio.ensure_future(_end_if_idle(server, idle, ready))]
     try:
         await serving
     except asyncio.CancelledError:
         pass
     finally:
-        showing.cancel()
-        await asyncio.gather(showing, return_exceptions=True)
+        announcing.close()
+        for task in beside:
+            task.cancel()
+        await asyncio.gather(*beside, return_exceptions=True)
+
+
+def _find_address(server: Any) -> ServerAddress:
+    """Return where other machines find a server: by this machine's name, unless it listens to this machine alone."""
+    split = urlsplit(server.address)
+    everywhere = split.hostname in ("0.0.0.0", "::")
+    address = f"{split.scheme}://{platform.node()}:{split.port}" if everywhere else server.address
+    return ServerAddress(address, server.settings.token)
+
+
+async def _end_if_idle(server: Any, seconds: float, ready: asyncio.Event) -> None:
+    """End a server once it has had no client for so long."""
+    await ready.wait()
+    last = time.monotonic()
+    while time.monotonic() - last < seconds:
+        await asyncio.sleep(min(1.0, seconds / 4))
+        last = time.monotonic() if server.clients else last
+    server.end()
 
 
 async def _show(server: Any, name: str, ready: asyncio.Event) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""SIGTERM: the run is closed within seconds, whatever it is doing, and the exit code says that it can be resumed."""
+"""SIGTERM and SIGUSR2: the run is closed within seconds, whatever it is doing; the exit code says it can be resumed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from typing import Any, NoReturn
 
 EXIT_RESUME = 75
 """EX_TEMPFAIL: whoever stopped the run, such as a batch system, may start `wiw resume`."""
+STOPPING = (signal.SIGTERM, signal.SIGUSR2)
+"""SIGUSR2 is what SLURM sends jobs of submitit before their time is up, to all their processes."""
 GRACE = 4.0
 """Seconds for closing everything in order; after that the process ends, for each record is on disk once it is made."""
 
 
 class Terminated(BaseException):
-    """SIGTERM has come; raised so that everything is closed on the way out."""
+    """SIGTERM or SIGUSR2 has come; raised so that everything is closed on the way out."""
 
 
 def end_process(code: int) -> NoReturn:
@@ -42,8 +44,8 @@ def end_process(code: int) -> NoReturn:
 
 
 @contextmanager
-def raise_on_sigterm() -> Iterator[None]:
-    """Raise `Terminated` at the first SIGTERM; end the process where the work does not get to it, as inside a model.
+def raise_on_stop_signals() -> Iterator[None]:
+    """Raise `Terminated` at the first of `STOPPING`; end the process where the work does not get to it, as in a model.
 
     Python runs signal handlers only between its own instructions, so a thread, notified by a pipe, enforces the end.
     """
@@ -51,27 +53,34 @@ def raise_on_sigterm() -> Iterator[None]:
     os.set_blocking(tell, False)
     done = threading.Event()
     guard = threading.Thread(target=_guard, args=(watch, done), daemon=True)
-    handler, earlier = signal.signal(signal.SIGTERM, _terminate), signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    handlers = {number: signal.signal(number, _terminate) for number in STOPPING}
+    earlier = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     guard.start()
     try:
         yield
     finally:
         done.set()
         signal.set_wakeup_fd(earlier)
-        signal.signal(signal.SIGTERM, handler)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         os.close(tell)
         guard.join()
         os.close(watch)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one must not disturb the closing
+    for each in STOPPING:
+        signal.signal(each, _note)  # a second one must not disturb the closing
     raise Terminated
+
+
+def _note(number: int, frame: FrameType | None) -> None:
+    """Do nothing. Python complains of a signal that has come and is then ignored by `SIG_IGN`."""
 
 
 def _guard(watch: int, done: threading.Event) -> None:
     while number := os.read(watch, 1):
-        if number[0] == signal.SIGTERM and not done.wait(GRACE):
+        if number[0] in STOPPING and not done.wait(GRACE):
             for worker in multiprocessing.active_children():
                 worker.kill()
             print(

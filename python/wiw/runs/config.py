@@ -12,11 +12,24 @@ from tyro.conf import arg
 
 from wiw.errors import ArgumentError
 from wiw.loop.limits import Limits
+from wiw.runs.shards import Shard
 from wiw.types import check_seed
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunConfig(Limits):
+class EngineConfig:
+    """What runs the episodes, and where."""
+
+    engine: Literal["processes", "ray"] = "processes"
+    """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
+    address: Annotated[str | None, arg(metavar="ADDRESS")] = None
+    """Ray cluster, such as auto or HOST:6379; one of this machine alone if not given."""
+    worker_gpus: Annotated[float, arg(metavar="N")] = 0
+    """GPUs of an actor of Ray."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig(Limits, EngineConfig):
     """How a run goes, whatever agents it compares. All randomness is keyed by (seed, episode, decision, candidate):
     neither `workers` nor `live` changes a result.
 
@@ -38,8 +51,14 @@ class RunConfig(Limits):
     keep_images: Annotated[int | Literal["all"], arg(metavar="N|all")] = 2
     """Episodes that keep pictures for report and view, of manipulation one of each task at least; all: every one, at
     0.2 MB per decision."""
+    shard: Annotated[str | None, arg(metavar="I/N")] = None
+    """Part I of N of the episodes, in a store of its own; `wiw merge` makes one run of the stores of all parts."""
+    scratch: Annotated[Path | str | None, arg(metavar="DIR")] = None
+    """Folder on a local disk, such as /tmp, where the store is written while the run goes on; it is copied to --out
+    every minute and at the end. Needed where --out is on a network file system. auto: the system's own for temporary
+    files, or the job's."""
     resume: bool = False
-    """Whether to resume the run in `out`."""
+    """Whether to resume the run in `out`, if one is there."""
     progress: bool = True
     """Whether to show progress bars."""
 
@@ -51,6 +70,17 @@ class RunConfig(Limits):
                 raise ArgumentError(f"evaluate: expected {name} of at least {least}, got {value}")
         if self.seed is not None:
             check_seed(self.seed)
+        if self.worker_gpus < 0:
+            raise ArgumentError(f"evaluate: expected worker_gpus of at least 0, got {self.worker_gpus}")
+        if self.engine != "ray" and (self.address is not None or self.worker_gpus):
+            raise ArgumentError("evaluate: address and worker_gpus are for engine ray: give --engine ray (engine=)")
+        if self.shard is not None:
+            Shard.parse(self.shard)
+
+    @property
+    def place(self) -> EngineConfig:
+        """What runs the episodes, and where."""
+        return EngineConfig(**{field.name: getattr(self, field.name) for field in fields(EngineConfig)})
 
     def count_pictured(self, episodes: int) -> int:
         """Return how many of a run's episodes keep pictures."""

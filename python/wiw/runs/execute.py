@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from wiw.errors import Error, InfrastructureError, StoreError
+from wiw.runs.config import EngineConfig
 from wiw.runs.films import film_episodes
 from wiw.runs.pictures import drop_spare_pictures
 from wiw.runs.progress import ArmProgress, Tracker, make_board
@@ -18,6 +19,9 @@ from wiw.runs.sources import require_sources
 from wiw.runs.store import RunStore
 from wiw.runs.workers import Job, Row, WorkerSpec, run_here, run_in_workers
 from wiw.types import Episode, EpisodeResult
+
+PROCESSES = EngineConfig()
+"""Processes of this machine."""
 
 
 def recipes_of(store: RunStore) -> tuple[TaskRecipe, dict[str, AgentRecipe]]:
@@ -86,6 +90,7 @@ def run_pending(
     pending: Mapping[str, list[int]],
     workers: int,
     progress: bool,
+    place: EngineConfig = PROCESSES,
 ) -> None:
     """Run the pending episodes of each arm and close the store."""
     info = store.info
@@ -96,17 +101,28 @@ def run_pending(
     )
     board = make_board(progress and any(pending.values()))
     try:
+        if any(pending.values()):
+            store.begin_session()
         for arm, indices in pending.items():
             store.discard(arm, indices)
         built = task.build()
         writer = _StoreWriter(store, Tracker(_count_ended(store, pending), built.decisions, board))
-        _run_jobs(spec, episodes, pending, writer, workers)
-        drop_spare_pictures(store)
-        draw_scene_maps(store, built)
-        film_episodes(store, built)
+        _run_jobs(spec, episodes, pending, writer, workers, place)
+        if store.shard is None:
+            drop_spare_pictures(store)
+            draw_pictures(store, built)
     finally:
         board.close()
         store.close()
+
+
+def draw_pictures(store: RunStore, task: Any) -> None:
+    """Draw scenes and films of the episodes that have pictures.
+
+    For a shard that is done once it is merged: these episodes are chosen among those of all shards.
+    """
+    draw_scene_maps(store, task)
+    film_episodes(store, task)
 
 
 def _count_ended(store: RunStore, pending: Mapping[str, list[int]]) -> dict[str, ArmProgress]:
@@ -121,21 +137,39 @@ def _count_ended(store: RunStore, pending: Mapping[str, list[int]]) -> dict[str,
 
 
 def _run_jobs(
-    spec: WorkerSpec, episodes: list[Episode], pending: Mapping[str, list[int]], writer: _StoreWriter, workers: int
+    spec: WorkerSpec,
+    episodes: list[Episode],
+    pending: Mapping[str, list[int]],
+    writer: _StoreWriter,
+    workers: int,
+    place: EngineConfig,
 ) -> None:
     sizes = {
         arm: len(left) if workers == 1 else max(spec.live, math.ceil(len(left) / (3 * workers)))
         for arm, left in pending.items()
     }
+    by_scene = place.engine == "ray"
     jobs = [
-        Job(arm, tuple((index, episodes[index]) for index in left[first : first + sizes[arm]]))
+        Job(arm, tuple((index, episodes[index]) for index in group[first : first + sizes[arm]]))
         for arm, left in pending.items()
-        for first in range(0, len(left), max(1, sizes[arm]))
+        for group in (_group_by_scene(left, episodes) if by_scene else [left])
+        for first in range(0, len(group), max(1, sizes[arm]))
     ]
-    if workers == 1 or len(jobs) == 0:
+    if place.engine == "ray" and jobs:
+        from wiw.runs.ray_engine import run_on_ray
+
+        run_on_ray(spec, jobs, writer, workers, place)
+    elif workers == 1 or len(jobs) == 0:
         run_here(spec, jobs, writer)
     else:
         run_in_workers(spec, jobs, writer, workers)
+
+
+def _group_by_scene(indices: Iterable[int], episodes: Sequence[Episode]) -> list[list[int]]:
+    groups: dict[str, list[int]] = {}
+    for index in indices:
+        groups.setdefault(episodes[index].scene, []).append(index)
+    return list(groups.values())
 
 
 SAME_ERRORS = 5

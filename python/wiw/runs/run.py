@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, StoreError
 from wiw.registry import TASKS, task_class
-from wiw.runs.store import RunStore
+from wiw.runs.store import FILE_NAME, RunStore, store_path
 from wiw.types import TableSpec
 
 
@@ -80,3 +81,23 @@ class Run:
     def __repr__(self) -> str:
         ended = {arm: sum(record["arm"] == arm for record in self.episodes) for arm in self.arms}
         return f"{type(self).__name__}({str(self.path)!r}, ended: {ended} of {len(self.store.episodes())})"
+
+
+def find_stores(runs: Sequence[str | Path]) -> list[Path]:
+    """Return the folders with a store, each once: those given, and of folders without one those right inside.
+
+    Raises:
+        StoreError: neither a folder nor those inside have a store.
+    """
+    found = [store for run in runs for store in _stores_of(Path(run).expanduser())]
+    return list({store.resolve(): store for store in reversed(found)}.values())[::-1]
+
+
+def _stores_of(run: Path) -> Iterator[Path]:
+    if store_path(run).is_file():
+        yield run
+        return
+    inside = sorted(path.parent for path in run.glob(f"*/{FILE_NAME}"))
+    if not inside:
+        raise StoreError(f"no run at {run}: expected a folder with {FILE_NAME} in it, or with folders of shards")
+    yield from inside

@@ -11,8 +11,8 @@ import fcntl
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
@@ -21,10 +21,14 @@ from typing import Any
 import wiw
 from wiw.errors import ArgumentError, StoreError
 from wiw.runs.faults import explain_faults, find_remedy
+from wiw.runs.file_systems import find_network
 from wiw.runs.judges import JudgedRow, JudgeRecord, apply_judge, find_judge
 from wiw.runs.migrations import OLDEST_READABLE, migrate, show_as_current
+from wiw.runs.processes import describe_process
 from wiw.runs.rows import AgentRow, DecisionRow, LostRow, OutcomeRow, to_json
+from wiw.runs.scratch import ScratchCopy
 from wiw.runs.shapes import check_decision, check_types, parse_column
+from wiw.runs.shards import Shard
 from wiw.types import Episode
 
 SCHEMA_VERSION = 11
@@ -61,41 +65,61 @@ def store_path(run: str | Path) -> Path:
 class RunStore:
     """An open run store. Use `create`, `resume` or `read`; works as a context manager."""
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, lock: Any = None) -> None:
+    def __init__(
+        self, path: Path, connection: sqlite3.Connection, lock: Any = None, copy: ScratchCopy | None = None
+    ) -> None:
         self.path = path
         self._connection = connection
         self._lock = lock
+        self._copy = copy
         self._judge: str | None = None
 
     @classmethod
     def create(
-        cls, run: str | Path, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]
+        cls,
+        run: str | Path,
+        config: dict[str, Any],
+        info: dict[str, Any],
+        episodes: Iterable[Episode],
+        scratch: str | Path | None = None,
+        created: str | None = None,
     ) -> RunStore:
         """Create a store for writing.
 
+        Args:
+            run: its folder.
+            config: task, arms and seed.
+            info: whatever else belongs to the run.
+            episodes: that every arm runs.
+            scratch: folder on a local disk; given, the store is written there, and copied to `run` when a session
+                begins, then at most once a minute, and when it is closed.
+            created: when the run began; now if not given.
+
         Raises:
-            StoreError: a run is already there, or the folder cannot be written.
+            StoreError: a run is already there, or the folder cannot be written or is on a network file system.
         """
-        path = store_path(run)
+        copy = None if scratch is None else ScratchCopy(store_path(run), Path(scratch))
+        path = store_path(run) if copy is None else copy.path
         if cls.exists(run):
             raise StoreError(
-                f"{path} holds a run already; continue it with `wiw resume {path.parent}` "
+                f"{store_path(run)} holds a run already; continue it with `wiw resume {store_path(run).parent}` "
                 "(or evaluate(..., resume=True)), or give another output folder"
             )
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StoreError(
-                f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
-            ) from error
-        lock = _lock(path)
-        store = cls(path, _connect(path, lock), lock)
-        with store._close_on_error(), store._writing() as connection:
+        _make_folder(store_path(run))
+        lock = _lock(path) if copy is None else _lock_both(copy)
+        if copy is not None:
+            copy.discard()
+        store = cls(path, _connect(path, lock), lock, copy)
+        with store._close_on_error():
+            store._fill(created or _now(), config, info, episodes)
+        return store
+
+    def _fill(self, created: str, config: dict[str, Any], info: dict[str, Any], episodes: Iterable[Episode]) -> None:
+        with self._writing() as connection:
             for statement in _SCHEMA.read_text().split(";\n"):
                 connection.execute(statement)
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
-            created = datetime.now(timezone.utc).isoformat(timespec="seconds")
             connection.execute(
                 "INSERT INTO run VALUES (1, ?, ?, ?, ?)", (created, wiw.__version__, to_json(config), to_json(info))
             )
@@ -103,24 +127,28 @@ class RunStore:
                 "INSERT INTO episode VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                 [_episode_values(index, episode) for index, episode in enumerate(episodes)],
             )
-        return store
 
     @staticmethod
     def exists(run: str | Path) -> bool:
         """Return whether a run is there, rather than nothing or a creation that was cut off."""
         path = store_path(run)
-        return path.exists() and not _blank(path)
+        return path.exists() and (find_network(path) is not None or not _blank(path))
 
     @classmethod
-    def resume(cls, run: str | Path, config: dict[str, Any] | None = None) -> RunStore:
-        """Open an existing store for writing and discard partial episodes.
+    def resume(
+        cls, run: str | Path, config: dict[str, Any] | None = None, scratch: str | Path | None = None
+    ) -> RunStore:
+        """Open an existing store for writing and discard partial episodes; `scratch` as in `create`.
 
         Raises:
-            StoreError: missing, damaged, of another version, of another configuration than `config`, or in use.
+            StoreError: missing, damaged, of another version, of another configuration than `config`, in use, or on a
+                network file system.
         """
         path = store_path(run)
-        lock = _lock(path) if path.exists() else None
-        store = cls._open(path, lock)
+        if scratch is not None and path.exists():
+            store = cls._take_in(ScratchCopy(path, Path(scratch)))
+        else:
+            store = cls._open(path, _lock(path) if path.exists() else None)
         with store._close_on_error():
             store.require_version()
             if config is not None:
@@ -176,10 +204,22 @@ class RunStore:
         return cls._open(path, _lock(path) if path.exists() else None)
 
     @classmethod
-    def _open(cls, path: Path, lock: Any) -> RunStore:
+    def _take_in(cls, copy: ScratchCopy) -> RunStore:
+        """Open a store for writing on a local disk."""
+        lock = _lock_both(copy)
+        try:
+            with explain_faults(copy.home):
+                copy.take_in()
+        except BaseException:
+            lock.close()
+            raise
+        return cls._open(copy.path, lock, copy)
+
+    @classmethod
+    def _open(cls, path: Path, lock: Any, copy: ScratchCopy | None = None) -> RunStore:
         if not path.is_file():
             raise StoreError(f"no run at {path}: expected a folder with {FILE_NAME} in it")
-        store = cls(path, _connect(path, lock), lock)
+        store = cls(path, _connect(path, lock), lock, copy)
         with store._close_on_error():
             store._require_whole()
             store._require_readable()
@@ -219,6 +259,11 @@ class RunStore:
             migrate(connection, version)
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
 
+    @property
+    def home(self) -> Path:
+        """The file in the run's own folder; `path` is another where the store is written on a local disk."""
+        return self.path if self._copy is None else self._copy.home
+
     # -- what the run is -------------------------------------------------------------------------------------------
 
     @property
@@ -240,6 +285,12 @@ class RunStore:
     def info(self) -> dict[str, Any]:
         """Platform, how to rebuild task and agents, which episodes keep pictures."""
         return dict(parse_column("info", self._value("info"), str(self.path)))
+
+    @property
+    def shard(self) -> Shard | None:
+        """The part of the episodes that this store is for; None for all of them."""
+        named = self.info.get("shard")
+        return None if named is None else Shard.parse(str(named))
 
     def episodes(self) -> list[Episode]:
         """Return the episodes that every arm runs; their place in the list is their index."""
@@ -303,6 +354,11 @@ class RunStore:
             {**row, **{name: parse_column(name, row[name], self._place("outcome", row)) for name in OUTCOME_JSON}}
             for row in named
         ]
+
+    def count_ended(self) -> tuple[int, int]:
+        """Return how many episodes of all arms have ended, and how many of these with an error."""
+        (counted,) = self._rows("SELECT count(*) AS n, coalesce(sum(status = 'error'), 0) AS errors FROM outcome")
+        return counted["n"], counted["errors"]
 
     def decisions(self, arm: str | None = None, episode: int | None = None) -> list[dict[str, Any]]:
         """Return the decisions of ended episodes in order, of all or of one arm or episode."""
@@ -376,8 +432,13 @@ class RunStore:
                     "SELECT episode FROM judged WHERE arm = ? AND judge = ? AND status = 'done'", (arm, own.digest)
                 )
             }
-        rows = self._rows("SELECT episode FROM episode ORDER BY episode")
-        return [row["episode"] for row in rows if row["episode"] not in ended]
+        return [episode for episode in self.own_episodes() if episode not in ended]
+
+    def own_episodes(self) -> Sequence[int]:
+        """Return the indices of the episodes that this store is for: all, or its shard's."""
+        (counted,) = self._rows("SELECT count(*) AS n FROM episode")
+        shard = self.shard
+        return range(counted["n"]) if shard is None else shard.select(counted["n"])
 
     # -- writing ---------------------------------------------------------------------------------------------------
 
@@ -414,13 +475,14 @@ class RunStore:
                         "UPDATE episode SET geodesic = ? WHERE episode = ? AND geodesic IS NULL",
                         (shortest, result.episode),
                     )
+        if self._copy is not None and isinstance(row, OutcomeRow):
+            self._copy.copy_if_due(self._connection)
 
     def add_judge(self, judge: JudgeRecord) -> None:
         """Store a judge's description, so that its marks can be written."""
-        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with self._writing() as connection:
             connection.execute(
-                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", (judge.digest, to_json(dict(judge.description)), now)
+                "INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", (judge.digest, to_json(dict(judge.description)), _now())
             )
 
     def write_judged(self, row: JudgedRow) -> None:
@@ -461,10 +523,50 @@ class RunStore:
             return
         info["live"] = changed.get("live", info["live"])
         info["limits"] |= {name: value for name, value in changed.items() if name != "live"}
-        now = datetime.now(timezone.utc).isoformat(timespec="seconds")
-        info["resumed_with"] = [*info.get("resumed_with", []), {"time": now, **changed}]
+        info["resumed_with"] = [*info.get("resumed_with", []), {"time": _now(), **changed}]
         with self._writing() as connection:
             connection.execute("UPDATE run SET info = ?", (to_json(info),))
+
+    def begin_session(self) -> None:
+        """Store when and where episodes begin to be run, and how many have ended before, for `wiw status`."""
+        session = {"begun": _now(), "ended": self.count_ended()[0], **describe_process()}
+        with self._writing() as connection:
+            connection.execute("UPDATE run SET info = ?", (to_json({**self.info, "session": session}),))
+        if self._copy is not None:
+            self._copy.copy(self._connection)
+
+    def take_episodes(self, source: RunStore, episodes: Collection[tuple[str, int]]) -> None:
+        """Copy ended episodes, by arm and index, from another store of the same run, with all that belongs to them.
+
+        Whatever else the other store has spent is recorded as lost.
+        """
+        with self._writing() as connection:
+            for row in source._rows("SELECT * FROM judge"):
+                connection.execute("INSERT OR IGNORE INTO judge VALUES (?, ?, ?)", tuple(row.values()))
+            for table in ("outcome", "decision", "image", "film", "judged"):
+                for own in episodes:
+                    for row in source._rows(f"SELECT * FROM {table} WHERE arm = ? AND episode = ?", own):
+                        _insert(connection, table, row)
+            for row in source._rows("SELECT episode, geodesic FROM episode WHERE geodesic IS NOT NULL"):
+                connection.execute(
+                    "UPDATE episode SET geodesic = ? WHERE episode = ? AND geodesic IS NULL",
+                    (row["geodesic"], row["episode"]),
+                )
+        for arm, spent in source._sum_other_costs(episodes).items():
+            self.write_lost(LostRow(arm, spent))
+
+    def _sum_other_costs(self, episodes: Collection[tuple[str, int]]) -> dict[str, dict[str, float]]:
+        """Return by arm and name what was spent on anything but these episodes."""
+        found = self.sum_lost_costs()
+        for column, name in _COSTS:
+            for row in self._rows(
+                f"SELECT arm, episode, {name} AS name, total(value) AS value FROM decision d, json_each(d.{column}) "
+                "WHERE key != 'replay' GROUP BY arm, episode, name"
+            ):
+                if (row["arm"], row["episode"]) not in episodes:
+                    own = found.setdefault(row["arm"], {})
+                    own[row["name"]] = own.get(row["name"], 0.0) + row["value"]
+        return found
 
     def write_lost(self, row: LostRow) -> None:
         """Record what an interrupted decision had spent."""
@@ -504,12 +606,16 @@ class RunStore:
         with self._writing() as connection:
             _insert(connection, "film", {"arm": arm, "episode": episode, "webp": webp})
 
+    def abandon(self) -> None:
+        """Close a new store that is written on a local disk, and remove it without copying it to its own folder."""
+        home = self.home
+        self._end(keep=False)
+        if not home.exists():
+            _remove(home)
+
     def close(self) -> None:
-        """Close the file and let others write."""
-        self._connection.close()
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
+        """Close the file and let others write; a store on a local disk is copied to its own folder, and removed."""
+        self._end(keep=True)
 
     def __enter__(self) -> RunStore:
         return self
@@ -518,6 +624,20 @@ class RunStore:
         self.close()
 
     # -- inside ----------------------------------------------------------------------------------------------------
+
+    def _end(self, keep: bool) -> None:
+        copy, self._copy = self._copy, None
+        try:
+            if copy is not None and keep:
+                copy.copy(self._connection)
+            self._connection.close()
+            if copy is not None:
+                copy.remove()
+        finally:
+            self._connection.close()
+            if self._lock is not None:
+                self._lock.close()
+                self._lock = None
 
     def _discard_partial(self) -> None:
         with self._writing() as connection:
@@ -570,12 +690,13 @@ class RunStore:
 
 
 @contextmanager
-def remove_if_empty(path: Path) -> Iterator[None]:
+def remove_if_empty(begun: RunStore) -> Iterator[None]:
     """Remove a new run where an error ends the work on it before anything was recorded.
 
     So a wrong token or missing weights leave no run behind that can neither be begun again nor resumed. An
     interruption leaves it.
     """
+    path = begun.home
     try:
         yield
     except Exception:
@@ -585,12 +706,26 @@ def remove_if_empty(path: Path) -> Iterator[None]:
                 "AS n"
             )
             if counted["n"] == 0:
-                for name in ("", "-wal", "-shm"):
-                    path.with_name(path.name + name).unlink(missing_ok=True)
-                path.with_suffix(".lock").unlink(missing_ok=True)
-                with suppress(OSError):  # other files are in it
-                    path.parent.rmdir()
+                _remove(path)
         raise
+
+
+def _remove(path: Path) -> None:
+    """Remove a store, and its folder if nothing else is in it."""
+    for name in ("", "-wal", "-shm"):
+        path.with_name(path.name + name).unlink(missing_ok=True)
+    path.with_suffix(".lock").unlink(missing_ok=True)
+    with suppress(OSError):  # other files are in it
+        path.parent.rmdir()
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(
+            f"cannot make the run's folder {path.parent}: {error}; choose another with out= or --out"
+        ) from error
 
 
 def _connect(path: Path, lock: Any = None) -> sqlite3.Connection:
@@ -645,6 +780,12 @@ def _blank(path: Path) -> bool:
 
 def _lock(path: Path) -> Any:
     """Take an advisory lock that the kernel drops when its holder dies, so that a run never has two writers."""
+    if kind := find_network(path):
+        raise StoreError(
+            f"{path.parent} is on a network file system ({kind}), on which SQLite's log is not safe; expected a local "
+            "disk: give a folder on this machine's own disk, as in --scratch /tmp (scratch=), and the store is written "
+            "there and copied here; or a local folder with --out (out=), and then `wiw merge` it to here"
+        )
     try:
         handle = path.with_suffix(".lock").open("w")
     except OSError as error:
@@ -660,6 +801,21 @@ def _lock(path: Path) -> Any:
     return handle
 
 
+def _now() -> str:
+    """Return the time, ISO 8601 in UTC."""
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
+
+
+def _lock_both(copy: ScratchCopy) -> ExitStack:
+    """Lock a store on a local disk, and its own file where that is on one too: somebody may write it there."""
+    with ExitStack() as locks:
+        for path in (copy.path, copy.home):
+            if path is copy.path or find_network(path) is None:
+                _make_folder(path)
+                locks.enter_context(_lock(path))
+        return locks.pop_all()
+
+
 def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) -> None:
     marks = ", ".join("?" for _ in values)
     connection.execute(f"INSERT INTO {table} ({', '.join(values)}) VALUES ({marks})", tuple(values.values()))
@@ -668,9 +824,13 @@ def _insert(connection: sqlite3.Connection, table: str, values: dict[str, Any]) 
 _ADD = "ON CONFLICT (arm, name) DO UPDATE SET value = value + excluded.value"
 
 
+_COSTS = (("spent", "key"), ("seconds", "'seconds'"))
+"""Columns of a decision with costs, and the names of these in SQL."""
+
+
 def _forget(connection: sqlite3.Connection, condition: str, values: tuple[Any, ...]) -> None:
     """Delete decisions, pictures and films `d` that meet a condition; record their costs as lost."""
-    for column, name in (("spent", "key"), ("seconds", "'seconds'")):
+    for column, name in _COSTS:
         connection.execute(
             f"INSERT INTO lost SELECT arm, {name}, total(value) FROM decision d, json_each(d.{column}) "
             f"WHERE ({condition}) AND key != 'replay' GROUP BY arm, {name} {_ADD}",

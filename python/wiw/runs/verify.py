@@ -97,7 +97,7 @@ def verify(run: str | Path, episodes: int = 3, seed: int = 0) -> Verification:
         arms = [arm["name"] for arm in store.config["arms"]]
         keys = [(arm, index) for index in chosen for arm in arms if (arm, index) in ended]
         return Verification(
-            store.path.parent, tuple(_check(key, _read_facts(store, ended[key]), again[key]) for key in keys)
+            store.path.parent, tuple(_check(key, read_facts(store, ended[key]), again[key]) for key in keys)
         )
 
 
@@ -150,7 +150,8 @@ class _Collected:
         return self._episodes.setdefault(index, [])
 
 
-def _read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
+def read_facts(store: RunStore, outcome: Mapping[str, Any]) -> Facts:
+    """Return what was decided and measured in an ended episode, given its row of `recorded_outcomes`."""
     arm, index = outcome["arm"], outcome["episode"]
     decisions = [
         _decision(row["decision"], row, store.images(arm, index, row["decision"]))
@@ -176,10 +177,11 @@ def _outcome(status: str, metrics: Mapping[str, float], error: str) -> tuple[str
 
 def _check(key: tuple[str, int], recorded: Facts, again: Facts) -> Check:
     was, now = (_digest(json.dumps(facts, sort_keys=True).encode()) for facts in (recorded, again))
-    return Check(*key, was, now, next(_differences(recorded, again), ""))
+    return Check(*key, was, now, next(list_differences(recorded, again), ""))
 
 
-def _differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[str, Any]]) -> Iterator[str]:
+def list_differences(recorded: Sequence[tuple[str, Any]], again: Sequence[tuple[str, Any]]) -> Iterator[str]:
+    """Return in words what differs between two records of an episode, first things first."""
     for (place, was), (place_now, now) in zip(recorded, again, strict=False):
         if place != place_now:
             yield f"{place}: now {place_now}, {now.get('error') or 'another number of decisions'}"

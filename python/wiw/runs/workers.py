@@ -30,6 +30,11 @@ from wiw.types import DecisionRecord, Episode, EpisodeResult
 Row = RestartRow | AgentRow | DecisionRow | LostRow | OutcomeRow
 
 
+TRIES = 2
+"""How often an episode is begun whose worker dies."""
+NUMBERS = {2: "twice", 3: "three times"}
+
+
 class ReportReceiver(Protocol):
     """The receiver of the workers' reports."""
 
@@ -140,14 +145,19 @@ def run_in_workers(spec: WorkerSpec, jobs: Iterable[Job], receiver: ReportReceiv
         InfrastructureError: the task or an agent cannot be sent, or workers cannot start.
         Error: what a worker raised on purpose, such as a broken contract.
     """
-    pool = _WorkerPool(_pickle_spec(spec), deque(jobs), receiver, workers)
+    pool = _WorkerPool(pickle_spec(spec), deque(jobs), receiver, workers)
     try:
         pool.run()
     finally:
         pool.stop()
 
 
-def _pickle_spec(spec: WorkerSpec) -> bytes:
+def pickle_spec(spec: WorkerSpec) -> bytes:
+    """Return what a worker needs as bytes.
+
+    Raises:
+        InfrastructureError: task or agent cannot be sent.
+    """
     try:
         return pickle.dumps(spec)
     except Exception as error:
@@ -236,14 +246,29 @@ class _WorkerPool:
             )
         if worker.job is None:
             return
-        self._receiver.discard(worker.job.arm, list(worker.unfinished))
-        for index, episode in worker.unfinished.items():
-            if worker.job.attempt == 0:
-                self._jobs.append(Job(worker.job.arm, ((index, episode),), attempt=1))
-            else:
-                error = f"the worker process died twice on this episode, last: {cause}"
-                result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
-                self._receiver.write(OutcomeRow(worker.job.arm, result))
+        self._jobs.extend(lease_again(worker.job, worker.unfinished, self._receiver, TRIES, cause))
+
+
+def lease_again(
+    job: Job, unfinished: Mapping[int, Episode], receiver: ReportReceiver, tries: int, cause: str
+) -> list[Job]:
+    """Return jobs of one episode each for what a lost worker had not finished; record those without tries left.
+
+    Args:
+        job: that the worker had.
+        unfinished: its episodes that have not ended, by index.
+        receiver: discards what it was told of them, and records errors.
+        tries: how often an episode is begun.
+        cause: why the worker was lost.
+    """
+    receiver.discard(job.arm, list(unfinished))
+    if job.attempt + 1 < tries:
+        return [Job(job.arm, (item,), attempt=job.attempt + 1) for item in unfinished.items()]
+    for index, episode in unfinished.items():
+        error = f"the worker process died {NUMBERS[tries]} on this episode, last: {cause}"
+        result = EpisodeResult(index, episode.episode_id, episode.scene, "error", error=error, kind="worker")
+        receiver.write(OutcomeRow(job.arm, result))
+    return []
 
 
 def _describe_exit(exit_code: int) -> str:
@@ -282,13 +307,14 @@ def _run_worker(pipe: Connection) -> None:
 
     It ends without Python's shutdown, which aborts where a model's thread is still inside compiled code.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    for number in (signal.SIGINT, signal.SIGUSR2):  # reach the whole group, or all of a job; the parent decides
+        signal.signal(number, signal.SIG_IGN)
     try:
         _serve(pipe)
     except (EOFError, BrokenPipeError):
         pass
     except Exception as error:
-        pipe.send(_make_portable(error))
+        pipe.send(make_portable(error))
     pipe.close()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -299,21 +325,28 @@ def _serve(pipe: Connection) -> None:
     import cv2
 
     cv2.setNumThreads(int(os.environ.get("WIW_NUM_THREADS", "1")))
-    data = pipe.recv_bytes()
-    try:
-        spec = pickle.loads(data)  # made by the parent process
-    except Exception as error:
-        raise InfrastructureError(
-            f"task or agent cannot be built again in a worker process ({error}); define its class in a file and give "
-            "path.py:Class or package.module:Class, or use workers=1"
-        ) from error
-    runner = Runner(spec)
+    runner = Runner(unpickle_spec(pipe.recv_bytes()))
     while True:
         pipe.send(None)
         runner.run(pipe.recv(), pipe.send)
 
 
-def _make_portable(error: Exception) -> Exception:
+def unpickle_spec(data: bytes) -> WorkerSpec:
+    """Return what `pickle_spec` has made, in a worker of the same run.
+
+    Raises:
+        InfrastructureError: task or agent cannot be built again there.
+    """
+    try:
+        return pickle.loads(data)  # made by the parent process
+    except Exception as error:
+        raise InfrastructureError(
+            f"task or agent cannot be built again in a worker process ({error}); define its class in a file and give "
+            "path.py:Class or package.module:Class, or use workers=1"
+        ) from error
+
+
+def make_portable(error: Exception) -> Exception:
     """Return the exception itself where it survives pickling and is ours; else its text."""
     if isinstance(error, Error):
         try:

@@ -201,7 +201,7 @@ def _store(base: RunStore, agents: Mapping[str, AgentRecipe]) -> RunStore:
     folder = base.path.parent / FOLDER
     if RunStore.exists(folder):
         return RunStore.resume(folder, config)
-    own = ("keep_images", "resumed_with")  # the run chooses pictures for both
+    own = ("keep_images", "resumed_with", "session")  # the run chooses pictures for both
     info = {name: value for name, value in base.info.items() if name not in own}
     info |= {
         "platform": describe_platform(),

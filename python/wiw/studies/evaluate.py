@@ -14,12 +14,13 @@ from typing import Any
 from wiw.errors import Error, StoreError
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
-from wiw.runs.config import ResumeConfig, RunConfig, read_resume_settings, take_settings
+from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
 from wiw.runs.departures import describe_departures
 from wiw.runs.execute import recipes_of, require_left, require_own_sources, run_pending, sources_of
 from wiw.runs.pictures import pool_episodes
 from wiw.runs.platform import describe_platform
 from wiw.runs.recipes import TaskInMemory, TaskRecipe, agent_recipe, arm_recipes, task_recipe
+from wiw.runs.shards import Shard
 from wiw.runs.store import RunStore, remove_if_empty
 from wiw.studies.run_log import RunLog
 
@@ -88,7 +89,13 @@ def _find_task(env_or_task: Any, options: dict[str, Any], settings: RunConfig) -
 
 
 def resume_run(
-    run: str | Path, workers: int | None = None, progress: bool = True, retry_errors: bool = False, **settings: Any
+    run: str | Path,
+    workers: int | None = None,
+    progress: bool = True,
+    retry_errors: bool = False,
+    scratch: str | Path | None = None,
+    engine: Mapping[str, Any] | None = None,
+    **settings: Any,
 ) -> RunLog:
     """Go on with a run of named parts: only episodes that have not ended are run.
 
@@ -97,6 +104,8 @@ def resume_run(
         workers: processes; None means as many as it was begun with.
         progress: whether to show bars.
         retry_errors: whether to rerun episodes that ended with an infrastructure error.
+        scratch: folder on a local disk in which the store is written; see `RunConfig`.
+        engine: values of `EngineConfig` in place of those that the run was begun with, such as {"engine": "processes"}.
         settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
 
     Raises:
@@ -109,7 +118,7 @@ def resume_run(
     if workers is not None:
         RunConfig(workers=workers)  # its numbers are checked there
     changes = read_resume_settings(settings).to_json()
-    store = RunStore.resume(run)
+    store = RunStore.resume(run, scratch=scratch)
     try:
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
@@ -123,7 +132,9 @@ def resume_run(
         raise
     require_left(built, store, agents, retry_errors)
     store.change_settings(changes)
-    return _finish(store, task, agents, workers or store.info["workers"], progress, retry_errors=retry_errors)
+    place = EngineConfig(**{**store.info.get("engine", {}), **({} if engine is None else engine)})
+    workers = workers or store.info["workers"]
+    return _finish(store, task, agents, workers, progress, place, retry_errors=retry_errors)
 
 
 def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
@@ -140,8 +151,10 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
     }
     for recipe in agents.values():
         recipe.require(config["task"])
+    if settings.shard is not None:
+        Shard.parse(settings.shard).select(count)
     if settings.resume and settings.out is not None and RunStore.exists(settings.out):
-        store = RunStore.resume(settings.out, config)
+        store = RunStore.resume(settings.out, config, settings.scratch)
         require_left(built, store, agents)
         require_own_sources(store, task, agents)
         _take_over(store, settings)
@@ -162,27 +175,31 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "stage": built.stage,
             "wording": asdict(built.wording),
             "tables": asdict(built.tables),
+            **({} if settings.shard is None else {"shard": settings.shard}),
             "live": settings.live,
             "workers": settings.workers,
+            "engine": asdict(settings.place),
             "limits": settings.to_json(),
             "command": sys.argv,
             "preparation_seconds": time.perf_counter() - started,
         }
-        store = RunStore.create(folder, config, info, episodes)
-        with remove_if_empty(store.path):
-            return _finish(store, task, agents, settings.workers, settings.progress)
-    return _finish(store, task, agents, settings.workers, settings.progress)
+        store = RunStore.create(folder, config, info, episodes, settings.scratch)
+        with remove_if_empty(store):
+            return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
+    return _finish(store, task, agents, settings.workers, settings.progress, settings.place)
 
 
 def _take_over(store: RunStore, settings: RunConfig) -> None:
     """Let a resumed run go on with these settings; closes the store where other things would be measured.
 
     Raises:
-        StoreError: fidelity was measured otherwise so far.
+        StoreError: fidelity was measured otherwise so far, or it is another shard.
     """
     begun_with, now = Limits(**store.info["limits"]).to_json(), settings.to_json()
+    begun_with["shard"], now["shard"] = store.info.get("shard"), settings.shard
     try:
-        store.require_same(*({name: each[name] for name in ("fidelity", "lpips")} for each in (begun_with, now)))
+        names = ("fidelity", "lpips", "shard")
+        store.require_same(*({name: each[name] for name in names} for each in (begun_with, now)))
     except StoreError:
         store.close()
         raise
@@ -196,10 +213,12 @@ def _finish(
     agents: Mapping[str, Any],
     workers: int,
     progress: bool,
+    place: EngineConfig,
     *,
     retry_errors: bool = False,
 ) -> RunLog:
     """Run what is missing, close the store and open it for reading."""
     pending = {arm: store.pending(arm, retry_errors) for arm in agents}
-    run_pending(store, task, agents, pending, workers, progress)
-    return RunLog(RunStore.read(store.path))
+    home = store.home
+    run_pending(store, task, agents, pending, workers, progress, place)
+    return RunLog(RunStore.read(home))

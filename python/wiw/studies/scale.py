@@ -119,13 +119,18 @@ def scale(
         settings: any of `RunConfig`'s in place of the config's, and options of a task given by name.
 
     Raises:
-        ArgumentError: an agent without a world model; no amounts, equal ones or ones out of range.
+        ArgumentError: an agent without a world model; a shard; no amounts, equal ones or ones out of range.
     """
     if agent.model is None:
         raise ArgumentError("scale: expected an agent with a world model, got one without")
     amounts = _amounts(candidates, imagine_fraction)
     agents = {f"{sweep}={value:g}": _with(agent, changes) for (sweep, value), changes in amounts.items()}
     own, task_options = take_settings(config, settings)
+    if own.shard is not None:
+        raise ArgumentError(
+            "scale: a curve needs all episodes, so it takes no shard; expected none, or `wiw run --shard` for each "
+            "number of candidates"
+        )
     out = own.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}"
     run_config = replace(own, out=out, keep_images=0, episodes=own.episodes or EPISODES)
     log = run_arms(env_or_task, agents, config=run_config, **task_options)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import os
 import random
 import threading
 import time
@@ -18,6 +19,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as LateError
 from dataclasses import dataclass, field
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -28,6 +30,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 import wiw
 from wiw.errors import ContractError, RemoteError
+from wiw.wire.address_book import ServerAddress, read_addresses
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import row_id
 
@@ -57,12 +60,15 @@ class _Question:
 
 
 class Link:
-    """A connection to the server at an address. Any number of threads may use it."""
+    """A connection to the server at an address, or to one of those announced in a folder, the next when it is lost.
+
+    Any number of threads may use it.
+    """
 
     def __init__(self, address: str, token: str | None) -> None:
         self.address = address
-        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        self._proxy: Any = None if _is_loopback(address) else True
+        self._given = ServerAddress(address, token)
+        self._turn = os.getpid()  # clients spread over the servers
         self._open: dict[bytes, _Question] = {}
         self._welcome: Future[Welcome] = Future()
         self.last_error = "not connected yet"
@@ -196,14 +202,17 @@ class Link:
             if not self._open and self._welcome.done():
                 self._wanted.clear()
                 continue
+            self._turn += 1
             await asyncio.sleep(pause * random.uniform(0.8, 1.2))
             pause = min(2 * pause, LONGEST_PAUSE)
 
     def _connection(self) -> connect:
+        server = self._choose_server()
+        self.address = server.address
         return connect(
-            self.address,
-            additional_headers=self._headers,
-            proxy=self._proxy,
+            server.address,
+            additional_headers={} if server.token is None else {"Authorization": f"Bearer {server.token}"},
+            proxy=None if _is_loopback(server.address) else True,
             compression=None,
             max_size=MOST_BYTES,
             open_timeout=HANDSHAKE,
@@ -211,6 +220,14 @@ class Link:
             ping_timeout=SILENCE,
             close_timeout=1,
         )
+
+    def _choose_server(self) -> ServerAddress:
+        if "://" in self._given.address:
+            return self._given
+        servers = read_addresses(Path(self._given.address))
+        if not servers:
+            raise ConnectionError(f"no server is announced in {self._given.address} yet")
+        return servers[self._turn % len(servers)]
 
     async def _shake_hands(self, connection: ClientConnection) -> None:
         await connection.send(encode(Hello(f"wiw {wiw.__version__}")))

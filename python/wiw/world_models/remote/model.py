@@ -9,6 +9,7 @@ import os
 import time
 import weakref
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ TOKEN = "WIW_TOKEN"
 """Environment variable with the server's token."""
 DEADLINE = 300.0
 """Seconds that a call may take where the caller sets no limit."""
+PATIENCE, PATIENCE_FOR_JOBS = 15.0, 270.0
+"""Seconds that the first connection may take; a server that is a job loads its weights first."""
 OVERHEAD = 1024
 """Bytes of a message beside its row."""
 MARGIN = 0.05
@@ -38,9 +41,10 @@ class Remote(WorldModel):
 
     Args:
         address: "ws://HOST:PORT", or "wss://..." for a server behind TLS; several with commas between them share the
-            rows of each call, and go on without one that dies.
-        token: the server's; None means that of the environment variable WIW_TOKEN.
-        patience: seconds that the first connection may take.
+            rows of each call, and go on without one that dies. Or a folder in which servers of the same model announce
+            themselves (`wiw serve --announce FOLDER/NAME.json`).
+        token: the server's; None means that of the environment variable WIW_TOKEN. Announced servers say theirs.
+        patience: seconds that the first connection may take; 15 if not given, 270 for servers that are announced.
 
     Raises:
         ArgumentError: no such address, or one twice.
@@ -48,10 +52,12 @@ class Remote(WorldModel):
             another model than the first.
     """
 
-    def __init__(self, address: str, token: str | None = None, patience: float = 15.0) -> None:
+    def __init__(self, address: str, token: str | None = None, patience: float | None = None) -> None:
         self._arguments = (address, token, patience)
-        key = token if token is not None else os.environ.get(TOKEN)
-        links = [Link(each, key) for each in _check_addresses(address)]
+        folder, key = _find_folder(address), token if token is not None else os.environ.get(TOKEN)
+        if patience is None:
+            patience = PATIENCE if folder is None else PATIENCE_FOR_JOBS
+        links = [Link(each, key) for each in (_check_addresses(address) if folder is None else [folder])]
         self._link = links[0] if len(links) == 1 else Links(links)
         self._close = weakref.finalize(self, self._link.close)
         try:
@@ -116,6 +122,12 @@ class Remote(WorldModel):
         self._close()
 
 
+def _find_folder(address: str) -> str | None:
+    """Return the folder in which servers announce themselves; None for addresses."""
+    path = Path(address).expanduser()
+    return str(path.resolve()) if "://" not in address and (os.sep in address or path.is_dir()) else None
+
+
 def _check_addresses(text: str) -> list[str]:
     addresses = [_check_address(each.strip()) for each in text.split(",")]
     if len(set(addresses)) < len(addresses):
@@ -130,7 +142,10 @@ def _check_address(address: str) -> str:
     try:
         uri = parse_uri(address)
     except (InvalidURI, ValueError):
-        raise ArgumentError(f"remote: expected an address such as ws://127.0.0.1:8765, got '{address}'") from None
+        raise ArgumentError(
+            "remote: expected an address such as ws://127.0.0.1:8765, or a folder of `wiw serve --announce`, "
+            f"got '{address}'"
+        ) from None
     if uri.username or uri.query:
         raise ArgumentError(f"remote: the address is written into records; put the token into {TOKEN} instead")
     return address

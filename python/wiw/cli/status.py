@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw status`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from wiw.cli.terminal import printable
+
+
+def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN")]], /) -> int:
+    """Show how far runs are: shards, ended episodes, errors, time left. Only reads, also while runs are going on.
+
+    $ wiw status runs/first
+    $ wiw status runs/a runs/b
+
+    States: done; running (by a process of this machine); on HOST (run by another machine when it was last written);
+    stopped. The time left is estimated from the episodes that have ended since the present process began.
+
+    Args:
+        runs: Folders of runs, or folders that hold the folders of shards.
+    """
+    print("\n\n".join(printable(_describe(run)) for run in runs))
+    return 0
+
+
+def _describe(run: Path) -> str:
+    """Return how far a run is, and the states of the jobs that were submitted for it."""
+    from wiw.errors import StoreError
+    from wiw.runs.status import status as read_status
+    from wiw.runs.submission import find_states
+
+    jobs = [
+        f"job {job.id}  {job.state}  {' '.join(job.arguments[:2])} {_name_shard(job.arguments)}"
+        for job in find_states(run)
+    ]
+    try:
+        return "\n".join([str(read_status(run)), *jobs])
+    except StoreError as error:
+        if not jobs:
+            raise
+        return "\n".join([str(error), *jobs])
+
+
+def _name_shard(arguments: Sequence[str]) -> str:
+    return arguments[arguments.index("--shard") + 1] if "--shard" in arguments else ""

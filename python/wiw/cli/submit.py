@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`wiw submit` and `wiw cancel`."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from wiw.cli.command_line import format_flags
+from wiw.cli.parts import AgentFlags, TaskFlags
+from wiw.cli.run import AGENT, SEARCH, SETTINGS, TASK, PreparedRun, prepare_run
+from wiw.errors import ArgumentError
+from wiw.loop.config import AgentConfig
+from wiw.runs.config import RunConfig
+from wiw.runs.shards import Shard
+from wiw.runs.submission import ClusterConfig
+
+CLUSTER = ClusterConfig()
+SERVERS = "servers"
+"""Folder in that of the run in which servers announce themselves."""
+IDLE = "1800"
+"""Seconds without a client after which a server ends."""
+
+
+def submit(
+    task: Positional[Annotated[str, arg(metavar="TASK")]] = "imagenav",
+    /,
+    *,
+    shards: Annotated[int, arg(metavar="N")] = 8,
+    servers: Annotated[int, arg(metavar="N")] = 0,
+    server_gpus: Annotated[int, arg(metavar="N")] = 1,
+    server_partition: Annotated[str | None, arg(metavar="NAME")] = None,
+    jobs: Annotated[ClusterConfig, arg(name="")] = CLUSTER,
+    dry_run: bool = False,
+    parts: Annotated[AgentFlags, arg(name="")] = AGENT,
+    arms: Annotated[str | None, arg(metavar="[NAME=]MODEL[?KEY=VALUE],...")] = None,
+    rules: Annotated[TaskFlags, arg(name="")] = TASK,
+    search: Annotated[AgentConfig, arg(name="")] = SEARCH,
+    config: Annotated[RunConfig, arg(name="")] = SETTINGS,
+) -> int:
+    """Run an agent in shards, as an array of SLURM jobs. Takes the flags of `wiw run`; needs wiw[slurm].
+
+    $ wiw submit imagenav --arms none,warp --episodes 400 --shards 8 --partition cpu --out runs/a
+    $ wiw submit imagenav --world-model svd --shards 4 --partition gpu --gpus 1 --minutes 720 --out runs/b
+    $ wiw submit imagenav --world-model svd --shards 16 --partition cpu --servers 4 --server-partition gpu --out runs/d
+    $ wiw submit imagenav --arms none,warp --episodes 8 --shards 2 --cluster local --out runs/c
+    $ wiw status runs/a
+    $ wiw merge runs/a --out runs/a
+    $ wiw cancel runs/a
+
+    Prints the command of each job, which a person can run by hand. A job writes its store on the node's own disk and
+    copies it to a folder in --out, which all nodes must see. Before the time limit, or when it is preempted, a job
+    stops, everything recorded, and is requeued. After a failure the same command submits what is left.
+
+    Args:
+        task: See `wiw list`.
+        shards: Number of parts of the episodes, each a job.
+        servers: Jobs of their own that serve --world-model to all shards; none, and each shard has its own model, if
+            not given. A server ends after half an hour without a client.
+        server_gpus: GPUs of such a job.
+        server_partition: Its SLURM partition; --partition if not given.
+        jobs: What a job asks of the cluster.
+        dry_run: Whether to print the commands and submit nothing.
+        parts: The agent.
+        arms: As for `wiw run`.
+        rules: What it is run on.
+        search: Numbers of the search.
+        config: How the run goes.
+    """
+    from wiw.runs.submission import submit_commands
+
+    for name in ("shard", "resume"):
+        if getattr(config, name):
+            raise ArgumentError(f"submit: --{name} is what each job is given; leave it out")
+    prepared = prepare_run(task, parts, arms, rules, search, config)
+    folder, count = Path(prepared.settings.out or ""), prepared.count
+    Shard(1, shards).select(count)
+    serving = _write_servers(folder, parts, servers, jobs.cluster)
+    if serving:
+        parts, arms = replace(parts, world_model=_remote(folder), world_model_option=()), _ask_servers(prepared, folder)
+    parted = [Shard(number, shards) for number in range(1, shards + 1)]
+    commands = {shard: _write_command(task, arms, (parts, rules, search), prepared.settings, shard) for shard in parted}
+    active = _require_alone(folder, [*serving, *commands.values()])
+    left = [command for shard, command in commands.items() if not _is_done(folder / shard.folder)]
+    absent = [command for command in serving if left and tuple(command) not in active]
+    for command in [*absent, *left]:
+        print(shlex.join(["wiw", *command]))
+    if left and not dry_run:
+        name = f"wiw-{folder.name}"
+        own = replace(jobs, gpus=server_gpus, partition=server_partition or jobs.partition)
+        begun = submit_commands(folder, absent, own, f"{name}-server") if absent else []
+        submitted = submit_commands(folder, left, jobs, name, begun)
+        print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
+    print(f"then    wiw status {folder}\n        wiw merge {folder} --out {folder}")
+    return 0
+
+
+def cancel(run: Positional[Annotated[Path, arg(metavar="RUN")]], /) -> int:
+    """Cancel the jobs of a run. Everything recorded is kept; `wiw submit` with the same flags goes on.
+
+    $ wiw cancel runs/a
+
+    Args:
+        run: Folder that was given to `wiw submit` as --out.
+    """
+    from wiw.runs.submission import cancel as cancel_jobs
+
+    told = cancel_jobs(run)
+    print(f"{run}: told {len(told)} jobs to end")
+    return 0
+
+
+def _write_command(
+    task: str, arms: str | None, flags: tuple[AgentFlags, TaskFlags, AgentConfig], settings: RunConfig, shard: Shard
+) -> list[str]:
+    """Return the command of a shard as arguments of `wiw`."""
+    own = replace(
+        settings,
+        shard=str(shard),
+        out=Path(settings.out or "") / shard.folder,
+        scratch=settings.scratch or "auto",
+        resume=True,
+        progress=False,
+    )
+    named = [] if arms is None else ["--arms", arms]
+    return ["run", task, *named, *(part for each in (*flags, own) for part in format_flags(each))]
+
+
+def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ...]]:
+    """Check that a run is submitted as it was before, and that nothing else writes its shards; return active servers.
+
+    Raises:
+        ArgumentError: other commands were submitted for it before, or shards of it still wait or run.
+    """
+    from wiw.runs.submission import find_active, read_jobs
+
+    before = [job.arguments for job in read_jobs(folder)]
+    if before and not {tuple(command) for command in commands} >= set(before):
+        raise ArgumentError(
+            f"submit: {folder} was submitted with other flags, such as: {shlex.join(['wiw', *before[-1]])}; give the "
+            "same ones, or another --out"
+        )
+    active = find_active(folder)
+    if shards := [job for job in active if job.arguments[0] == "run"]:
+        raise ArgumentError(
+            f"submit: job {shards[0].id} of {folder} is {shards[0].state}, and {len(shards)} in all; wait for them, or "
+            f"`wiw cancel {folder}` first"
+        )
+    return {job.arguments for job in active}
+
+
+def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) -> list[list[str]]:
+    """Return the commands of servers of the world model.
+
+    Raises:
+        ArgumentError: there is no world model.
+    """
+    if count and parts.world_model == "none":
+        raise ArgumentError("submit: --servers serve --world-model, and none is given; name one, or leave them out")
+    options = [part for option in parts.world_model_option for part in ("--world-model-option", option)]
+    listen = ["--host", "127.0.0.1" if cluster == "local" else "0.0.0.0", "--port", "0", "--idle", IDLE]
+    return [
+        ["serve", parts.world_model, *options, *listen, "--announce", str(folder / SERVERS / f"{number}.json")]
+        for number in range(1, count + 1)
+    ]
+
+
+def _remote(folder: Path) -> str:
+    return f"remote:{(folder / SERVERS).expanduser().resolve()}"
+
+
+def _ask_servers(prepared: PreparedRun, folder: Path) -> str:
+    """Return the arms of a run with the served model in place of its own, under the same name."""
+    from wiw.runs.arm_text import parse_arm
+
+    own = str(prepared.agent.model)
+    served = f"{prepared.agent.arm}={_remote(folder)}"
+    return ",".join(served if text == own else str(parse_arm(text)) for text in prepared.arms or [own])
+
+
+def _is_done(shard: Path) -> bool:
+    """Return whether a shard has ended all its episodes."""
+    from wiw.runs.status import status
+    from wiw.runs.store import store_path
+
+    return store_path(shard).is_file() and all(store.state == "done" for store in status(shard).stores)

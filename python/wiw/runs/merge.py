@@ -1,0 +1,239 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Merge the stores of a run's shards into one run, equal to what one process would have recorded.
+
+Equal are all rows of episodes, outcomes, decisions, pictures, films and maps. Excepted are times (`seconds`), `spent`
+and `calls` as far as they depend on which episodes were live together, and what `info` says of machines and commands.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass
+from inspect import isfunction
+from pathlib import Path
+from typing import Any
+
+from wiw.errors import Error, StoreError
+from wiw.registry import POLICIES, TASKS, WORLD_MODELS
+from wiw.runs.execute import draw_pictures, recipes_of
+from wiw.runs.pictures import drop_spare_pictures
+from wiw.runs.rows import to_json
+from wiw.runs.run import find_stores
+from wiw.runs.scratch import find_local_folder
+from wiw.runs.store import RunStore
+from wiw.runs.verify import list_differences, read_facts
+from wiw.world_models.base import Requirements
+
+Key = tuple[str, int]
+"""Arm and index of an episode."""
+_ABSENT = "absent"
+
+
+@dataclass(frozen=True)
+class Merged:
+    """The result of `wiw.merge`; prints as a few lines."""
+
+    run: Path
+    stores: int
+    ended: int
+    """Episodes of all arms that have ended."""
+    pending: Mapping[str, int]
+    """By arm: episodes that no store has ended; arms without any are left out."""
+    repeated: int
+    """Episodes that several stores had, all with the same record."""
+    unlike: tuple[str, ...]
+    """Episodes that several stores had with unlike records, where none is promised to be equal; the first was taken.
+    E.g. "vlm episode 3: decision 0: note: recorded ..., now ...": the first difference."""
+    undrawn: str = ""
+    """Reason why scene maps and films could not be drawn here; empty where they were."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether every arm has ended every episode."""
+        return not self.pending
+
+    def __str__(self) -> str:
+        lines = [f"{self.run}: {self.ended} episodes of {self.stores} stores"]
+        if self.repeated:
+            lines.append(f"{self.repeated} of them were in several stores, with equal records")
+        if self.unlike:
+            lines.append(f"{len(self.unlike)} were in several stores with unlike records; the first was taken:")
+            lines += [f"  {text}" for text in self.unlike]
+        if self.pending:
+            left = ", ".join(f"{arm} {count}" for arm, count in self.pending.items())
+            lines.append(f"episodes that no store has: {left}; run them with `wiw resume {self.run}`")
+        if self.undrawn:
+            lines.append(f"scene maps and films could not be drawn here: {self.undrawn}")
+        return "\n".join(lines)
+
+
+def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | None = None) -> Merged:
+    """Merge the stores of shards, or of the same run in other places, into one run.
+
+        wiw.merge(["/scratch/a/1", "/scratch/a/2"], out="runs/a")
+        wiw.merge(["runs/a"], out="runs/whole")        # all stores in folders of runs/a
+
+    An episode that several stores have is taken from the first that has ended it without an error. Their records must
+    be equal where that is promised: built-in parts without weights, on machines of the same kind. Elsewhere unlike ones
+    are counted. Stores may still be written, and episodes may be missing: `wiw resume` runs these.
+
+    Args:
+        stores: folders with a store, or with folders that have one.
+        out: folder of the merged run, on any disk: the store is complete there or absent.
+        scratch: folder on a local disk in which it is written; the system's for temporary files if not given.
+
+    Raises:
+        StoreError: no store; manifests that differ, naming the difference; unlike records of an episode for which equal
+            ones are promised; `out` holds a run already.
+        FileError: `out` cannot be written.
+    """
+    with ExitStack() as stack:
+        parts = [stack.enter_context(RunStore.read(folder)) for folder in find_stores(stores)]
+        require_equal_manifests(parts)
+        takes, repeated, unlike = _choose_sources(parts)
+        own = find_local_folder() if scratch is None else Path(scratch)
+        own.mkdir(parents=True, exist_ok=True)
+        local = stack.enter_context(tempfile.TemporaryDirectory(prefix="wiw-merge-", dir=own))
+        created = min(part.created for part in parts)
+        target = RunStore.create(out, parts[0].config, _merge_info(parts), parts[0].episodes(), local, created)
+        try:
+            for part, episodes in zip(parts, takes, strict=True):
+                target.take_episodes(part, episodes)
+            drop_spare_pictures(target)
+            undrawn = _draw_pictures(target)
+            left = {arm["name"]: len(target.pending(arm["name"])) for arm in target.config["arms"]}
+        except BaseException:
+            target.abandon()
+            raise
+        target.close()
+    pending = {arm: count for arm, count in left.items() if count}
+    return Merged(Path(out), len(parts), sum(map(len, takes)), pending, repeated, tuple(unlike), undrawn)
+
+
+def require_equal_manifests(stores: Sequence[RunStore]) -> None:
+    """Check that stores are of the same run: version, task, seed, arms, episodes, scenes, source files, measurements.
+
+    Raises:
+        StoreError: two differ; says in what, and which they are.
+    """
+    first = stores[0]
+    manifest = _read_manifest(first)
+    for other in stores[1:]:
+        for place, here, there in _compare(manifest, _read_manifest(other), ""):
+            raise StoreError(
+                f"{first.path.parent} and {other.path.parent} are not of the same run: {place}: "
+                f"{_show(here)} and {_show(there)}; expected stores of one command that differ in --shard alone"
+            )
+        built, built_there = first.info.get("built", {}), other.info.get("built", {})
+        for arm in built.keys() & built_there.keys():
+            for place, here, there in _compare(built[arm], built_there[arm], f"agent {arm}"):
+                raise StoreError(
+                    f"{first.path.parent} and {other.path.parent} had unlike agents: {place}: {_show(here)} and "
+                    f"{_show(there)}; expected the same weights and options everywhere"
+                )
+
+
+def _read_manifest(store: RunStore) -> dict[str, Any]:
+    info = store.info
+    episodes = [{**asdict(episode), "geodesic": None} for episode in store.episodes()]  # may be measured in one alone
+    limits = {name: info["limits"].get(name) for name in ("fidelity", "lpips")}
+    kept = {name: info.get(name) for name in ("sources", "scenes")}
+    return {"wiw": store.wiw_version, **store.config, **limits, **kept, "episode": episodes}
+
+
+def _compare(first: Any, second: Any, place: str) -> Iterator[tuple[str, Any, Any]]:
+    """Return the places at which two manifests differ, with both values."""
+    if isinstance(first, dict) and isinstance(second, dict):
+        for name in dict.fromkeys([*first, *second]):
+            inner = f"{place}.{name}" if place else str(name)
+            yield from _compare(first.get(name, _ABSENT), second.get(name, _ABSENT), inner)
+    elif isinstance(first, list | tuple) and isinstance(second, list | tuple) and len(first) == len(second):
+        for index, (one, other) in enumerate(zip(first, second, strict=True)):
+            yield from _compare(one, other, f"{place}[{index}]")
+    elif first != second:
+        yield place, first, second
+
+
+def _show(value: Any, most: int = 120) -> str:
+    text = to_json(value)
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def _choose_sources(parts: Sequence[RunStore]) -> tuple[list[set[Key]], int, list[str]]:
+    """Return the episodes to take from each store, the number of repeated ones, and those with unlike records."""
+    found: dict[Key, list[tuple[int, Mapping[str, Any]]]] = {}
+    for index, part in enumerate(parts):
+        for row in part.recorded_outcomes():
+            found.setdefault((row["arm"], row["episode"]), []).append((index, row))
+    takes, repeated, unlike = [set[Key]() for _ in parts], 0, list[str]()
+    for key, records in found.items():
+        done = [record for record in records if record[1]["status"] == "done"] or records[:1]
+        takes[done[0][0]].add(key)
+        differences = [text for other in done[1:] if (text := _find_difference(parts, done[0], other))]
+        unlike += differences[:1]
+        repeated += len(done) > 1 and not differences
+    return takes, repeated, unlike
+
+
+def _find_difference(
+    parts: Sequence[RunStore], first: tuple[int, Mapping[str, Any]], other: tuple[int, Mapping[str, Any]]
+) -> str:
+    """Return the first difference between two records of an episode; empty where they are equal.
+
+    Raises:
+        StoreError: they differ though they are promised to be equal.
+    """
+    (store, row), (store_there, row_there) = ((parts[index], row) for index, row in (first, other))
+    facts, facts_there = read_facts(store, row), read_facts(store_there, row_there)
+    text = next(list_differences(facts, facts_there), "")
+    if text and _is_promised(store, row["arm"], facts) and store.info["platform"] == store_there.info["platform"]:
+        raise StoreError(
+            f"{row['arm']} episode {row['episode']} has unlike records in {store.path.parent} and "
+            f"{store_there.path.parent}, though equal ones are promised of its parts on equal machines: {text}. "
+            "Find out which is right with `wiw verify`, and merge without the other"
+        )
+    return f"{row['arm']} episode {row['episode']}: {text}" if text else ""
+
+
+def _is_promised(store: RunStore, arm: str, facts: Sequence[tuple[str, Mapping[str, Any]]]) -> bool:
+    """Return whether results are promised to be equal on equal machines: built-in parts, no weights, no server."""
+    task, agent = store.info["task"], store.info["agents"][arm]
+    if task is None or agent is None or task["name"] not in TASKS.built_in:
+        return False
+    policies = [agent["policy"], *([agent["reviser"]] if agent["reviser"] else [])]
+    asked = any(values.get("exchanges") for _, values in facts)
+    return all(policy in POLICIES.built_in for policy in policies) and _needs_nothing(agent["model"]) and not asked
+
+
+def _needs_nothing(model: str | None) -> bool:
+    """Return whether a world model is a built-in one without packages, weights or servers of its own."""
+    if model is None:
+        return True
+    found = WORLD_MODELS.find(model) if model in WORLD_MODELS.built_in else None
+    return isfunction(found) or (found is not None and found.requires == Requirements())
+
+
+def _merge_info(parts: Sequence[RunStore]) -> dict[str, Any]:
+    """Return the first store's info as that of the whole run, and where each part is from."""
+    infos = [part.info for part in parts]
+    named = ("shard", "platform", "command", "preparation_seconds", "session")
+    info = {name: value for name, value in infos[0].items() if name not in ("shard", "session")}
+    info["built"] = {arm: agent for own in reversed(infos) for arm, agent in own.get("built", {}).items()}
+    info["preparation_seconds"] = sum(own.get("preparation_seconds", 0.0) for own in infos)
+    info["merged"] = [
+        {"store": str(part.path.parent), "created": part.created, **{name: own.get(name) for name in named}}
+        for part, own in zip(parts, infos, strict=True)
+    ]
+    return info
+
+
+def _draw_pictures(store: RunStore) -> str:
+    """Draw maps and films as at the end of a run; return why that cannot be done here."""
+    try:
+        task, _ = recipes_of(store)
+        draw_pictures(store, task.build())
+    except Error as error:
+        return str(error)
+    return ""

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A store that is written on a local disk and copied as a whole to its own folder, which any disk may hold.
+
+The copy is made as episodes begin to be run, then at most once a minute, and when the store is closed: at the run's
+end, or when it is stopped. So a machine that is lost takes the episodes of a minute with it. A copy is complete or
+absent, and needs no log beside it, so it can be read anywhere.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import tempfile
+import time
+from contextlib import closing, suppress
+from hashlib import blake2b
+from pathlib import Path
+
+from wiw.files import atomic_file
+
+PERIOD = 60.0
+"""Seconds between two copies."""
+
+
+class ScratchCopy:
+    """The store at `path`, on a local disk, whose own place is `home`."""
+
+    def __init__(self, home: Path, scratch: Path) -> None:
+        own = home.expanduser().resolve()
+        scratch = find_local_folder() if str(scratch) == "auto" else scratch
+        digest = blake2b(str(own).encode(), digest_size=6).hexdigest()
+        self.home = home
+        self.path = scratch.expanduser().resolve() / f"{own.parent.name}-{digest}" / own.name
+        self._copied = time.monotonic()
+
+    def take_in(self) -> None:
+        """Fetch the store from its home, unless a killed process has left more of the same run here.
+
+        The caller holds the store's lock.
+        """
+        with closing(_open(self.home, "ro")) as source:
+            if self._has_left_more(source):
+                return
+            self.discard()
+            with closing(sqlite3.connect(self.path)) as target:
+                source.backup(target)
+
+    def copy_if_due(self, connection: sqlite3.Connection) -> None:
+        """Copy the store home if the last time was long enough ago."""
+        if time.monotonic() - self._copied >= PERIOD:
+            self.copy(connection)
+
+    def copy(self, connection: sqlite3.Connection) -> None:
+        """Copy the store home.
+
+        Raises:
+            FileError: it cannot be written; the store here is whole.
+        """
+        draft = self.path.with_name(f"{self.path.name}.copy")
+        write_whole(connection, draft)
+        with atomic_file(self.home) as file:
+            shutil.copyfile(draft, file)
+        draft.unlink()
+        self._copied = time.monotonic()
+
+    def discard(self) -> None:
+        """Remove what an earlier process has left here; the caller holds the lock."""
+        for end in ("", "-wal", "-shm", ".copy"):
+            self.path.with_name(self.path.name + end).unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the store here, and its folder."""
+        self.discard()
+        self.path.with_suffix(".lock").unlink(missing_ok=True)
+        with suppress(OSError):  # other files are in it
+            self.path.parent.rmdir()
+
+    def _has_left_more(self, home: sqlite3.Connection) -> bool:
+        if not self.path.is_file():
+            return False
+        try:
+            with closing(_open(self.path, "rw")) as left:  # takes in what is in its log
+                (begun, ended), (begun_here, ended_here) = _count_ended(home), _count_ended(left)
+        except sqlite3.DatabaseError:  # cut off while it was fetched
+            return False
+        return begun_here == begun and ended_here > ended
+
+
+def find_local_folder() -> Path:
+    """Return where temporary files belong: the folder of the SLURM job where the cluster makes one, else $TMPDIR."""
+    return Path(os.environ.get("SLURM_TMPDIR") or tempfile.gettempdir())
+
+
+def write_whole(connection: sqlite3.Connection, path: Path) -> None:
+    """Write a store as one file that needs no log beside it."""
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as target:
+        connection.backup(target)
+        target.execute("PRAGMA journal_mode = DELETE")
+
+
+def _count_ended(store: sqlite3.Connection) -> tuple[str, int]:
+    """Return when the run began, and how many episodes have ended without an error."""
+    (begun,) = store.execute("SELECT created FROM run").fetchone()
+    (ended,) = store.execute("SELECT count(*) FROM outcome WHERE status = 'done'").fetchone()
+    return begun, ended
+
+
+def _open(path: Path, mode: str) -> sqlite3.Connection:
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode={mode}", uri=True)

@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far runs are. Only reads: safe while other processes write."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+from typing import Any, Literal
+
+from wiw.runs.processes import is_here, is_running
+from wiw.runs.run import find_stores
+from wiw.runs.shards import Shard
+from wiw.runs.store import RunStore
+
+State = Literal["done", "running", "elsewhere", "stopped"]
+
+
+@dataclass(frozen=True)
+class StoreStatus:
+    """How far one store is."""
+
+    store: Path
+    shard: Shard | None
+    of_run: int
+    """Episodes of all arms of the whole run."""
+    total: int
+    """Episodes of all arms that this store is for."""
+    ended: int
+    errors: int
+    """Those of them that ended with an infrastructure error."""
+    state: State
+    """Whether all have ended, a process of this machine runs them, or one of another machine did at the last write."""
+    host: str
+    """Machine that last ran episodes; empty where none has."""
+    written: datetime
+    """Last write of the file, or of its copy where the store is written on another disk."""
+    seconds_left: float | None
+    """Estimate from the episodes that have ended since the present process began; None where there are none."""
+
+
+@dataclass(frozen=True)
+class RunStatus:
+    """How far a run is, over all its stores; prints as a table."""
+
+    run: Path
+    stores: tuple[StoreStatus, ...]
+
+    @property
+    def ended(self) -> int:
+        """Episodes of all arms that have ended."""
+        return sum(store.ended for store in self.stores)
+
+    @property
+    def errors(self) -> int:
+        """Those of them that ended with an infrastructure error."""
+        return sum(store.errors for store in self.stores)
+
+    @property
+    def total(self) -> int:
+        """Episodes of all arms of the whole run, those included whose shards have no store yet."""
+        return max(store.of_run for store in self.stores)
+
+    @property
+    def missing(self) -> tuple[Shard, ...]:
+        """Shards that have no store yet."""
+        shards = [store.shard for store in self.stores if store.shard is not None]
+        counts = {shard.count for shard in shards}
+        if len(shards) < len(self.stores) or len(counts) != 1:
+            return ()
+        (count,) = counts
+        return tuple(shard for number in range(1, count + 1) if (shard := Shard(number, count)) not in shards)
+
+    @property
+    def seconds_left(self) -> float | None:
+        """Estimated time until the last shard ends; None where any that is not done has no estimate."""
+        left = [store.seconds_left for store in self.stores if store.state != "done"]
+        known = [seconds for seconds in left if seconds is not None]
+        return None if self.missing or len(known) < len(left) else max(known, default=0.0)
+
+    def __str__(self) -> str:
+        rows: list[tuple[str, ...]] = [("shard", "episodes", "errors", "state", "last write", "left", "store")]
+        rows += [_format_row(store) for store in self.stores]
+        left = _format_seconds(self.seconds_left)
+        share = 100 * self.ended / max(1, self.total)
+        rows.append(("all", f"{self.ended}/{self.total}", str(self.errors), f"{share:.0f} %", "", left, str(self.run)))
+        widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+        lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in rows]
+        if self.missing:
+            lines.append(f"no store yet: shards {', '.join(map(str, self.missing))}")
+        return "\n".join(line.rstrip() for line in lines)
+
+
+def status(run: str | Path) -> RunStatus:
+    """Return how far a run is.
+
+    Args:
+        run: folder of a run, or one that holds the folders of its shards.
+
+    Raises:
+        StoreError: no store, or one that cannot be read.
+    """
+    return RunStatus(Path(run), tuple(map(_read_status, find_stores([run]))))
+
+
+def _read_status(folder: Path) -> StoreStatus:
+    with RunStore.read(folder) as store:
+        arms = len(store.config["arms"])
+        total, (ended, errors) = arms * len(store.own_episodes()), store.count_ended()
+        session = store.info.get("session")
+        written = _read_time(store.path)
+        state = _find_state(session, ended >= total)
+        left = _estimate_left(session, state, written, ended, total)
+        return StoreStatus(
+            folder,
+            store.shard,
+            arms * store.config["episodes"],
+            total,
+            ended,
+            errors,
+            state,
+            "" if session is None else session["host"],
+            written,
+            left,
+        )
+
+
+def _read_time(path: Path) -> datetime:
+    """Return when a store was last written; the latest transactions may lie in the log beside it."""
+    files = [path, path.with_name(f"{path.name}-wal")]
+    return datetime.fromtimestamp(max(file.stat().st_mtime for file in files if file.exists()), timezone.utc)
+
+
+def _find_state(session: Mapping[str, Any] | None, done: bool) -> State:
+    if done:
+        return "done"
+    if session is None:
+        return "stopped"
+    if not is_here(session):
+        return "elsewhere"
+    return "running" if is_running(session) else "stopped"
+
+
+def _estimate_left(
+    session: Mapping[str, Any] | None, state: State, written: datetime, ended: int, total: int
+) -> float | None:
+    """Return the seconds until all have ended, at the pace since the session began."""
+    if state == "done":
+        return 0.0
+    if session is None or state == "stopped" or ended <= session["ended"]:
+        return None
+    seconds = (written - datetime.fromisoformat(session["begun"])).total_seconds()
+    return max(0.0, seconds) * (total - ended) / (ended - session["ended"])
+
+
+def _format_row(store: StoreStatus) -> tuple[str, ...]:
+    state = {"running": "running", "elsewhere": f"on {store.host}"}.get(store.state, store.state)
+    ago = (datetime.now(timezone.utc) - store.written).total_seconds()
+    return (
+        "-" if store.shard is None else str(store.shard),
+        f"{store.ended}/{store.total}",
+        str(store.errors),
+        state,
+        f"{_format_seconds(max(0.0, ago))} ago",
+        _format_seconds(store.seconds_left),
+        str(store.store),
+    )
+
+
+def _format_seconds(seconds: float | None) -> str:
+    return "?" if seconds is None else str(timedelta(seconds=round(seconds)))

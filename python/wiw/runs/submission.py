@@ -1,0 +1,312 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Submit commands as jobs of a cluster, through submitit: one array, each element a command a person can run by hand.
+
+A job is this module's `JobCommand`, which starts the command as a process of its own. Before the time limit, and when
+it is preempted with a warning, SLURM sends SIGUSR2: the command stops, everything recorded, and submitit requeues the
+job. At SIGTERM the command stops likewise; `--requeue` lets SLURM itself start the job again where it was preempted,
+and not where it was cancelled.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, Literal
+
+from tyro.conf import arg
+
+from wiw.errors import ArgumentError, DependencyError, InfrastructureError, StoreError
+from wiw.files import atomic_file
+
+SIGNAL_DELAY = 90
+"""Seconds before the time limit at which SLURM sends SIGUSR2."""
+PATIENCE = 45.0
+"""Seconds that a command has for stopping; `wiw run` takes 5 at most, `wiw serve` 30 unless it is told otherwise."""
+FILE_NAME = "jobs.json"
+LOGS = "jobs"
+"""Folder in that of the run with submitit's files and the output of jobs."""
+ACTIVE = frozenset({"PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY"})
+"""States of jobs that wait or run."""
+FINISHED = (0, 1)
+"""Exit codes of a command that is not to be run again: done, or done with an invalid run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClusterConfig:
+    """What jobs ask of the cluster. Memory, accounts and so on are the cluster's own defaults if not given.
+
+    Raises:
+        ArgumentError: a number out of range.
+    """
+
+    cluster: Literal["slurm", "local"] = "slurm"
+    """slurm, or local: processes of this machine, all at once, to try a submission."""
+    partition: Annotated[str | None, arg(metavar="NAME")] = None
+    """SLURM partition."""
+    minutes: Annotated[float, arg(metavar="N")] = 240
+    """Time limit of a job; one that reaches it is requeued and goes on."""
+    requeues: Annotated[int, arg(metavar="N")] = 50
+    """How often a job may reach its time limit."""
+    gpus: Annotated[int, arg(metavar="N")] = 0
+    """GPUs of a job."""
+    cpus: Annotated[int | None, arg(metavar="N")] = None
+    """Cores of a job."""
+    memory: Annotated[float | None, arg(metavar="GB")] = None
+    """Memory of a job in gigabytes."""
+    parallel: Annotated[int, arg(metavar="N")] = 256
+    """Most jobs of the array that run at a time."""
+    account: Annotated[str | None, arg(metavar="NAME")] = None
+    """SLURM account."""
+    qos: Annotated[str | None, arg(metavar="NAME")] = None
+    """SLURM quality of service."""
+    constraint: Annotated[str | None, arg(metavar="FEATURES")] = None
+    """SLURM constraint on nodes."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("minutes", 0.05), ("requeues", 0), ("gpus", 0), ("cpus", 1), ("parallel", 1)):
+            value = getattr(self, name)
+            if value is not None and not value >= least:
+                raise ArgumentError(f"submit: expected {name} of at least {least}, got {value}")
+
+    def list_parameters(self, name: str) -> dict[str, Any]:
+        """Return the parameters of submitit's executor."""
+        common = {
+            "name": name,
+            "timeout_min": self.minutes,
+            "gpus_per_node": self.gpus or None,
+            "cpus_per_task": self.cpus,
+            "mem_gb": self.memory,
+        }
+        if self.cluster == "local":
+            return {key: value for key, value in common.items() if value is not None and key != "mem_gb"}
+        common["timeout_min"] = max(1, round(self.minutes))
+        slurm = {
+            "slurm_partition": self.partition,
+            "slurm_account": self.account,
+            "slurm_qos": self.qos,
+            "slurm_constraint": self.constraint,
+            "slurm_signal_delay_s": SIGNAL_DELAY,
+            "slurm_array_parallelism": self.parallel,
+            "slurm_additional_parameters": {"requeue": True},
+        }
+        return {key: value for key, value in {**common, **slurm}.items() if value is not None}
+
+
+class JobCommand:
+    """A command of wiw as a job: runs it, stops it when it is told to, and starts it again when it is requeued."""
+
+    def __init__(self, arguments: Sequence[str]) -> None:
+        self.arguments = list(arguments)
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __call__(self) -> int:
+        """Run the command to its end, and return its exit code.
+
+        Raises:
+            InfrastructureError: it ended with another exit code than `FINISHED`.
+        """
+        process = self._process = subprocess.Popen([sys.executable, "-m", "wiw.cli", *self.arguments])
+        signal.signal(signal.SIGTERM, self._pass_on)
+        while (code := process.poll()) is None:  # wait() holds a lock that `checkpoint` would wait for
+            time.sleep(0.1)
+        if code not in FINISHED:
+            raise InfrastructureError(f"exit code {code} of: {self}; its output says why. Submit it again to go on")
+        return code
+
+    def checkpoint(self) -> Any:
+        """Stop the command and return it, to be run again; submitit calls this at SIGUSR2."""
+        from submitit.helpers import DelayedSubmission
+
+        process = self._process
+        if process is not None:
+            with suppress(ProcessLookupError):
+                os.kill(process.pid, signal.SIGTERM)
+            _wait_for_end(process.pid)
+        return DelayedSubmission(type(self)(self.arguments))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"arguments": self.arguments, "_process": None}
+
+    def __str__(self) -> str:
+        return shlex.join(["wiw", *self.arguments])
+
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+        if self._process is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, number)
+
+
+def _wait_for_end(process: int) -> None:
+    """Wait until a child has ended, and kill it if it takes too long; somebody else takes its exit code."""
+    deadline = time.monotonic() + PATIENCE
+    with suppress(ChildProcessError):  # its exit code was taken already
+        while os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
+            if time.monotonic() > deadline:
+                os.kill(process, signal.SIGKILL)
+            time.sleep(0.05)
+
+
+@dataclass(frozen=True)
+class SubmittedJob:
+    """A job of a run."""
+
+    cluster: str
+    id: str
+    arguments: tuple[str, ...]
+    """Of `wiw`."""
+    state: str = ""
+    """As the cluster says; empty where it was not asked."""
+
+
+def submit_commands(
+    run: str | Path,
+    commands: Sequence[Sequence[str]],
+    config: ClusterConfig,
+    name: str = "wiw",
+    after: Sequence[SubmittedJob] = (),
+) -> list[SubmittedJob]:
+    """Submit commands of wiw as one array of jobs, and note them in the run's folder.
+
+    Args:
+        run: its folder, which all machines of the cluster see.
+        commands: arguments of `wiw`, as in ["run", "imagenav", "--shard", "1/8"].
+        config: what each job asks for.
+        name: of the jobs.
+        after: SLURM jobs that must have begun before any of these does, such as servers.
+
+    Raises:
+        DependencyError: submitit is not installed.
+        InfrastructureError: this machine has no SLURM, or it refuses.
+    """
+    submitit = _import_submitit()
+    folder = Path(run).expanduser().resolve()
+    try:
+        timeouts = {} if config.cluster == "local" else {"slurm_max_num_timeout": config.requeues}
+        executor = submitit.AutoExecutor(folder / LOGS, cluster=config.cluster, **timeouts)
+        begun = {"slurm_dependency": ":".join(("after", *(job.id for job in after)))} if after else {}
+        executor.update_parameters(**config.list_parameters(name), **(begun if config.cluster == "slurm" else {}))
+        with executor.batch():
+            made = [executor.submit(JobCommand(arguments)) for arguments in commands]
+    except (RuntimeError, OSError, submitit.core.utils.FailedSubmissionError) as error:
+        raise InfrastructureError(
+            f"the jobs cannot be submitted: {error}; expected a machine from which sbatch works, or try the commands "
+            "on this one with --cluster local"
+        ) from error
+    jobs = [
+        SubmittedJob(config.cluster, str(job.job_id), tuple(arguments))
+        for job, arguments in zip(made, commands, strict=True)
+    ]
+    _write_jobs(folder, [*read_jobs(folder), *jobs])
+    return jobs
+
+
+def read_jobs(run: str | Path) -> list[SubmittedJob]:
+    """Return the jobs that were submitted for a run, oldest first; none where none were.
+
+    Raises:
+        StoreError: the list of jobs is damaged.
+    """
+    path = Path(run).expanduser() / FILE_NAME
+    if not path.is_file():
+        return []
+    try:
+        return [SubmittedJob(each["cluster"], each["id"], tuple(each["arguments"])) for each in _parse(path)]
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(f"{path} is damaged ({error}); remove it, and ask the cluster for its jobs") from error
+
+
+def find_states(run: str | Path) -> list[SubmittedJob]:
+    """Return the jobs of a run with their states, as the cluster says.
+
+    Raises:
+        StoreError: the list of jobs is damaged.
+    """
+    folder = Path(run).expanduser().resolve()
+    return [SubmittedJob(job.cluster, job.id, job.arguments, _find_state(folder, job)) for job in read_jobs(folder)]
+
+
+def find_active(run: str | Path) -> list[SubmittedJob]:
+    """Return the jobs of a run that wait or run, as the cluster says.
+
+    Raises:
+        StoreError: the list of jobs is damaged.
+    """
+    return [job for job in find_states(run) if job.state in ACTIVE]
+
+
+def cancel(run: str | Path) -> list[SubmittedJob]:
+    """Cancel all jobs of a run that have not ended; what was recorded is kept. Return those that were told to end.
+
+    Raises:
+        StoreError: no jobs were submitted for it, or the list of them is damaged.
+        InfrastructureError: SLURM cannot be asked to.
+    """
+    folder = Path(run).expanduser().resolve()
+    jobs = read_jobs(folder)
+    if not jobs:
+        raise StoreError(f"no jobs of {run}: expected a folder of `wiw submit` with {FILE_NAME} in it")
+    told = [job for job in jobs if job.cluster == "local" and _end_controller(job.id)]
+    arrays = list(dict.fromkeys(job.id.partition("_")[0] for job in jobs if job.cluster == "slurm"))
+    if arrays:
+        try:
+            subprocess.run(["scancel", *arrays], check=True, capture_output=True, text=True)
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise InfrastructureError(
+                f"scancel {' '.join(arrays)}: {getattr(error, 'stderr', '') or error}; expected a machine of the "
+                "cluster that the jobs were submitted from"
+            ) from error
+    return told + [job for job in jobs if job.cluster == "slurm"]
+
+
+def _parse(path: Path) -> list[Mapping[str, Any]]:
+    return list(json.loads(path.read_text()))
+
+
+def _write_jobs(folder: Path, jobs: Sequence[SubmittedJob]) -> None:
+    listed = [{"cluster": job.cluster, "id": job.id, "arguments": list(job.arguments)} for job in jobs]
+    with atomic_file(folder / FILE_NAME) as file:
+        file.write_text(json.dumps(listed, indent=1))
+
+
+def _import_submitit() -> Any:
+    try:
+        import submitit
+    except ModuleNotFoundError:
+        raise DependencyError("submitting jobs needs submitit: pip install 'wiw[slurm]'") from None
+    return submitit
+
+
+def _find_state(folder: Path, job: SubmittedJob) -> str:
+    if job.cluster == "local":
+        return "RUNNING" if _is_controller(job.id) else "ENDED"
+    try:
+        return str(_import_submitit().SlurmJob(folder / LOGS, job.id).state)
+    except (DependencyError, OSError) as error:
+        return f"unknown ({error})"
+
+
+def _end_controller(process: str) -> bool:
+    """Tell the process that watches a local job to end it; return whether it was there."""
+    if not _is_controller(process):
+        return False
+    with suppress(ProcessLookupError):
+        os.kill(int(process), signal.SIGTERM)
+    return True
+
+
+def _is_controller(process: str) -> bool:
+    """Return whether a process is one that watches a local job: numbers are used again."""
+    try:
+        return b"submitit.local._local" in Path("/proc", process, "cmdline").read_bytes()
+    except OSError:
+        return False

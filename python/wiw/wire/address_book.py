@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files in which servers announce where they listen, for clients whose command was written before.
+
+A file holds the server's token too, so its owner alone may read it. A server that comes back elsewhere replaces its
+file; one that was killed leaves it, and clients try the next.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from wiw.files import atomic_file
+
+
+@dataclass(frozen=True)
+class ServerAddress:
+    """Where a server listens."""
+
+    address: str
+    """"ws://HOST:PORT", or "wss://..."."""
+    token: str | None = None
+
+
+@contextmanager
+def announced(server: ServerAddress, file: Path) -> Iterator[None]:
+    """Announce a server in a file as long as the context lasts.
+
+    Raises:
+        FileError: it cannot be written.
+    """
+    with atomic_file(file) as draft:
+        draft.touch(mode=0o600)
+        draft.write_text(json.dumps(asdict(server)))
+    try:
+        yield
+    finally:
+        if read_addresses(file) == [server]:  # and not one that has come in its place
+            file.unlink(missing_ok=True)
+
+
+def read_addresses(place: Path) -> list[ServerAddress]:
+    """Return the servers that are announced in a file, or in the .json files of a folder; none where there are none."""
+    files = sorted(place.glob("*.json")) if place.is_dir() else [place]
+    found = []
+    for file in files:
+        with suppress(OSError, ValueError, TypeError):  # gone just now, or no announcement
+            found.append(ServerAddress(**json.loads(file.read_text())))
+    return found

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs in Ray actors are the same as in this process, whichever actors are lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from fakes import LineAgent, LineTask
+
+from wiw.cli import main
+from wiw.errors import ArgumentError, ContractError, DependencyError, InfrastructureError
+from wiw.runs import ray_engine
+from wiw.runs.config import RunConfig
+from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.store import store_path
+from wiw.studies.evaluate import evaluate, resume_run, run_arms
+from wiw.studies.run_log import load_run
+
+TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"
+
+
+def facts(run):
+    log = load_run(run)
+    rows = [*log.episodes, *log.decisions]
+    return [{name: value for name, value in row.items() if name not in ("seconds", "spent", "calls")} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def ray():
+    """A cluster of two cores, for all tests: starting one takes seconds."""
+    found = pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parent), *sys.path]))
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("OMP_NUM_THREADS", "1")
+        found.init(num_cpus=2, object_store_memory=10**8, include_dashboard=False, log_to_driver=False)
+        yield found
+        found.shutdown()
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    out = tmp_path_factory.mktemp("reference") / "run"
+    run_arms(LineTask(), {"none": LineAgent(0.5), "warp": LineAgent(0.8)}, 10, out=out, progress=False).close()
+    return facts(out)
+
+
+def run_line(out, workers=2, **options):
+    arms = {"none": LineAgent(0.5, **options), "warp": LineAgent(0.8, **options)}
+    return run_arms(LineTask(), arms, 10, out=out, progress=False, engine="ray", workers=workers, live=2)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_one_and_two_actors_record_what_one_process_does(ray, reference, tmp_path, workers):
+    run_line(tmp_path / "run", workers).close()
+    assert facts(tmp_path / "run") == reference
+    assert ray.is_initialized()  # it was there before
+
+
+def test_a_lost_actor_costs_the_episodes_in_flight_and_nothing_else(ray, reference, tmp_path):
+    """Its process is killed at decision 1 of episode 6, once."""
+    run_line(tmp_path / "run", kill=(6,), marker=str(tmp_path / "marker")).close()
+    assert facts(tmp_path / "run") == reference
+
+
+def test_an_episode_that_kills_every_actor_is_an_error_after_three_tries(ray, tmp_path):
+    log = run_line(tmp_path / "run", kill=(6,))
+    errors = [row for row in log.episodes if row["status"] == "error"]
+    assert [(row["arm"], row["episode"], row["kind"]) for row in errors] == [
+        ("none", 6, "worker"),
+        ("warp", 6, "worker"),
+    ]
+    assert all("the worker process died three times on this episode" in row["error"] for row in errors)
+    assert len(log.episodes) == 20
+
+
+def test_actors_that_are_killed_at_any_time_change_nothing(ray, reference, tmp_path, monkeypatch):
+    """Five actors are killed from outside, each once a row of its has come."""
+    killed, receive = [], ray_engine._ActorPool._receive
+
+    def receive_and_kill(pool, lease):
+        receive(pool, lease)
+        if lease.job is not None and lease.job.attempt == 0 and len(killed) < 5:
+            killed.append(lease.actor)
+            ray.kill(lease.actor)
+
+    monkeypatch.setattr(ray_engine._ActorPool, "_receive", receive_and_kill)
+    run_line(tmp_path / "run").close()
+    assert len(killed) == 5 and facts(tmp_path / "run") == reference
+
+
+def test_a_broken_contract_stops_the_run_as_in_this_process(ray, tmp_path):
+    method = "    def propose(self, situations, candidates, horizon):\n        return 3\n"
+    (tmp_path / "bad.py").write_text(f"import wiw\n\nclass Bad(wiw.Policy):\n{method}")
+    with pytest.raises(ContractError, match="propose"):
+        evaluate(
+            TaskRecipe(TASK),
+            AgentRecipe(f"{tmp_path}/bad.py:Bad"),
+            2,
+            out=tmp_path / "run",
+            progress=False,
+            engine="ray",
+        )
+
+
+def test_jobs_are_of_one_scene(ray, tmp_path, monkeypatch):
+    leased, assign = [], ray_engine._ActorPool._assign
+
+    def assign_and_note(pool, lease):
+        assign(pool, lease)
+        leased.extend([lease.job] if lease.job is not None else [])
+
+    monkeypatch.setattr(ray_engine._ActorPool, "_assign", assign_and_note)
+    run_line(tmp_path / "run").close()
+    assert all(len({episode.scene for _, episode in job.episodes}) == 1 for job in leased)
+    assert sum(len(job.episodes) for job in leased) == 20
+
+
+def test_a_driver_that_is_stopped_is_resumed_in_processes(tmp_path):
+    pytest.importorskip("ray", reason="needs ray: pip install 'wiw[ray]'")
+    out = tmp_path / "run"
+    command = ["run", TASK, "--policy", "heuristic", "--scenes", "slow", "--episodes", "12", "--live", "1"]
+    command += ["--out", str(out), "--engine", "ray", "--workers", "2", "--no-report"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1"}
+    driver = subprocess.Popen([sys.executable, "-m", "wiw.cli", *command], env=environment)
+    while driver.poll() is None and count_ended(out) < 3:
+        time.sleep(0.05)
+    driver.send_signal(signal.SIGTERM)
+    assert driver.wait(60) == 75  # Ray's own handler would end it otherwise
+    assert 3 <= count_ended(out) < 12
+    resume_run(out, progress=False, engine={"engine": "processes"}).close()
+    assert main([*command[:10], "--out", str(tmp_path / "whole"), "--no-report"]) == 0
+    assert facts(out) == facts(tmp_path / "whole")
+
+
+def count_ended(out):
+    return len(load_run(out).episodes) if store_path(out).exists() and store_path(out).stat().st_size else 0
+
+
+def test_without_ray_or_a_cluster_it_is_said(tmp_path, monkeypatch):
+    with pytest.raises(ArgumentError, match="give --engine ray"):
+        RunConfig(address="auto")
+    with pytest.raises(ArgumentError, match="worker_gpus of at least 0"):
+        RunConfig(engine="ray", worker_gpus=-1)
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(DependencyError, match=r"wiw\[ray\]"):
+        run_line(tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_objects_that_cannot_be_sent_are_refused(ray, tmp_path):
+    agent = LineAgent(0.5)
+    agent.model = lambda: None
+    with pytest.raises(InfrastructureError, match="cannot be sent to worker processes"):
+        run_arms(LineTask(), {"none": agent}, 2, out=tmp_path / "run", progress=False, engine="ray")
