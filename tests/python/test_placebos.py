@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from pressing_policy import Pressing
 
 import wiw
 from wiw.action import FORWARD, STOP, TURN_LEFT, TURN_RIGHT
+from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.experiments.gating import Gated
 from wiw.experiments.placebos import ShuffledPlacebo, SwappedPlacebo, shuffle
@@ -262,3 +264,20 @@ def test_a_swap_needs_another_episode(two_rooms, tmp_path) -> None:
     task = TaskRecipe("imagenav", {"scenes": two_rooms, "decisions": 1})
     with pytest.raises(ArgumentError, match="at least 2 episodes"):
         wiw.evaluate(task, AgentRecipe("matcher"), 1, out=tmp_path / "r", arms=["placebo-swapped"], progress=False)
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (["ar", "--episodes", "1", "--arms", "none,placebo-swapped"], "expected at least 2 episodes, got 1"),
+        (
+            ["manipulation", "--world-model", "armnet", "--arms", "none,placebo-shuffled"],
+            "these plans are made of none",
+        ),
+    ],
+)
+def test_a_placebo_that_a_run_cannot_have_is_refused_before_anything_runs(
+    command: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", *command, "--out", str(tmp_path / "run")]) == 2
+    assert said in capsys.readouterr().err and not (tmp_path / "run").exists()

@@ -73,7 +73,7 @@ def test_trackers_that_nobody_looks_through_are_refused(context: RunContext) -> 
     with pytest.raises(RegistryError, match=r"tracker 'flow': .*weights"):
         AgentRecipe("vlm", "copy", tracker="flow", tracker_options={"weights": "x"}).describe()
     with pytest.raises(ArgumentError, match="task 'imagenav' points nothing out"):
-        AgentRecipe("matcher", tracker="flow").require({"task": "imagenav"})
+        AgentRecipe("matcher", tracker="flow").require(ImageNav(scenes="apartments:val"), 2)
     nav = RunContext(ImageNav(scenes="apartments:val"))
     assert "tracker" not in AgentRecipe("vlm", **VLM).build(nav).describe()["policy"]
 

@@ -26,10 +26,10 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
         ArgumentError: an arm does not fit the task.
     """
     said = task.describe()
+    count = task.default_episodes if config.episodes is None else config.episodes
     for recipe in arms.values():
         recipe.describe()
-        recipe.require(said)
-    count = task.default_episodes if config.episodes is None else config.episodes
+        recipe.require(task, count)
     policies = sorted({str(recipe.policy) for recipe in arms.values()})
     trials = f"{count_noun(count, 'episode')}{_describe_scenes(said, count)}"
     lines = {

@@ -109,31 +109,35 @@ def _limit(model: WorldModel, limits: Limits) -> WorldModel:
     return cache_rollouts(Attempted(model, limits.deadline), limits.cache, limits.cache_gb)
 
 
-def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContext) -> Imaginer:
+def require_placebo(placebo: str, space: str, episodes: int) -> None:
+    """Require that a run of so many episodes, with plans of a space, can have a placebo.
+
+    Raises:
+        ArgumentError: it cannot, or there is no such placebo.
+    """
     if placebo not in PLACEBOS:
         raise ArgumentError(f"expected placebo {' or '.join(PLACEBOS)}, got '{placebo}'")
+    if placebo == "shuffled" and space != PRIMITIVES:
+        raise ArgumentError(NO_POSES)
+    if placebo == "swapped" and episodes < 2:
+        raise ArgumentError(
+            f"placebo-swapped shows the model another episode: expected at least 2 episodes, got {episodes}"
+        )
+
+
+def _as_placebo(imaginer: Imaginer, placebo: str, space: str, context: RunContext) -> Imaginer:
+    require_placebo(placebo, space, len(context.episodes))
     if placebo == "swapped":
         return SwappedPlacebo(imaginer, NextEpisodes(context, imaginer))
     if placebo == "blind":
         return BlindPlacebo(imaginer)
-    if space != PRIMITIVES:
-        raise ArgumentError(NO_POSES)
     return ShuffledPlacebo(imaginer)
 
 
 class NextEpisodes:
-    """First observations of the run's next episode (cyclic), for swapped placebos.
-
-    Raises:
-        ArgumentError: the run has a single episode.
-    """
+    """First observations of the run's next episode (cyclic), for swapped placebos."""
 
     def __init__(self, context: RunContext, imaginer: Imaginer) -> None:
-        if len(context.episodes) < 2:
-            raise ArgumentError(
-                "placebo-swapped shows the model another episode: expected at least 2 episodes, got "
-                f"{len(context.episodes)}"
-            )
         self._context, self._needs = context, imaginer.accepts.needs
         self._depth = "depth" in imaginer.needs
         self._labels = isinstance(imaginer, Labelled) and imaginer.source == SIMULATOR and "semantic" in self._needs

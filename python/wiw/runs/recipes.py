@@ -23,7 +23,7 @@ from wiw.loop.observers import Observer
 from wiw.policies.base import Policy
 from wiw.registry import POLICIES, SEMANTICS, TRACKERS, WORLD_MODELS
 from wiw.runs.arm_text import EXAMPLE, ArmText, check_arm_name, parse_arm
-from wiw.runs.compose import Experiment, RunContext, compose, make_for_space
+from wiw.runs.compose import Experiment, RunContext, compose, make_for_space, require_placebo
 from wiw.runs.part_options import parse_options
 from wiw.runs.sources import source_digests
 from wiw.tasks.base import Task
@@ -97,7 +97,7 @@ class AgentRecipe(AgentConfig):
 
     def build(self, context: RunContext, limits: Limits = NO_LIMITS) -> Agent:
         """Return the agent; numbers that are open are the task's."""
-        space = self.space or context.task.defaults.get("space") or PRIMITIVES
+        space = self._find_space(context.task)
         model: Any = self.model
         if options := self.resolve_model_options(context.task):
             model = make_for_space(self.model, space, limits.deadline, **options)
@@ -195,23 +195,26 @@ class AgentRecipe(AgentConfig):
                 found |= source_digests(_unwrap(part))
         return found
 
-    def require(self, task: Mapping[str, Any]) -> None:
-        """Require that world model, policies and tracker are made for a task that describes itself so.
+    def require(self, task: Task, episodes: int) -> None:
+        """Require that world model, policies, tracker and placebo are made for a run of so many episodes of a task.
 
         Raises:
             ArgumentError: one of them is not.
         """
-        if (self.tracker or self.tracker_options) and not task.get("categories"):
+        said = task.describe()
+        if (self.tracker or self.tracker_options) and not said.get("categories"):
             raise ArgumentError(
-                f"tracker: task '{task.get('task', 'of this run')}' points nothing out that could be followed; name a "
+                f"tracker: task '{said.get('task', 'of this run')}' points nothing out that could be followed; name a "
                 "tracker for task ar alone"
             )
+        if self.placebo is not None:
+            require_placebo(self.placebo, self._find_space(task), episodes)
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
             kind = found if isinstance(found, type) else type(found)
             if issubclass(kind, WorldModel | Policy):
-                found.require(task)
+                found.require(said)
 
     def replaying(self, run: Path) -> AgentRecipe:
         """Return the same agent with a run's recorded answers in place of its language model."""
@@ -233,6 +236,9 @@ class AgentRecipe(AgentConfig):
         kind, scheme, _ = self.model.partition("://")
         hosts = ";".join(address.partition("://")[2] for address in self.model.split(","))
         return f"{kind.partition(':')[0]}:{hosts}" if scheme else self.model.rpartition(":")[2]
+
+    def _find_space(self, task: Task) -> str:
+        return self.space or task.defaults.get("space") or PRIMITIVES
 
     def _make_policies(self, space: str, task: Task) -> tuple[Any, Any]:
         """Return policy and reviser (None: the policy's or the task's own); the one that revises has the tracker.
@@ -319,7 +325,7 @@ class AgentInMemory:
         """Return the agent's own description."""
         return dict(self.agent.describe())
 
-    def require(self, task: Mapping[str, Any]) -> None:
+    def require(self, task: Task, episodes: int) -> None:
         """Require nothing: there is no world model to ask."""
 
     def to_json(self) -> None:

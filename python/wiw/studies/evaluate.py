@@ -150,7 +150,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
         "arms": [{"name": arm, "agent": recipe.describe()} for arm, recipe in agents.items()],
     }
     for recipe in agents.values():
-        recipe.require(config["task"])
+        recipe.require(built, count)
     if settings.shard is not None:
         Shard.parse(settings.shard).select(count)
     if settings.resume and settings.out is not None and RunStore.exists(settings.out):
