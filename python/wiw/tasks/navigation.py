@@ -144,9 +144,7 @@ class NavigationTask(NavigationSpec, Task):
         if self.episode_file:
             source = {"episode_file": self.episode_file}
         backend = resolve_backend(self.backend)
-        given = {"policies": self.policy_options, "models": self.model_options}
-        options = {name: value for name, value in given.items() if value}
-        return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules), **options}
+        return {"task": self.name, "seed": self.seed, **source, "backend": backend, **asdict(self.rules)}
 
     def environment(self, depth: bool = False) -> NavigationEnv:
         """Return a gymnasium environment of this task; `depth` adds it to the observations."""
