@@ -68,7 +68,8 @@ def test_flags_are_written_as_they_are_read(capsys):
     for settings in (
         RunConfig(episodes=7, seed=3, out=Path("a b/c"), keep_images="all", progress=False, fidelity=True, resume=True),
         RunConfig(shard="2/3", scratch=Path("/tmp"), deadline=12.5, cache="off", live=9, workers=2),
-        AgentFlags(world_model="svd", world_model_option=("steps=3", "a=b c"), vlm="http://h/v1", prompts="p"),
+        AgentFlags(world_model="svd", world_model_option=("steps=3", "a=b c"), vlm="http://h/v1", prompts="p q"),
+        AgentFlags(policy="vlm", vlm_prices=Path("p.yaml"), tracker="sam2", tracker_option=("weights=w",)),
         TaskFlags(scenes="apartments:val", task_option=("decisions=2",), motion="slide", backend="cpu"),
         AgentConfig(depth=2, width=3, execute=-1, candidates=4),
     ):
