@@ -105,10 +105,11 @@ def stoppable(work: Callable[[], Any], folder: Path, command: str = "resume") ->
 
 
 @contextmanager
-def announce_resume() -> Iterator[None]:
-    """Run work that keeps finished parts; if it is stopped, print that the same command resumes it."""
+def announce_resume(aloud: bool = True) -> Iterator[None]:
+    """Run work that keeps finished parts; if it is stopped, print that the same command resumes it, if `aloud`."""
     try:
         yield
     except (KeyboardInterrupt, Terminated):
-        print("\nstopped. Repeat the command to resume; finished parts are kept", file=sys.stderr)
+        if aloud:
+            print("\nstopped. Repeat the command to resume; finished parts are kept", file=sys.stderr)
         raise

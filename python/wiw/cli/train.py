@@ -16,7 +16,9 @@ from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
 from wiw.cli.train_pocket import train_pocket
 from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, train_video
+from wiw.training.launcher import ProcessLayout
 
+ONE_PROCESS = ProcessLayout()
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
 PERCEPTION_SCENES = "apartments:train:160"
 ON_SCENES, ON_PLAYS, ON_DEMONSTRATIONS = ("recogniser", "warpnet", "perception"), ("armnet",), ("armnet", "diffuser")
@@ -40,6 +42,10 @@ USES: Mapping[str, tuple[tuple[str, ...], str]] = {
     "validation": (ON_DATA, "is evaluated on --val, if at all"),
     "decisions": (ON_DATA, "is evaluated on --val, if at all"),
     "tracker": (ON_DATA, "reports to no tracker"),
+    "gpus": (VIDEO, "trains in one process"),
+    "nodes": (VIDEO, "trains in one process"),
+    "partition": (VIDEO, "trains in one process"),
+    "dry-run": (VIDEO, "trains in one process"),
 }
 """For each option that not all networks use: those that do, and why the others refuse it."""
 
@@ -74,6 +80,8 @@ def train(
     seed: Annotated[int, arg(metavar="N")] = 0,
     workers: Annotated[int | None, arg(metavar="N")] = None,
     cache: Annotated[Path | None, arg(metavar="DIR")] = None,
+    layout: Annotated[ProcessLayout, arg(name="")] = ONE_PROCESS,
+    dry_run: bool = False,
 ) -> int:
     """Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model (NAME-action).
 
@@ -104,6 +112,8 @@ def train(
     $ wiw train pocket --data data --out pocket.safetensors
     $ wiw train ltx-action --data data --out runs/ltx
     $ wiw train wan2.1-action --data data --weights /models/wan2.1 --option clips=1600 --option lora=16 --out runs/wan
+    $ wiw train ltx-action --data data --gpus 8 --out runs/ltx
+    $ wiw train wan2.2-5b-action --data data --option shard=true --nodes 2 --gpus 8 --partition gpu --out runs/wan5b
     $ wiw run imagenav --world-model ltx-action --world-model-option checkpoint=runs/ltx
     $ wiw train nwm-action --data data --out runs/nwm
     $ wiw train svd-action --data demos --out runs/svd-arm
@@ -159,6 +169,8 @@ def train(
         workers: Processes that prepare training data from scenes or plays. Default: 2.
         cache: Folder of prepared training data; it can be deleted at any time. Default: $WIW_CACHE/looks. Of clips as
             a video model's frozen networks encode them, for later epochs and other trainings. Default: none.
+        layout: Processes of a video model's training.
+        dry_run: Print the command that runs on each machine, for several GPUs, and train nothing.
     """
     from wiw.scenes.store import folder
 
@@ -173,13 +185,15 @@ def train(
     options |= {"data": data, "weights": weights, "recipe": recipe, "option": option or None}
     options |= {"device": device, "part": part}
     options |= {"validation": validation, "decisions": decisions, "tracker": tracker}
+    options |= {"gpus": None if layout.gpus == 1 else layout.gpus, "nodes": None if layout.nodes == 1 else layout.nodes}
+    options |= {"partition": layout.partition, "dry-run": dry_run or None}
     _check_use(what, _drop_none(options))
     if what in VIDEO:
         _require_torch(what)
         numbers = _drop_none({"epochs": epochs, "seed": seed or None})
         given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
         given |= {"validation": validation, "decisions": decisions, "tracker": tracker}
-        return train_video(what, out or Path(what), data, recipe, option, numbers, given)
+        return train_video(what, out or Path(what), data, recipe, option, numbers, given, layout, dry_run)
     out = out or Path(f"{what}.safetensors")
     _require_torch(what)
     _check_out(out)

@@ -8,10 +8,14 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from wiw.cli.bars import Bars
 from wiw.cli.stop import announce_resume
+from wiw.training.launcher import ProcessLayout
+
+if TYPE_CHECKING:
+    from wiw.training.post_training.recipe import PostTrainingRecipe
 
 VideoName = Literal[
     "svd-action",
@@ -39,8 +43,10 @@ def train_video(
     pairs: Sequence[str],
     numbers: Mapping[str, Any],
     weights: Mapping[str, Any],
+    layout: ProcessLayout,
+    dry_run: bool,
 ) -> int:
-    """Post-train a model and print where its checkpoint is.
+    """Post-train a model and print where its checkpoint is, or start several processes that do.
 
     Args:
         name: of the model.
@@ -51,29 +57,73 @@ def train_video(
         numbers: of the recipe that have flags of their own.
         weights: which pretrained weights, on which device; part of the data; what it is validated on; folder of encoded
             clips.
+        layout: how many processes, where.
+        dry_run: whether to print torchrun's command and to train nothing.
+
+    Returns:
+        The exit code: of the process that failed first if there are several.
 
     Raises:
-        ArgumentError: no data; see also `wiw.training.post_training.train.post_train`.
+        ArgumentError: no data, or a recipe whose steps the processes cannot share out; see also
+            `wiw.training.post_training.train.post_train`.
+        DependencyError, InfrastructureError: see `wiw.training.launcher.submit_job`.
     """
+    folder = require_data(name, data, " or `wiw collect manipulation`")
+    chosen = _choose_recipe(name, recipe, pairs, numbers, weights)
+    if dry_run or layout != ProcessLayout():
+        flags = {**numbers, **weights, "data": folder, "recipe": recipe, "out": out}
+        options = [*flags.items(), *(("option", pair) for pair in pairs)]
+        given = [part for key, value in options if value is not None for part in (f"--{key}", str(value))]
+        return _launch(["train", name, *given], chosen, layout, out, dry_run)
+    return _train(name, folder, out, chosen, weights)
+
+
+def _train(name: str, data: Path, out: Path, recipe: PostTrainingRecipe, weights: Mapping[str, Any]) -> int:
+    from wiw.training.post_training import distributed
+    from wiw.training.post_training.train import post_train
+
+    began = time.monotonic()
+    with distributed.join_processes(), announce_resume(distributed.is_main()):
+        with TrainingProgress(recipe.batch) as progress:
+            card = post_train(
+                name, data, out, recipe=recipe, on_step=progress, on_validation=progress.show_validation, **weights
+            )
+        if distributed.is_main():
+            print(f"{describe_steps(card, recipe.batch)}, {time.monotonic() - began:.0f} s")
+            print(f"log         {out}.log")
+            print(f"checkpoint  {out}")
+            print(f"run it:     {_write_command(out, card['run'])}")
+    return 0
+
+
+def _launch(
+    arguments: Sequence[str], recipe: PostTrainingRecipe, layout: ProcessLayout, out: Path, dry_run: bool
+) -> int:
+    """Run a command in several processes, submit it, or print it; return the exit code."""
+    from wiw.training.launcher import run_processes, submit_job, write_command
+    from wiw.training.post_training.clip_trainer import require_equal_shares
+
+    require_equal_shares(recipe.batch, recipe.rows, layout.count)
+    if dry_run:
+        print(write_command(arguments, layout))
+        return 0
+    if not layout.submitted:
+        return run_processes(arguments, layout)
+    jobs = out.with_name(f"{out.name}.jobs")
+    print(f"job {submit_job(arguments, layout, jobs)}, output in {jobs}; repeat the command if it fails")
+    return 0
+
+
+def _choose_recipe(
+    name: str, file: Path | None, pairs: Sequence[str], numbers: Mapping[str, Any], weights: Mapping[str, Any]
+) -> PostTrainingRecipe:
     from wiw.runs.part_options import parse_options
     from wiw.training.post_training.recipe import PostTrainingRecipe, load_recipe
-    from wiw.training.post_training.train import choose_precision, post_train
+    from wiw.training.post_training.train import choose_precision
 
-    folder = require_data(name, data, " or `wiw collect manipulation`")
     options = {**numbers, **parse_options(pairs, PostTrainingRecipe, "--option")}
-    chosen = load_recipe(name, recipe, options)
-    if "precision" not in options:
-        chosen = choose_precision(chosen, weights.get("device"))
-    began = time.monotonic()
-    with announce_resume(), TrainingProgress(chosen.batch) as progress:
-        card = post_train(
-            name, folder, out, recipe=chosen, on_step=progress, on_validation=progress.show_validation, **weights
-        )
-    print(f"{describe_steps(card, chosen.batch)}, {time.monotonic() - began:.0f} s")
-    print(f"log         {out}.log")
-    print(f"checkpoint  {out}")
-    print(f"run it:     {_write_command(out, card['run'])}")
-    return 0
+    chosen = load_recipe(name, file, options)
+    return chosen if "precision" in options else choose_precision(chosen, weights.get("device"))
 
 
 def describe_steps(card: Mapping[str, Any], batch: int) -> str:

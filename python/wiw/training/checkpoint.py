@@ -52,10 +52,11 @@ class Checkpoint:
         path: the file.
         identity: JSON-able description of the data and the recipe; the checkpoint of another training is refused.
         seconds: least time between two writes.
+        shared: whether several processes read the file, which then is in main memory once.
     """
 
-    def __init__(self, path: Path, identity: Mapping[str, Any], seconds: float = 60.0) -> None:
-        self.path, self.seconds = path, seconds
+    def __init__(self, path: Path, identity: Mapping[str, Any], seconds: float = 60.0, *, shared: bool = False) -> None:
+        self.path, self.seconds, self.shared = path, seconds, shared
         self._identity = json.dumps(dict(identity), sort_keys=True)
         self._last_saved = time.monotonic()
 
@@ -71,7 +72,7 @@ class Checkpoint:
         if not self.path.exists():
             return None
         try:
-            content = torch.load(self.path, weights_only=True)
+            content = torch.load(self.path, weights_only=True, mmap=self.shared)
             identity = content["of"]
             state = TrainingState(content["epochs"], content["step"], content["state"])
         except Exception as error:  # what torch's unpickler meets in damaged bytes raises nearly anything
@@ -89,8 +90,12 @@ class Checkpoint:
         Raises:
             FileError: it cannot be written.
         """
-        if time.monotonic() >= self._last_saved + self.seconds:
+        if self.is_due():
             self.save(trainer, epochs, step)
+
+    def is_due(self) -> bool:
+        """Return whether the last write was long enough ago."""
+        return time.monotonic() >= self._last_saved + self.seconds
 
     def save(self, trainer: ResumableTrainer, epochs: int, step: int) -> None:
         """Write the file atomically.
@@ -98,13 +103,21 @@ class Checkpoint:
         Raises:
             FileError: it cannot be written.
         """
+        self.write(trainer.state_dict(), epochs, step)
+        self._last_saved = time.monotonic()
+
+    def write(self, state: Mapping[str, Any], epochs: int, step: int) -> None:
+        """Write a trainer's state atomically.
+
+        Raises:
+            FileError: it cannot be written.
+        """
         import torch
 
         packed = io.BytesIO()  # torch's own writer reports a full disk by a bare RuntimeError
-        torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": trainer.state_dict()}, packed)
+        torch.save({"of": self._identity, "epochs": epochs, "step": step, "state": state}, packed)
         with atomic_file(self.path) as draft:
             draft.write_bytes(packed.getbuffer())
-        self._last_saved = time.monotonic()
 
     def remove(self) -> None:
         """Delete the file at the end of training."""

@@ -18,6 +18,7 @@ from torch.utils._pytree import tree_map_only
 
 from wiw.errors import ArgumentError, TrainingError
 from wiw.training.checkpoint import ResumableTrainer
+from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_order import ClipOrder
 from wiw.training.post_training.optimizers import create_optimizer
 from wiw.training.post_training.recipe import ClipRecipe
@@ -41,7 +42,7 @@ class ClipTrainer(ResumableTrainer, ABC):
         device: of torch.
 
     Raises:
-        ArgumentError: there are fewer clips than one step takes.
+        ArgumentError: there are fewer clips than one step takes, or its passes cannot be shared out evenly.
     """
 
     trained: dict[str, nn.Parameter]
@@ -53,6 +54,7 @@ class ClipTrainer(ResumableTrainer, ABC):
     def __init__(self, clips: NamedClips, recipe: ClipRecipe, device: torch.device) -> None:
         self.clips, self.recipe, self.device = clips, recipe, device
         self.order = arrange_clips(len(clips), recipe)
+        require_equal_shares(recipe.batch, self.rows, distributed.count_processes())
         self.mean_loss = float("nan")
 
     def start_optimizer(self, trained: dict[str, nn.Parameter]) -> None:
@@ -80,6 +82,11 @@ class ClipTrainer(ResumableTrainer, ABC):
         """Clips in one pass through the networks; gradients of several passes are added up."""
         return self.recipe.batch
 
+    @property
+    def gradient_scale(self) -> int:
+        """Factor of the loss before the backward pass: the number of processes where gradients become their mean."""
+        return 1
+
     @abstractmethod
     def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
         """Return the loss of each clip, float32 [B]; `random` is on the CPU, so that draws are alike on all devices.
@@ -105,11 +112,12 @@ class ClipTrainer(ResumableTrainer, ABC):
         """
         batch = self.select_batch()
         self.optimizer.zero_grad(set_to_none=True)
-        total = 0.0
-        for first in range(0, self.recipe.batch, self.rows):
-            total += self._add_gradients(batch[first : first + self.rows], first)
+        own = distributed.select_share(range(0, self.recipe.batch, self.rows))
+        losses = {first: self._add_gradients(batch, first) for first in own}
+        total = sum(loss for _, loss in sorted(pair for each in distributed.collect(losses) for pair in each.items()))
+        distributed.sum_gradients(self.trained.values())
         norm = nn.utils.clip_grad_norm_(list(self.trained.values()), self.recipe.clip_norm)
-        self._require_finite(norm[None], batch, "gradient")
+        self._require_finite(distributed.join_tensor(norm), batch, "gradient")
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         self.optimizer.step()
@@ -119,24 +127,36 @@ class ClipTrainer(ResumableTrainer, ABC):
         return total
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the number of steps, the mean loss, weights, averages and the optimiser's state, in main memory."""
-        return {
+        """Return the number of steps, the mean loss, weights, averages and the optimiser's state, in main memory.
+
+        To be called in all processes; in the first one, tensors are whole, in the others they are empty.
+        """
+        state = {
             "count": self.step_count,
             "loss": self.mean_loss,
-            "weights": {name: value.detach().cpu() for name, value in self.trained.items()},
-            "averages": {name: value.cpu() for name, value in self.averages.items()},
-            "optimizer": tree_map_only(Tensor, Tensor.cpu, self.optimizer.state_dict()),
+            "weights": dict(self.trained),
+            "averages": dict(self.averages),
+            "optimizer": self.optimizer.state_dict(),
         }
+        return tree_map_only(Tensor, distributed.gather_tensor, state)
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resume from a state that `state_dict` returned."""
+        """Resume from a state that `state_dict` returned, in any number of processes."""
         self.step_count, self.mean_loss = state["count"], state["loss"]
         with torch.no_grad():
             for name, value in self.trained.items():
-                value.copy_(state["weights"][name])
+                value.copy_(distributed.shard_like(state["weights"][name], value))
             for name, average in self.averages.items():
-                average.copy_(state["averages"][name])
-        self.optimizer.load_state_dict(state["optimizer"])
+                average.copy_(distributed.shard_like(state["averages"][name], average))
+        moments = {
+            place: {
+                name: distributed.shard_like(value, parameter)
+                for name, value in state["optimizer"]["state"][place].items()
+            }
+            for place, parameter in enumerate(self.trained.values())
+            if place in state["optimizer"]["state"]
+        }
+        self.optimizer.load_state_dict({**state["optimizer"], "state": moments})
 
     @contextmanager
     def use_averages(self) -> Iterator[None]:
@@ -162,17 +182,21 @@ class ClipTrainer(ResumableTrainer, ABC):
             averages, weights = ([each[name] for name in names] for each in (self.averages, self.trained))
             get_ema_multi_avg_fn(self.recipe.ema)(averages, weights, None)
 
-    def _add_gradients(self, rows: NDArray[np.int64], first: int) -> float:
-        """Add the gradients of some clips of a batch, from its clip `first` on; return their part of its mean loss."""
+    def _add_gradients(self, batch: NDArray[np.int64], first: int) -> float:
+        """Add the gradients of one pass, from clip `first` of a batch on; return its part of the batch's mean loss."""
+        rows = batch[first : first + self.rows]
         with seed_torch(mix_seed(self.recipe.seed, "step", self.step_count, first), self.device) as random:
             losses = self.compute_losses(rows, random)
             self._require_finite(losses, rows, "loss")
             loss = losses.sum() / self.recipe.batch
-            loss.backward()
+            (loss * self.gradient_scale).backward()
         return float(loss.detach())
 
     def _require_finite(self, values: Tensor, rows: NDArray[np.int64], what: str) -> None:
-        if bool(torch.isfinite(values).all()):
+        """Check values in all processes; called alike in each, it raises in all of them."""
+        own = [] if bool(torch.isfinite(values).all()) else rows.tolist()
+        rows = np.array(list(dict.fromkeys(row for each in distributed.collect(own) for row in each)), np.int64)
+        if not len(rows):
             return
         self.optimizer.zero_grad(set_to_none=True)
         names = [self.clips.describe(int(row)) for row in rows]
@@ -196,6 +220,26 @@ def arrange_clips(total: int, recipe: ClipRecipe) -> ClipOrder:
             "more data, or lower batch"
         )
     return order
+
+
+def require_equal_shares(batch: int, rows: int, processes: int) -> None:
+    """Check that processes can share out the passes of a step evenly.
+
+    Args:
+        batch: clips of a step.
+        rows: clips of a pass.
+        processes: how many there are.
+
+    Raises:
+        ArgumentError: they cannot.
+    """
+    passes = batch // rows
+    if passes % processes:
+        raise ArgumentError(
+            f"a step of {batch} clips has {passes} passes of {rows}, which {processes} processes cannot share out "
+            "evenly; expected a number of processes that divides the passes: change --gpus or --nodes, or batch or "
+            "rows of the recipe"
+        )
 
 
 def mix_seed(seed: int, *parts: object) -> int:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from wiw.errors import ArgumentError
+from wiw.training.post_training import distributed
 from wiw.training.post_training.clips import ClipBatch
 from wiw.training.post_training.objective import Objective
 from wiw.training.post_training.recipe import PostTrainingRecipe
@@ -66,8 +67,7 @@ class ConditionedGenerator(TrainableModel):
     def list_units(self, place: str) -> Sequence[nn.Module]:
         """Return the denoiser's blocks, the denoiser, and the encoder."""
         denoiser = self.find_denoiser(place)
-        kinds = set(denoiser._no_split_modules or ())
-        blocks = [module for module in denoiser.modules() if type(module).__name__ in kinds]
+        blocks = [block for each in denoiser.children() if isinstance(each, nn.ModuleList) for block in each]
         return [*blocks, denoiser, self.encoders[place]]
 
     def encode(self, batch: ClipBatch) -> Encoded:
@@ -94,8 +94,8 @@ class ConditionedGenerator(TrainableModel):
         checkpoint.save(folder, self.encoders, self.objective.pipeline, lora=bool(self.recipe.lora))
 
     def activate(self, place: str) -> None:
-        """Keep on the device only the denoiser that is trained."""
-        if self._active != place:
+        """Keep on the device only the denoiser that is trained; sharded ones stay there."""
+        if self._active != place and not distributed.is_sharded(self.find_denoiser(place)):
             for each in self.places:
                 self.find_denoiser(each).to(self.device if each == place else "cpu")
             self._active = place

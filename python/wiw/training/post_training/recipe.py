@@ -121,6 +121,8 @@ class PostTrainingRecipe(ClipRecipe):
     """NWM: share of clips whose context is its last frame, repeated, as at the first decision of an episode."""
     checkpointing: bool = True
     """Whether activations are computed again in the backward pass, which takes less memory."""
+    shard: bool = False
+    """Whether several processes have a part of weights, gradients and moments each (FSDP2), or all have the whole."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,6 +130,8 @@ class PostTrainingRecipe(ClipRecipe):
         self._require_shares("warmup", "drop", "mirror", "still")
         if self.lora < 0:
             raise ArgumentError(f"recipe: lora: expected 0 or more, got {self.lora}")
+        if self.shard and self.optimizer == "adamw8bit":
+            raise ArgumentError("recipe: shard: moments in 8 bits cannot be sharded; expected optimizer=adamw")
         if self.batch % self.rows:
             raise ArgumentError(f"recipe: rows: expected a divisor of batch ({self.batch}), got {self.rows}")
 

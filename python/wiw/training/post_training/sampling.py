@@ -82,11 +82,17 @@ class TrainingSampler:
         with torch.random.fork_rng([device] if device.type == "cuda" else []):
             try:
                 for network in networks:
-                    network.eval().to(device)
+                    _move(network.eval(), device)
                 yield
             finally:
                 pipeline.scheduler = scheduler
                 for network, place in zip(networks, places, strict=True):
-                    network.to(place)
+                    _move(network, place)
                     for layer in network.modules():
                         layer.training = modes[id(layer)]
+
+
+def _move(network: nn.Module, device: torch.device) -> None:
+    """Move a network to a device unless it is there: a sharded one, which always is, is not to be touched."""
+    if next(network.parameters()).device.type != device.type:
+        network.to(device)

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A checkpoint that is also written when the process is told to stop: batch systems send SIGTERM or SIGUSR1."""
+"""A checkpoint that is also written when a process is told to stop: batch systems send SIGTERM or SIGUSR1."""
 
 from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from wiw.training.checkpoint import Checkpoint, ResumableTrainer
+from wiw.errors import ArgumentError
+from wiw.training.checkpoint import Checkpoint, ResumableTrainer, TrainingState
+from wiw.training.post_training import distributed
 
 STOPPING = (signal.SIGTERM, signal.SIGINT)
 """Signals after which the training stops, once its state is written; after SIGUSR1 it goes on."""
@@ -21,9 +23,25 @@ class SignalledCheckpoint(Checkpoint):
 
     Within `watch`, SIGUSR1 writes the state. SIGTERM and SIGINT (Ctrl-C) write it, and then do what they would have
     done without this; a second one does so at once.
+
+    With several processes, a signal to any of them is one to all. They have to call `save_if_due` alike. The first one
+    writes; a second signal is ignored, since torchrun hands on what a batch system sends to each process itself.
     """
 
-    _pending: signal.Signals | None = None
+    _pending = 0
+
+    def load(self) -> TrainingState | None:
+        """Read the file; None where there is none.
+
+        Raises:
+            ArgumentError: it belongs to another training, or only some processes find it.
+            FileError: it is damaged.
+        """
+        if len(set(distributed.collect(self.path.exists()))) > 1:
+            raise ArgumentError(
+                f"{self.path} is there on some machines only: expected a folder that all share; name one by --out"
+            )
+        return super().load()
 
     @contextmanager
     def watch(self) -> Iterator[None]:
@@ -48,16 +66,25 @@ class SignalledCheckpoint(Checkpoint):
         Raises:
             FileError: it cannot be written.
         """
-        if self._pending is None:
-            super().save_if_due(trainer, epochs, step)
-            return
-        number, self._pending = self._pending, None
-        self.save(trainer, epochs, step)
+        told, due = zip(*distributed.collect((self._pending, self.is_due())), strict=True)
+        number = max(told)
+        if self._pending == number:
+            self._pending = 0
+        if number or any(due):
+            self.save(trainer, epochs, step)
         if number in STOPPING:
             signal.signal(number, self._earlier[number])
             signal.raise_signal(number)
 
+    def write(self, state: Mapping[str, Any], epochs: int, step: int) -> None:
+        """Write the file in the first process; the others wait for it.
+
+        Raises:
+            FileError: it cannot be written.
+        """
+        distributed.call_on_main(lambda: super(SignalledCheckpoint, self).write(state, epochs, step))
+
     def _note(self, number: int, frame: FrameType | None) -> None:
-        self._pending = signal.Signals(number)
-        if number in STOPPING:
+        self._pending = number
+        if number in STOPPING and distributed.count_processes() == 1:
             signal.signal(number, self._earlier[number])

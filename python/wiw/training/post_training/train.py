@@ -14,6 +14,7 @@ import wiw
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.files import atomic_file, atomic_folder
+from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import arrange_clips
 from wiw.training.post_training.corpora import Corpus, CorpusPart, NavigationCorpus, open_corpus
 from wiw.training.post_training.families import Family, Loaded, PretrainedWeights, find_family
@@ -36,6 +37,7 @@ TASKS: Mapping[str, str] = {PRIMITIVES: "imagenav", GRIPPER_POSES: "manipulation
 """A task for the actions of each space."""
 
 
+@distributed.join_processes()
 def post_train(
     name: str,
     data: str | Path,
@@ -57,6 +59,7 @@ def post_train(
 ) -> dict[str, Any]:
     """Train a model on navigation or manipulation, or resume its training, and write its checkpoint.
 
+    In processes that torchrun has started, all train together: call it alike in each; the first one writes and reports.
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
     SIGTERM or Ctrl-C. The same call resumes from it, and on the CPU ends with the same bytes. `OUT.log` has the loss
     of each step and what validations found, with pictures; the checkpoint has the weights that were best in validation.
@@ -94,6 +97,7 @@ def post_train(
     """
     out = Path(out)
     family, device = find_family(name), devices.device(device)
+    distributed.require_own_gpu(device)
     recipe = recipe or choose_precision(load_recipe(name), device)
     _require_free(out)
     corpus, recipe = family.fit(open_corpus(data, part, recipe.held_out), recipe)
@@ -106,10 +110,10 @@ def post_train(
         checked = None if split is None else choose_validation_set(*split, decisions, recipe)
         card = {"model": name, **describe_training(loaded, corpus)}
         card |= {"validated_on": checked.identity if checked else None}
-        state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), card, seconds)
+        state = open_state(out, card, seconds)
         latents = None if cache is None else open_cache(Path(cache), loaded, corpus)
         trainer = PostTrainer(loaded.model, corpus.clips(recipe.frames), recipe, latents)
-        if not state.path.exists():
+        if not state.path.exists() and distributed.is_main():
             remove_log(out)
         validated = ValidatedTrainer(
             trainer,
@@ -124,7 +128,7 @@ def post_train(
     card |= {"trained_steps": trainer.step_count, "loss": trainer.mean_loss}
     card |= {"run": describe_run(family, corpus, recipe)}
     card = publish_checkpoint(out, validated, trainer, card)
-    state.remove()
+    distributed.call_on_main(state.remove)
     return card
 
 
@@ -177,7 +181,7 @@ def run_steps(
                 inner.steps_per_epoch,
                 None,
                 lambda progress: recipe.scale_rate(progress * phases % 1),  # each network has a schedule of its own
-                lambda step, steps, _: on_step(step, steps, inner.mean_loss),
+                lambda step, steps, _: on_step(step, steps, inner.mean_loss) if distributed.is_main() else None,
                 state,
             )
             trainer.validate()
@@ -195,10 +199,14 @@ def open_log(out: Path, tracker: str | None, recipe: ClipRecipe) -> TrainingLog:
     Raises:
         DependencyError: the tracker's package is not installed.
     """
-    folder = locate_log(out)
-    return TrainingLog(
-        folder / LOG, [] if tracker is None else [open_tracker(tracker, out.name, folder, recipe.describe())]
-    )
+    folder, told = locate_log(out), tracker if distributed.is_main() else None
+    return TrainingLog(folder / LOG, [open_tracker(told, out.name, folder, recipe.describe())] if told else [])
+
+
+def open_state(out: Path, identity: Mapping[str, Any], seconds: float) -> SignalledCheckpoint:
+    """Return the state of a training, in `OUT.checkpoint`."""
+    path, shared = out.with_name(f"{out.name}.checkpoint"), distributed.count_processes() > 1
+    return SignalledCheckpoint(path, identity, seconds, shared=shared)
 
 
 def remove_log(out: Path) -> None:
@@ -219,10 +227,14 @@ def publish_checkpoint(
     Raises:
         FileError: `out` holds something, or cannot be written.
     """
-    if not trainer.best.exists():
-        found = {**card, "steps": trainer.step_count}
-        write_checkpoint(out, trained, found)
-        return found
+    if distributed.call_on_main(trainer.best.exists):
+        return distributed.call_on_main(lambda: _publish_best(out, trainer, card))
+    found = {**card, "steps": trainer.step_count}
+    write_checkpoint(out, trained, found)
+    return found
+
+
+def _publish_best(out: Path, trainer: ValidatedTrainer, card: Mapping[str, Any]) -> dict[str, Any]:
     own = json.loads((trainer.best / CARD).read_text(encoding="utf-8"))
     found = {**card, "steps": own["steps"], "validation": own["validation"]}
     with atomic_file(trainer.best / CARD) as draft:
@@ -252,7 +264,7 @@ def describe_training(loaded: Loaded, corpus: Corpus) -> dict[str, Any]:
         "wiw": wiw.__version__,
         "weights": loaded.identity,
         "data": corpus.describe(),
-        "recipe": loaded.recipe.describe(),
+        "recipe": {name: value for name, value in loaded.recipe.describe().items() if name != "shard"},
         "versions": loading.versions(),
     }
 
@@ -267,10 +279,14 @@ def write_checkpoint(
     Raises:
         FileError: `out` holds something, or cannot be written.
     """
-    with atomic_folder(out, replace) as draft:
-        with trainer.use_averages():
+
+    def write() -> None:
+        with atomic_folder(out, replace) as draft:
             trainer.model.write(draft)
-        (draft / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+            (draft / CARD).write_text(json.dumps(card, indent=2) + "\n", encoding="utf-8")
+
+    with trainer.use_final_weights():
+        distributed.call_on_main(write)
 
 
 def open_cache(folder: Path, loaded: Loaded, corpus: Corpus) -> LatentCache:
@@ -291,7 +307,10 @@ def list_remedies(recipe: PostTrainingRecipe) -> list[str]:
     remedies = [f"rows=1 (now {recipe.rows})"] if recipe.rows > 1 else []
     remedies += ["precision=bfloat16"] if recipe.precision == "float32" else []
     remedies += [] if recipe.checkpointing else ["checkpointing=true"]
-    remedies += ["optimizer=adamw8bit"] if recipe.optimizer == "adamw" and not recipe.lora else []
+    several = distributed.count_processes() > 1
+    remedies += ["shard=true"] if several and not recipe.shard and recipe.optimizer == "adamw" else []
+    eight = recipe.optimizer == "adamw" and not recipe.lora and not recipe.shard
+    remedies += ["optimizer=adamw8bit"] if eight else []
     remedies += ["ema=0"] if recipe.ema else []
     remedies += [] if recipe.lora else ["lora=32, for the Wan and LTX models"]
     return [*remedies, f"a smaller size than {height}x{width}", f"fewer frames than {recipe.frames}"]

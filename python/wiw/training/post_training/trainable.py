@@ -30,7 +30,7 @@ class TrainableModel(ABC):
 
     @abstractmethod
     def list_units(self, place: str) -> Sequence[nn.Module]:
-        """Return the modules that are spread over processes one by one, parts before the whole."""
+        """Return the modules whose parameters are sharded one by one, parts before the whole."""
 
     @abstractmethod
     def encode(self, batch: ClipBatch) -> Encoded:

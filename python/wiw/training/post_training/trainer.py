@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.clips import ClipBatch, load_clips, mirror_clip
 from wiw.training.post_training.corpora import CorpusClips
@@ -31,7 +33,7 @@ class PostTrainer(ClipTrainer):
         cache: where encoded clips are kept; they are encoded each time if None.
 
     Raises:
-        ArgumentError: there are fewer clips than one step takes.
+        ArgumentError: there are fewer clips than one step takes, or its passes cannot be shared out evenly.
         DependencyError: the recipe's optimiser is not installed.
     """
 
@@ -47,6 +49,8 @@ class PostTrainer(ClipTrainer):
     ) -> None:
         super().__init__(clips, recipe, model.device)
         self.model, self._cache = model, cache
+        self._units = [unit for place in model.places for unit in model.list_units(place)] if recipe.shard else []
+        distributed.shard_modules(self._units, model.device)
         trained: dict[str, nn.Parameter] = {}
         for place in model.places:
             trained |= model.list_trained(place)
@@ -66,6 +70,17 @@ class PostTrainer(ClipTrainer):
     def rows(self) -> int:
         """Clips in one pass through the networks."""
         return self.recipe.rows
+
+    @property
+    def gradient_scale(self) -> int:
+        """The number of processes where weights are sharded: FSDP2 takes the mean of gradients."""
+        return distributed.count_processes() if self._units else 1
+
+    @contextmanager
+    def use_final_weights(self) -> Iterator[None]:
+        """Have in the networks what is to be written, as long as the context lasts: averages if any, and whole."""
+        with self.use_averages(), distributed.gather_state_dicts(self._units):
+            yield
 
     def locate(self, step: int) -> tuple[str, int]:
         """Return the network that a step trains, by its place, and the number of its own steps before it."""

@@ -26,15 +26,16 @@ class TrainingLog:
         self.path, self._trackers = path, trackers
         self._began = time.monotonic()
 
-    def rewind(self, step: int) -> None:
-        """Drop what was written after a step: the training resumes there, and writes it again.
+    def rewind(self, step: int) -> list[dict[str, Any]]:
+        """Drop what was written after a step, and return the rest: the training resumes there, and writes it again.
 
         Raises:
             FileError: the file cannot be read or written.
         """
-        kept = [json.dumps(line) for line in self.read() if line["step"] <= step]
+        kept = [line for line in self.read() if line["step"] <= step]
         with atomic_file(self.path) as draft:
-            draft.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+            draft.write_text("".join(f"{json.dumps(line)}\n" for line in kept), encoding="utf-8")
+        return kept
 
     def read(self) -> list[dict[str, Any]]:
         """Return the lines, without one that a killed process has left unfinished.

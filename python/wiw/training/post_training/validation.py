@@ -20,6 +20,7 @@ from wiw.files import atomic_file
 from wiw.training.checkpoint import ResumableTrainer
 from wiw.training.decision_errors import measure_decisions
 from wiw.training.held_out_clips import Frames, HeldOutClips, Imagine, measure_clips, resize_frames, select_clips
+from wiw.training.post_training import distributed
 from wiw.training.post_training.clip_trainer import ClipTrainer
 from wiw.training.post_training.recipe import ClipRecipe
 from wiw.training.post_training.training_log import TrainingLog
@@ -110,16 +111,18 @@ class ValidatedTrainer(ResumableTrainer):
     """A trainer that is validated before a step, every so many steps; what it learns does not depend on it.
 
     Validation belongs to the step after it, so that a state written before it resumes with it. The weights, the log
-    and the picture of the best are in one folder.
+    and the picture of the best are in one folder. With several processes, all imagine the same, with weights that may
+    be sharded, and the first one writes.
 
     Args:
         trainer: to be validated.
         imagine: with its networks.
         validation: what it is measured on; None to log alone.
         log: of the training; pictures and the best weights lie beside it.
-        save: writes the trainer's weights as a checkpoint, given the folder and what was found.
+        save: writes the trainer's weights as a checkpoint, given the folder and what was found; called in all
+            processes.
         between: called between two calls of the model, such as to stop when told to.
-        on_validation: told what was found.
+        on_validation: told what was found, in the first process.
     """
 
     def __init__(
@@ -150,7 +153,7 @@ class ValidatedTrainer(ResumableTrainer):
         if self._validation is not None and self.step_count % self._validation.every == 0:
             self.validate()
         loss = self.trainer.train_step(learning_rate)
-        self._log.write(self.step_count, {"loss": loss, "rate": learning_rate})
+        distributed.call_on_main(lambda: self._log.write(self.step_count, {"loss": loss, "rate": learning_rate}))
         return loss
 
     def validate(self) -> None:
@@ -162,16 +165,24 @@ class ValidatedTrainer(ResumableTrainer):
         if self._validation is None or self._imagine is None or self.step_count in self._validated:
             return
         found, sheet = self._validation.measure(self._imagine, self.trainer.recipe.seed, self._between)
-        write_picture(self._folder / f"step-{self.step_count:07d}.png", sheet)
-        if self.step_count and found.get(CRITERION, -np.inf) > self._read_best():
+        if distributed.call_on_main(lambda: self._draw(found, sheet)):
             self._save(self.best, {"steps": self.step_count, "validation": found})
-        self._log.write(self.step_count, {f"{PREFIX}{name}": value for name, value in found.items()})
+        distributed.call_on_main(lambda: self._report(found))
         self._validated.add(self.step_count)
+
+    def _draw(self, found: Mapping[str, float], sheet: Frames) -> bool:
+        """Write the picture of a validation and return whether its weights are the best so far."""
+        write_picture(self._folder / f"step-{self.step_count:07d}.png", sheet)
+        return self.step_count > 0 and found.get(CRITERION, -np.inf) > self._read_best()
+
+    def _report(self, found: Mapping[str, float]) -> None:
+        self._log.write(self.step_count, {f"{PREFIX}{name}": value for name, value in found.items()})
         self._tell(self.step_count, found)
 
     def finish(self) -> None:
         """Tell the trackers that the training has ended."""
-        self._log.finish()
+        if distributed.is_main():
+            self._log.finish()
 
     @property
     def best(self) -> Path:
@@ -189,8 +200,8 @@ class ValidatedTrainer(ResumableTrainer):
             FileError: the log cannot be read or written.
         """
         self.trainer.load_state_dict(state)
-        self._log.rewind(self.step_count)
-        self._validated = {line["step"] for line in self._log.read() if f"{PREFIX}{CRITERION}" in line}
+        lines = distributed.call_on_main(lambda: self._log.rewind(self.step_count))
+        self._validated = {line["step"] for line in lines if f"{PREFIX}{CRITERION}" in line}
 
     def _read_best(self) -> float:
         card = self.best / CARD
