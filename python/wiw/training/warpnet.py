@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -72,19 +73,29 @@ def train(
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
     """
     steps_per_epoch = max(1, walks.places.size // recipe.batch)
+
+    def create_trainer() -> WarpNetTrainer:
+        return WarpNetTrainer(partial(sample_pairs, walks), walks.images.shape[2], recipe)
+
     trainer, recipe = run_training(
-        lambda: _Trainer(walks, recipe), recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
+        create_trainer, recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
     )
     return trainer.network.eval(), recipe
 
 
-class _Trainer:
-    """The network in training, with everything that its next step depends on."""
+class WarpNetTrainer:
+    """The network in training, with everything that its next step depends on.
 
-    def __init__(self, walks: Walks, recipe: Recipe) -> None:
+    Args:
+        draw_pairs: returns so many pairs, drawn by a generator.
+        height: of the panoramas.
+        recipe: of the training.
+    """
+
+    def __init__(self, draw_pairs: Callable[[int, np.random.Generator], Pairs], height: int, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C11]) % 2**63)
-        self.walks, self.recipe = walks, recipe
-        self.network = Network(walks.images.shape[2], recipe.widths)
+        self.recipe, self._draw_pairs = recipe, draw_pairs
+        self.network = Network(height, recipe.widths)
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C12]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
@@ -92,7 +103,7 @@ class _Trainer:
         """Train on one batch of pairs and return its loss."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
-        pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
+        pairs = self._draw_pairs(self.recipe.batch, self._rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
             found = self.network.train()(pairs.source, pairs.ahead)
         loss = _compute_loss(found, pairs, self.recipe)
@@ -117,24 +128,42 @@ class Pairs:
 
 
 def sample_pairs(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
-    """Sample pairs of panoramas of a walk, in either direction, half of them mirrored, with other brightness and
-    tint.
-    """
+    """Sample pairs of panoramas of a walk, in either direction."""
     stops = walks.places.shape[1]
     paths = rng.integers(0, len(walks), count)
     first = rng.integers(0, stops, count)
     second = (first + rng.integers(1, stops, count)) % stops
     ahead = walks.places[paths, second] - walks.places[paths, first]
-    back, mirrored = ahead < 0, rng.random(count) < 0.5
-    light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
-    gain = torch.from_numpy(light.astype(np.float32)).permute(0, 3, 1, 2)
-    source, target = (
-        (to_network(_augment_panoramas(walks.images[paths, stop], back, mirrored)) + 1) * gain - 1
-        for stop in (first, second)
+    return build_pairs(
+        walks.images[paths, first], walks.images[paths, second], walks.distances[paths, second], ahead, rng
     )
-    metres = _augment_panoramas(walks.distances[paths, second], back, mirrored).astype(np.float32)
+
+
+def build_pairs(
+    source: NDArray[np.uint8],
+    target: NDArray[np.uint8],
+    distances: NDArray[np.float16],
+    ahead: NDArray[np.float32],
+    rng: np.random.Generator,
+) -> Pairs:
+    """Build pairs of panoramas, half of them mirrored, with other brightness and tint.
+
+    Args:
+        source: uint8 [B, H, W, 3].
+        target: the same, seen from further ahead.
+        distances: float16 [B, H, W]: metres along the target's rays, 0 where nothing is hit.
+        ahead: float32 [B]: metres; where below 0, the target is behind, and both are turned around.
+        rng: draws the augmentation.
+    """
+    back, mirrored = ahead < 0, rng.random(len(ahead)) < 0.5
+    light = rng.uniform(0.8, 1.2, (len(ahead), 1, 1, 1)) * rng.uniform(0.92, 1.08, (len(ahead), 1, 1, 3))
+    gain = torch.from_numpy(light.astype(np.float32)).permute(0, 3, 1, 2)
+    before, after = (
+        (to_network(_augment_panoramas(images, back, mirrored)) + 1) * gain - 1 for images in (source, target)
+    )
+    metres = _augment_panoramas(distances, back, mirrored).astype(np.float32)
     log_distance = np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST))
-    return Pairs(source, torch.from_numpy(np.abs(ahead)), target, torch.from_numpy(log_distance)[:, None])
+    return Pairs(before, torch.from_numpy(np.abs(ahead)), after, torch.from_numpy(log_distance)[:, None])
 
 
 def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrored: NDArray[np.bool_]) -> NDArray[Any]:
