@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw.analysis.statistics import Estimate
 from wiw.errors import ArgumentError
 
+ONE_EPOCH, EQUAL_UPDATES, FEWER_SCENES = "one epoch", "equal updates", "fewer scenes"
+"""Arms: as in the paper, where more clips are also more updates; all trained as long as the largest; the same number of
+clips from fewer scenes."""
 RESAMPLES = 999
-STEEPEST = 3.0
-"""Largest exponent of a fit."""
+EXPONENTS = np.linspace(0.01, 3, 300)
+"""Exponents that a fit chooses from."""
 
-SceneSums = Mapping[str, tuple[float, float]]
+SceneSums = Mapping[str, Sequence[float]]
 """Sum and number of values in each scene."""
 
 
@@ -90,6 +95,95 @@ class Split:
     share: Value
     """Percent of the total that updates bring."""
 
+    @property
+    def verdict(self) -> str:
+        """What the gain is due to, as far as the intervals say."""
+        if not self.total.low > 0:
+            return "no gain beyond chance"
+        if self.share.low > 50:
+            return "mostly updates"
+        return "mostly data" if self.share.high < 50 else "undecided"
+
+
+@dataclass(frozen=True)
+class ScalingArm:
+    """Trainings of one model, from few clips or scenes to many."""
+
+    model: str
+    name: str
+    amounts: tuple[int, ...]
+    """What differs: clips of each training; scenes in the arm `FEWER_SCENES`."""
+    clips: int
+    """Clips of the last training."""
+    updates: tuple[int, ...]
+    trainings: tuple[str, ...]
+    """Names, without their seeds."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A measure over the trainings of an arm."""
+
+    arm: ScalingArm
+    measure: str
+    values: tuple[Value, ...]
+    by_seed: tuple[tuple[float, ...], ...]
+    """For each training, the value of each seed."""
+    gain: Value
+    """The first value less the last."""
+    trend: Trend | None
+    fit: PowerLaw | None
+    """Both of primary measures over numbers of clips alone."""
+
+
+@dataclass(frozen=True)
+class ModelSplit:
+    """The split of a model's gain in a primary measure."""
+
+    model: str
+    measure: str
+    split: Split
+
+
+@dataclass(frozen=True)
+class Success:
+    """The success rate of a trained model in closed loop, in percent."""
+
+    name: str
+    success: Estimate
+
+
+@dataclass(frozen=True)
+class ScalingTable:
+    """All numbers of a study."""
+
+    primary: Mapping[str, str]
+    """Measures that conclusions are drawn from, with descriptions."""
+    seeds: int
+    curves: tuple[Curve, ...]
+    splits: tuple[ModelSplit, ...]
+    references: Mapping[str, Mapping[str, float]]
+    """Primary measures of who has learnt nothing, and of the oracle."""
+    success: tuple[Success, ...]
+
+    @property
+    def models(self) -> list[str]:
+        """Models, in order."""
+        return list(dict.fromkeys(curve.arm.model for curve in self.curves))
+
+    def find_curve(self, model: str, arm: str, measure: str) -> Curve:
+        """Return the curve of a measure."""
+        return next(
+            each for each in self.curves if (each.arm.model, each.arm.name, each.measure) == (model, arm, measure)
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the numbers as dictionaries, with the verdict of each split."""
+        found = asdict(self)
+        for row, each in zip(found["splits"], self.splits, strict=True):
+            row["verdict"] = each.split.verdict
+        return found
+
 
 class Resampled:
     """Means of one measure over trainings, resampled together.
@@ -152,27 +246,25 @@ def measure_trend(means: Resampled, names: Sequence[str]) -> Trend:
 
 
 def fit_power_law(sizes: Sequence[int], values: Sequence[Draws]) -> PowerLaw:
-    """Fit a + b (K / K_1)^-c with a, b of 0 or more and c up to `STEEPEST`, by least squares, anew in each draw."""
+    """Fit a + b (K / K_1)^-c by least squares, anew in each draw; a and b are not below 0, c is one of `EXPONENTS`."""
     relative = np.array(sizes, np.float64) / sizes[0]
-    fitted = _fit(relative, np.array([each.value for each in values]))
-    drawn = np.array([_fit(relative, row) for row in np.stack([each.drawn for each in values], axis=1)])
+    fitted = _fit(relative, np.array([[each.value for each in values]]))[0]
+    drawn = _fit(relative, np.stack([each.drawn for each in values], axis=1))
     return PowerLaw(*(Draws(float(value), drawn[:, i]).interval() for i, value in enumerate(fitted)))
 
 
 def _fit(relative: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a, b and c."""
-    from scipy.optimize import least_squares
-
-    scale = max(float(np.abs(values).max()), 1e-12)
-    spread = max(float(values[0] - values[-1]) / scale, 1e-3)
-    start = np.clip([values[-1] / scale, spread, 0.5], 1e-6, 10.0)
-
-    def residuals(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-        a, b, c = numbers
-        return np.asarray(a + b * relative**-c - values / scale)
-
-    found = least_squares(residuals, start, bounds=([0, 0, 0.01], [np.inf, np.inf, STEEPEST]))
-    return np.asarray(found.x * (scale, scale, 1.0))
+    """Return a, b and c [D, 3] of values [D, K]: for each exponent the best line, and then the best exponent."""
+    x = relative ** -EXPONENTS[:, None]  # [C, K]
+    centred = x - x.mean(axis=1, keepdims=True)
+    b = values @ centred.T / (centred**2).sum(axis=1)  # [D, C]
+    a = values.mean(axis=1, keepdims=True) - b * x.mean(axis=1)
+    through_zero = values @ x.T / (x**2).sum(axis=1)
+    level = np.broadcast_to(values.mean(axis=1, keepdims=True), b.shape)
+    a, b = np.where(b < 0, level, np.maximum(a, 0)), np.where(b < 0, 0, np.where(a < 0, through_zero, b))
+    errors = ((a[..., None] + b[..., None] * x - values[:, None]) ** 2).sum(axis=-1)
+    rows, best = np.arange(len(values)), errors.argmin(axis=1)
+    return np.stack([a[rows, best], b[rows, best], EXPONENTS[best]], axis=1)
 
 
 def split_gain(means: Resampled, few: str, few_long: str, many: str) -> Split:
@@ -182,3 +274,57 @@ def split_gain(means: Resampled, few: str, few_long: str, many: str) -> Split:
     drawn = 100 * updates.drawn / np.where(np.abs(total.drawn) > 1e-12, total.drawn, np.nan)
     share = Draws(100 * updates.value / total.value if total.value else math.nan, drawn)
     return Split(total.interval(), updates.interval(), (middle - last).interval(), share.interval())
+
+
+def summarise_scaling(
+    arms: Sequence[ScalingArm],
+    measures: Mapping[str, Sequence[Mapping[str, SceneSums]]],
+    primary: Mapping[str, str],
+    references: Mapping[str, Mapping[str, float]],
+    success: Sequence[Success] = (),
+) -> ScalingTable:
+    """Return the curves of all measures with intervals, and tests, fits and splits of the primary ones.
+
+    Args:
+        arms: of all models, each model with the three.
+        measures: for each training the tables of its measures, a set for each seed.
+        primary: description of each primary measure.
+        references: primary measures of who has learnt nothing.
+        success: rates in closed loop.
+
+    Raises:
+        ArgumentError: numbers of seeds that differ.
+    """
+    names = list(dict.fromkeys(name for seeds in measures.values() for table in seeds for name in table))
+    resampled = {
+        name: Resampled({training: [table[name] for table in seeds] for training, seeds in measures.items()})
+        for name in names
+    }
+    curves = tuple(_draw_curve(arm, name, resampled[name], name in primary) for arm in arms for name in names)
+    splits = tuple(
+        ModelSplit(arm.model, name, _split_arm(resampled[name], arm, arms))
+        for name in primary
+        for arm in arms
+        if arm.name == ONE_EPOCH
+    )
+    return ScalingTable(dict(primary), len(next(iter(measures.values()))), curves, splits, references, tuple(success))
+
+
+def _draw_curve(arm: ScalingArm, measure: str, means: Resampled, primary: bool) -> Curve:
+    drawn = [means.mean(name) for name in arm.trainings]
+    judged = primary and arm.name != FEWER_SCENES
+    return Curve(
+        arm,
+        measure,
+        tuple(each.interval() for each in drawn),
+        tuple(tuple(means.by_seed(name)) for name in arm.trainings),
+        (drawn[0] - drawn[-1]).interval(),
+        measure_trend(means, arm.trainings) if judged else None,
+        fit_power_law(arm.amounts, drawn) if judged else None,
+    )
+
+
+def _split_arm(means: Resampled, short: ScalingArm, arms: Sequence[ScalingArm]) -> Split:
+    """Split the gain of an arm of one epoch, by the arm of equal updates of the same model."""
+    long = next(arm for arm in arms if (arm.model, arm.name) == (short.model, EQUAL_UPDATES))
+    return split_gain(means, short.trainings[0], long.trainings[0], short.trainings[-1])

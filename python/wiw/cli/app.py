@@ -35,6 +35,7 @@ from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
 from wiw.cli.terminal import printable
+from wiw.cli.study import study_data_scaling
 from wiw.cli.train import train
 from wiw.cli.verify import verify
 from wiw.cli.view import view
@@ -128,6 +129,16 @@ GROUPS: Mapping[str, Group] = {
             (export_data, "export", "Write navigation or manipulation data as a LeRobot dataset, format v3.0."),
             (import_data, "import", "Write the collection that a LeRobot dataset was exported from."),
         ),
+    ),
+    "study": Group(
+        "Train and measure many small world models to answer a question.",
+        """Train and measure many small world models to answer a question. Repeat an interrupted command to resume it.
+
+  $ wiw study data-scaling --small --workers 2
+  $ wiw study data-scaling --data data --workers 4
+
+`wiw study WHAT --help` explains each with examples.""",
+        ((study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),),
     ),
 }
 

@@ -58,32 +58,35 @@ def measure_decisions(
     """
     count, plans = decisions.plans.shape[:2]
     scores = np.empty((count, plans))
-    for first in range(0, count, max(1, batch // plans)):
-        rows = slice(first, first + max(1, batch // plans))
-        between()
-        scores[rows] = _score_ends(imagine, decisions, rows, seed)
+    for index in range(count):
+        ends = _imagine_ends(imagine, decisions, index, seed, batch, between)
+        scores[index] = _score(ends, decisions.goals[index])
     true = np.stack([_score(decisions.futures[index], decisions.goals[index]) for index in range(count)])
     least = decisions.distances.min(axis=1)
-    places = np.arange(count)
+    rows = np.arange(count)
     return DecisionErrors(
         decisions.scenes,
         np.array([rank_agreement(own, oracle) for own, oracle in zip(scores, true, strict=True)]),
-        decisions.distances[places, scores.argmax(axis=1)] - least,
+        decisions.distances[rows, scores.argmax(axis=1)] - least,
         decisions.distances.mean(axis=1) - least,
-        decisions.distances[places, true.argmax(axis=1)] - least,
+        decisions.distances[rows, true.argmax(axis=1)] - least,
     )
 
 
-def _score_ends(imagine: Imagine, decisions: Decisions, rows: slice, seed: int) -> NDArray[np.float64]:
-    """Return the scores of the plans of some decisions, float64 [B, M]; ends face where the observation does."""
-    plans, lengths = decisions.plans[rows], decisions.lengths[rows]
-    shape = plans.shape[:2]
-    flat = plans.reshape(-1, plans.shape[-1])
-    images = np.repeat(decisions.images[rows], shape[1], axis=0)
-    seeds = np.arange(len(flat), dtype=np.uint64) + np.uint64(seed + rows.start * shape[1])
-    ends = imagine(images, flat, seeds, lengths.reshape(-1, 1))[:, 0]
-    ends = turn_panoramas(ends, -action.to_trajectory(flat)[:, -1, 2]).reshape(*shape, *ends.shape[1:])
-    return np.stack([_score(own, goal) for own, goal in zip(ends, decisions.goals[rows], strict=True)])
+def _imagine_ends(
+    imagine: Imagine, decisions: Decisions, index: int, seed: int, batch: int, between: Callable[[], None]
+) -> Frames:
+    """Return the imagined ends of a decision's plans, uint8 [M, H, W, 3], facing where the observation does."""
+    plans, lengths = decisions.plans[index], decisions.lengths[index]
+    images = np.repeat(decisions.images[index][None], len(plans), axis=0)
+    seeds = np.arange(len(plans), dtype=np.uint64) + np.uint64(seed + index * len(plans))
+    parts = []
+    for first in range(0, len(plans), batch):
+        rows = slice(first, first + batch)
+        between()
+        parts.append(imagine(images[rows], plans[rows], seeds[rows], lengths[rows, None])[:, 0])
+    headings = action.to_trajectory(plans)[:, -1, 2]
+    return turn_panoramas(np.concatenate(parts), -headings)
 
 
 def _score(ends: Frames, goal: Frames) -> NDArray[np.float64]:

@@ -1,54 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small world models that learn from windows of a navigation dataset within minutes, for studies of data."""
+"""Small world models that learn from clips of a navigation dataset within minutes, for studies of data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from wiw.datasets.shrunk_navigation import ShrunkNavigation
 from wiw.errors import ArgumentError
-from wiw.training.held_out_clips import Imagine
-from wiw.training.post_training.clip_order import ClipOrder
+from wiw.registry import WORLD_MODELS
+from wiw.world_models import devices
+
+if TYPE_CHECKING:
+    from wiw.training.place_trainer import PlaceTrainer
+    from wiw.training.post_training.recipe import ClipRecipe
+    from wiw.world_models.trained import Trained
+
+LEARNERS = ("warpnet", "pocket")
 
 
-class Learner(Protocol):
-    """How a model is trained from nothing, kept, and asked."""
+@dataclass(frozen=True)
+class Learner:
+    """How a world model is trained from nothing, kept, and asked."""
 
-    name: str
-    """Of the world model that reads its weights by `weights=FILE`."""
-    needs_depth: bool
-    """Whether it learns from depth too."""
-
-    def train(
-        self,
-        data: ShrunkNavigation,
-        windows: NDArray[np.int64],
-        order: ClipOrder,
-        steps: int,
-        seed: int,
-        on_step: Callable[[int], None],
-    ) -> Any:
-        """Return a network trained for so many steps: step k on `windows[order.select(k)]`.
-
-        The learning rate's schedule ends with the last step. The result depends on nothing but the arguments.
-        """
-
-    def save(self, network: Any, path: Path, card: dict[str, Any]) -> None:
-        """Write the weights to a file."""
-
-    def load(self, path: Path) -> Any:
-        """Read a network from a file."""
-
-    def imagine(self, network: Any) -> Imagine:
-        """Return how a network imagines."""
-
-
-LEARNERS = ("warpnet",)
+    model: type[Trained]
+    """The world model that reads the weights by `weights=FILE`."""
+    trainer: type[PlaceTrainer]
+    create_recipe: Callable[..., ClipRecipe]
+    """Returns a recipe, given `frames`, `size`, `batch`, `clips` and `seed`."""
+    save: Callable[[Path, Any, Mapping[str, Any]], None]
+    """Writes a file of weights, given a path, a network and a card."""
 
 
 def make_learner(name: str) -> Learner:
@@ -56,14 +38,29 @@ def make_learner(name: str) -> Learner:
 
     Raises:
         ArgumentError: there is none of that name.
-        DependencyError: torch is not installed.
+        DependencyError: torch or safetensors is not installed.
     """
     if name not in LEARNERS:
         raise ArgumentError(f"expected a model among {', '.join(LEARNERS)}, got '{name}'")
-    from wiw.registry import WORLD_MODELS
-    from wiw.world_models import devices
+    model = WORLD_MODELS.find(name)
+    devices.require(model.requires)
+    if name == "warpnet":
+        from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer
+        from wiw.world_models.warpnet.weights import save
 
-    devices.require(WORLD_MODELS.find(name).requires)
-    from wiw.training.warpnet_clips import WarpNetLearner
+        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, save)
+    from wiw.training.pocket.trainer import PocketTrainer
+    from wiw.world_models.pocket.weights import save as save_pocket
 
-    return {"warpnet": WarpNetLearner}[name]()
+    return Learner(model, PocketTrainer, _create_pocket_recipe, save_pocket)
+
+
+def _create_pocket_recipe(**numbers: Any) -> ClipRecipe:
+    """Return the shipped recipe for a network about as large as warpnet, with fewer places of more clips, and without
+    averaged weights, which after few updates are still the random ones.
+    """
+    from wiw.training.pocket.recipe import PocketRecipe
+    from wiw.training.post_training.recipe import load_recipe
+
+    options = {"widths": [32, 64, 96, 128], "places": 3, "ema": 0.0}
+    return load_recipe("pocket", options={**options, **numbers}, kind=PocketRecipe)

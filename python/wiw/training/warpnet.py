@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,10 +18,11 @@ from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.reproject import pose, warp
+from wiw.training.reduced_frames import compute_log_distances
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 from wiw.training.walks import Walks, find_straight_paths
 from wiw.world_models.warpnet.model import WarpNet, to_network
-from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
+from wiw.world_models.warpnet.network import Network, Prediction
 
 STRIDE = 0.2
 """Metres of a step ahead."""
@@ -73,29 +73,19 @@ def train(
         on_step: called after each step with its number, the number of all steps and a running mean of the loss.
     """
     steps_per_epoch = max(1, walks.places.size // recipe.batch)
-
-    def create_trainer() -> WarpNetTrainer:
-        return WarpNetTrainer(partial(sample_pairs, walks), walks.images.shape[2], recipe)
-
     trainer, recipe = run_training(
-        create_trainer, recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
+        lambda: _Trainer(walks, recipe), recipe, steps_per_epoch, minutes, warmup_cosine_schedule(0.05), on_step
     )
     return trainer.network.eval(), recipe
 
 
-class WarpNetTrainer:
-    """The network in training, with everything that its next step depends on.
+class _Trainer:
+    """The network in training, with everything that its next step depends on."""
 
-    Args:
-        draw_pairs: returns so many pairs, drawn by a generator.
-        height: of the panoramas.
-        recipe: of the training.
-    """
-
-    def __init__(self, draw_pairs: Callable[[int, np.random.Generator], Pairs], height: int, recipe: Recipe) -> None:
+    def __init__(self, walks: Walks, recipe: Recipe) -> None:
         torch.manual_seed(core.fold_key([recipe.seed, 0x4C11]) % 2**63)
-        self.recipe, self._draw_pairs = recipe, draw_pairs
-        self.network = Network(height, recipe.widths)
+        self.walks, self.recipe = walks, recipe
+        self.network = Network(walks.images.shape[2], recipe.widths)
         self._rng = np.random.default_rng(core.fold_key([recipe.seed, 0x4C12]))
         self._optimiser = torch.optim.AdamW(self.network.parameters(), recipe.rate, weight_decay=recipe.decay)
 
@@ -103,10 +93,10 @@ class WarpNetTrainer:
         """Train on one batch of pairs and return its loss."""
         for group in self._optimiser.param_groups:
             group["lr"] = learning_rate
-        pairs = self._draw_pairs(self.recipe.batch, self._rng)
+        pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
             found = self.network.train()(pairs.source, pairs.ahead)
-        loss = _compute_loss(found, pairs, self.recipe)
+        loss = compute_losses(found, pairs, self.recipe).mean()
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -134,16 +124,15 @@ def sample_pairs(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
     first = rng.integers(0, stops, count)
     second = (first + rng.integers(1, stops, count)) % stops
     ahead = walks.places[paths, second] - walks.places[paths, first]
-    return build_pairs(
-        walks.images[paths, first], walks.images[paths, second], walks.distances[paths, second], ahead, rng
-    )
+    log_distances = compute_log_distances(walks.distances[paths, second])
+    return build_pairs(walks.images[paths, first], walks.images[paths, second], log_distances, ahead, rng)
 
 
 def build_pairs(
     source: NDArray[np.uint8],
     target: NDArray[np.uint8],
-    distances: NDArray[np.float16],
-    ahead: NDArray[np.float32],
+    log_distances: NDArray[Any],
+    ahead: NDArray[Any],
     rng: np.random.Generator,
 ) -> Pairs:
     """Build pairs of panoramas, half of them mirrored, with other brightness and tint.
@@ -151,8 +140,8 @@ def build_pairs(
     Args:
         source: uint8 [B, H, W, 3].
         target: the same, seen from further ahead.
-        distances: float16 [B, H, W]: metres along the target's rays, 0 where nothing is hit.
-        ahead: float32 [B]: metres; where below 0, the target is behind, and both are turned around.
+        log_distances: [B, H, W] of the target.
+        ahead: [B]: metres; where below 0, the target is behind, and both are turned around.
         rng: draws the augmentation.
     """
     back, mirrored = ahead < 0, rng.random(len(ahead)) < 0.5
@@ -161,9 +150,10 @@ def build_pairs(
     before, after = (
         (to_network(_augment_panoramas(images, back, mirrored)) + 1) * gain - 1 for images in (source, target)
     )
-    metres = _augment_panoramas(distances, back, mirrored).astype(np.float32)
-    log_distance = np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST))
-    return Pairs(before, torch.from_numpy(np.abs(ahead)), after, torch.from_numpy(log_distance)[:, None])
+    distances = _augment_panoramas(log_distances, back, mirrored).astype(np.float32)
+    return Pairs(
+        before, torch.from_numpy(np.abs(ahead).astype(np.float32)), after, torch.from_numpy(distances)[:, None]
+    )
 
 
 def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrored: NDArray[np.bool_]) -> NDArray[Any]:
@@ -174,23 +164,27 @@ def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrore
     return made
 
 
-def _compute_loss(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
+def compute_losses(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
+    """Return the loss of each pair, float32 [B]."""
     height = pairs.target.shape[2]
     weights = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))[:, None]
 
+    def average(values: Tensor, weights: Tensor) -> Tensor:
+        return (values * weights).mean(dim=(1, 2, 3))
+
     def error(a: Tensor, b: Tensor) -> Tensor:
-        return ((a - b).abs() * weights).mean() / weights.mean()
+        return average((a - b).abs(), weights) / weights.mean()
 
     def edges(a: Tensor, b: Tensor) -> Tensor:
         across = error(a - a.roll(1, -1), b - b.roll(1, -1))
-        return across + ((a - b)[:, :, 1:] - (a - b)[:, :, :-1]).abs().mul(weights[1:]).mean() / weights.mean()
+        return across + average(((a - b)[:, :, 1:] - (a - b)[:, :, :-1]).abs(), weights[1:]) / weights.mean()
 
     return (
         error(found.colours, pairs.target)
         + recipe.edges * edges(found.colours, pairs.target)
         + recipe.warped * error(found.warped, pairs.target)
         + recipe.distance * error(found.log_distance, pairs.log_distance)
-        + recipe.paint * (found.mask * weights).mean() / weights.mean()
+        + recipe.paint * average(found.mask, weights) / weights.mean()
     )
 
 

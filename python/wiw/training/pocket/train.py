@@ -16,7 +16,7 @@ import wiw
 from wiw.datasets.navigation import NavigationData, Part
 from wiw.files import atomic_file
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
-from wiw.training.pocket.frames import Bar, reduce_frames
+from wiw.training.reduced_frames import Bar, reduce_frames
 from wiw.training.pocket.recipe import PocketRecipe
 from wiw.training.pocket.trainer import PocketTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
