@@ -34,8 +34,8 @@ from wiw.cli.scenes import scenes
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_sigterm
-from wiw.cli.terminal import printable
 from wiw.cli.study import study_data_scaling
+from wiw.cli.terminal import printable
 from wiw.cli.train import train
 from wiw.cli.verify import verify
 from wiw.cli.view import view

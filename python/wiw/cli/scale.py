@@ -55,7 +55,10 @@ def scale(
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search)
     folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
     settings = replace(config, seed=seed, out=folder)
-    counts, shares = parse_numbers(candidates, int, "candidates"), parse_numbers(imagine_fraction, float, "imagine-fraction")
+    counts, shares = (
+        parse_numbers(candidates, int, "candidates"),
+        parse_numbers(imagine_fraction, float, "imagine-fraction"),
+    )
     found = stoppable(lambda: run_scale(recipe, agent, counts, shares, config=settings), folder)
     found.summary()
     for path in found.save():

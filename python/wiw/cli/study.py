@@ -78,8 +78,9 @@ def study_data_scaling(
         "decision_scenes": decision_scenes,
         "decisions_per_scene": decisions_per_scene,
     }
-    changes = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items() if value is not None}
-    settings = replace(SMALL if small else FULL, **changes)
+    changes = {name: value for name, value in given.items() if value is not None}
+    lists = {name: tuple(value) for name, value in changes.items() if isinstance(value, list)}
+    settings = replace(SMALL if small else FULL, **changes | lists)
     with announce_resume(), Bars() as bars:
         found = data_scaling(data, out, settings, workers=workers, episodes=imagenav, watch=bars.show)
     found.summary()

@@ -37,7 +37,7 @@ ABOUT: Mapping[str, str] = {
     "regret": "How much further from the goal the chosen plan ends than the best one.",
     "psnr/4": "Of the same frames as the error.",
     "ssim/4": "Of the same frames as the error.",
-    "gap/displacements": "PSNR under the true actions less PSNR under those of another clip, turned to the true heading.",
+    "gap/displacements": "PSNR under the true actions less that under another clip's, turned to the true heading.",
     "rank": "Kendall's tau of the plans' scores with those that true pictures give.",
 }
 

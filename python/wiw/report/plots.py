@@ -192,7 +192,9 @@ def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: 
         x = shift * np.array(clips)
         bars = [[each.value - each.low, each.high - each.value] for each in curve.values]
         middle = [each.value for each in curve.values]
-        axes.errorbar(x, middle, np.clip(np.array(bars).T, 0, None), fmt="o", color=color, ms=6, elinewidth=2, label=name)
+        axes.errorbar(
+            x, middle, np.clip(np.array(bars).T, 0, None), fmt="o", color=color, ms=6, elinewidth=2, label=name
+        )
         for at, seeds in zip(x, curve.by_seed, strict=True):
             axes.plot([at] * len(seeds), seeds, "_", color=color, ms=9, alpha=0.7)
         if curve.fit is not None:
@@ -214,10 +216,8 @@ def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: 
     levels = sorted((values[measure], name) for name, values in found.references.items() if measure in values)
     for row, (level, name) in enumerate(levels):  # the labels of neighbours are apart, and lie above the curves
         axes.axhline(level, color=ROLE_COLORS["none"], lw=1, ls=":")
-        at = (clips[-1 - row], level)
-        axes.annotate(
-            name, at, xytext=(0, 2), textcoords="offset points", ha="right" if row == 0 else "center", fontsize=8, color=INK
-        )
+        at, side = (clips[-1 - row], level), "center" if row else "right"
+        axes.annotate(name, at, (0, 2), textcoords="offset points", ha=side, fontsize=8, color=INK)
     axes.set_xscale("log")
     axes.set_xticks(clips, [f"{each:,}" for each in clips])
     axes.minorticks_off()

@@ -23,6 +23,7 @@ from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
 from wiw.studies.data_scaling_plan import (
+    FULL,
     PRIMARY,
     SMALL_SCENES,
     SMALL_SIZE,
@@ -84,7 +85,7 @@ class DataScaling:
 def data_scaling(
     data: str | Path | None = None,
     out: str | Path = "runs/data-scaling",
-    settings: ScalingSettings = ScalingSettings(),
+    settings: ScalingSettings = FULL,
     *,
     workers: int = 1,
     episodes: int = 0,
@@ -198,7 +199,7 @@ def _prepare(plan: ScalingPlan, data: Path, folder: Path, watch: Watch) -> None:
 
     settings = plan.settings
     if not (folder / DECISIONS).exists():
-        rules = DecisionRules(actions=settings.length - 1, size=settings.size)
+        rules = DecisionRules(size=settings.size)
         found = collect_decisions(
             settings.decision_scenes,
             settings.decisions_per_scene,
@@ -244,13 +245,11 @@ def _run_imagenav(
     from wiw.loop.agent import Agent
     from wiw.studies.evaluate import evaluate
 
-    seed = plan.settings.seeds[0]
-    arms = {job.training.setting: f"{job.training.model}?weights={job.weights}" for job in jobs if job.training.seed == seed}
     log = evaluate(
         "imagenav",
-        Agent("heuristic", "copy"),
+        Agent("matcher", "copy"),
         episodes,
-        arms={"none": "none", **arms},
+        arms={"none": "none", **name_arms(jobs, plan.settings.seeds[0])},
         out=folder / f"imagenav-{episodes}",
         resume=True,
         workers=workers,
@@ -258,3 +257,12 @@ def _run_imagenav(
         seed=0,
     )
     return [Success(line.name, line.estimates["success"]) for line in log.numbers().arms]
+
+
+def name_arms(jobs: Sequence[TrainingJob], seed: int) -> dict[str, str]:
+    """Return the world models of a seed as arms of a run, by their trainings' names."""
+    return {
+        job.training.setting: f"{job.training.model}?weights={job.weights.absolute()}"
+        for job in jobs
+        if job.training.seed == seed
+    }
