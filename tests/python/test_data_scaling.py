@@ -360,3 +360,14 @@ def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
         make_plan(dataset, replace(SETTINGS, clips=12_800))
     with pytest.raises(ArgumentError, match="0 held out; choose another share"):
         make_plan(dataset, replace(SETTINGS, held_out=0.0))
+    with pytest.raises(ArgumentError, match="expected a dataset for 12,800 clips"):
+        wiw.data_scaling(None)
+
+
+def test_a_dataset_without_depth_is_refused(dataset: Path, tmp_path: Path) -> None:
+    shutil.copytree(dataset, tmp_path / "data")
+    meta = json.loads((dataset / "meta.json").read_text())
+    meta["config"]["depth"] = False
+    (tmp_path / "data" / "meta.json").write_text(json.dumps(meta))
+    with pytest.raises(ArgumentError, match="expected a dataset with depth"):
+        make_plan(tmp_path / "data", SETTINGS)

@@ -89,15 +89,15 @@ class Split:
 
     total: Value
     updates: Value
-    """What more updates on the few clips bring."""
+    """Gain by more updates on the few clips."""
     data: Value
-    """What more clips bring at equal updates."""
+    """Gain by more clips at equal updates."""
     share: Value
     """Percent of the total that updates bring."""
 
     @property
     def verdict(self) -> str:
-        """What the gain is due to, as far as the intervals say."""
+        """Main cause of the gain, as far as the intervals say."""
         if not self.total.low > 0:
             return "no gain beyond chance"
         if self.share.low > 50:
@@ -112,7 +112,7 @@ class ScalingArm:
     model: str
     name: str
     amounts: tuple[int, ...]
-    """What differs: clips of each training; scenes in the arm `FEWER_SCENES`."""
+    """Clips of each training; scenes in the arm `FEWER_SCENES`."""
     clips: int
     """Clips of the last training."""
     updates: tuple[int, ...]

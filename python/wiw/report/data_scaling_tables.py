@@ -161,7 +161,8 @@ def _show_trend(curve: Curve) -> list[str]:
 
 
 def _show_fit(fit: PowerLaw) -> list[str]:
-    return [show_interval(each, _choose_form(each.value)) for each in (fit.a, fit.b, fit.c)]
+    form = _choose_form(max(fit.a.value, fit.b.value))
+    return [show_interval(fit.a, form), show_interval(fit.b, form), show_interval(fit.c, ".2f")]
 
 
 def _show_split(found: ModelSplit) -> list[str]:

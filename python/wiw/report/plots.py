@@ -199,8 +199,8 @@ def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: 
             axes.plot([at] * len(seeds), seeds, "_", color=color, ms=9, alpha=0.7)
         if curve.fit is not None:
             fine = np.geomspace(clips[0], clips[-1], 60)
-            level = curve.fit.a.value + curve.fit.b.value * (fine / clips[0]) ** -curve.fit.c.value
-            axes.plot(fine, level, color=color, lw=1.4, ls=(0, (4, 3)))
+            fitted = curve.fit.a.value + curve.fit.b.value * (fine / clips[0]) ** -curve.fit.c.value
+            axes.plot(fine, fitted, color=color, lw=1.4, ls=(0, (4, 3)))
     few = found.find_curve(model, FEWER_SCENES, measure)
     for scenes, each in list(zip(few.arm.amounts, few.values, strict=True))[:-1]:
         axes.errorbar(

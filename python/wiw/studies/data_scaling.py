@@ -25,6 +25,7 @@ from wiw.files import atomic_file
 from wiw.studies.data_scaling_plan import (
     FULL,
     PRIMARY,
+    SMALL,
     SMALL_SCENES,
     SMALL_SIZE,
     ScalingPlan,
@@ -44,6 +45,7 @@ from wiw.studies.data_scaling_training import (
 )
 from wiw.training.jobs import run_jobs
 from wiw.training.learners import make_learner
+from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 
 PLAN, DATA = "plan.json", "data"
 """In a study's folder."""
@@ -119,6 +121,11 @@ def data_scaling(
         raise ArgumentError(
             f"data-scaling: expected 1 worker or more and 0 episodes or more, got {workers} and {episodes}"
         )
+    if data is None and settings.clips > SMALL.clips:
+        raise ArgumentError(
+            f"data-scaling: expected a dataset for {settings.clips:,} clips (--data DIR, of `wiw collect navigation`); "
+            "only the small version collects its own (--small)"
+        )
     for name in settings.models:
         make_learner(name)  # fails before anything takes time
     folder = Path(out)
@@ -143,6 +150,9 @@ def make_plan(data: Path, settings: ScalingSettings) -> ScalingPlan:
         FileError: the dataset is missing or damaged.
     """
     trained, held_out = (NavigationData(data, part, settings.held_out) for part in ("train", "held-out"))
+    require_panoramas("data-scaling", NavigationCorpus(trained, "train"))
+    if not trained.meta["config"]["depth"]:
+        raise ArgumentError(f"data-scaling: expected a dataset with depth, got {data}; collect it without --no-depth")
     if not len(held_out) or not len(trained):
         raise ArgumentError(
             f"data-scaling: expected scenes to train on and others held out, got {len(trained)} segments to train on "

@@ -32,14 +32,14 @@ REGISTERED = (
     "Scenes: the difference between the same number of clips from the fewest and from all scenes, at equal updates.",
     "Intervals: 95 %, percentiles over scenes and seeds drawn anew together, all trainings paired.",
 )
-"""What was settled before the first training."""
+"""Rules that are settled before the first training."""
 SPAN = 100
 """The largest size over the smallest."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScalingSettings:
-    """What a study is asked for.
+    """Numbers that a user of a study chooses.
 
     Raises:
         ArgumentError: a number is out of range.

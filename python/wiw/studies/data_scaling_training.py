@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from wiw.training.reduced_frames import ReducedFrames
 
 FRAMES, DECISIONS = "frames", "decisions.parquet"
-"""What a study's folder has for all trainings: a folder and a file."""
+"""Folder and file in a study's folder that all trainings read."""
 STEP = 4
 """Actions after which the primary error is taken."""
 SAVED_EVERY = 60.0
@@ -49,7 +49,7 @@ Measures = dict[str, dict[str, list[float]]]
 
 @dataclass(frozen=True)
 class Material:
-    """What all trainings of a study share."""
+    """Data that all trainings of a study share."""
 
     clips: Clips
     """All windows of the scenes to train on."""
