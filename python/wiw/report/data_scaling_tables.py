@@ -188,7 +188,7 @@ def _tell_scenes(curve: Curve) -> str:
     verdict = "" if curve.gain.excludes_zero else ", which may be chance"
     few, whole = curve.arm.amounts[0], curve.arm.amounts[-1]
     return (
-        f"{curve.arm.model}, {curve.measure}: as many clips from all {whole} scenes instead of {few} lower it by "
+        f"{curve.arm.model}, {curve.measure}: as many clips from all {whole} scenes instead of {few} gain "
         f"{show_interval(curve.gain, form)}{verdict}."
     )
 

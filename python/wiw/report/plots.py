@@ -213,14 +213,26 @@ def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: 
             elinewidth=2,
             label=f"from {scenes} scenes",
         )
+    low, high = _find_range(found, measure)
+    axes.set_ylim(low, high)
     levels = sorted((values[measure], name) for name, values in found.references.items() if measure in values)
-    for row, (level, name) in enumerate(levels):  # the labels of neighbours are apart, and lie above the curves
+    for row, (level, name) in enumerate(each for each in levels if low < each[0] < high):
         axes.axhline(level, color=ROLE_COLORS["none"], lw=1, ls=":")
         at, side = (clips[-1 - row], level), "center" if row else "right"
         axes.annotate(name, at, (0, 2), textcoords="offset points", ha=side, fontsize=8, color=INK)
+    far = ", ".join(f"{name} {level:.3g}" for level, name in levels if not low < level < high)
+    axes.set_title(f"out of range: {far}" if far else "", loc="right", fontsize=8, color=INK)
     axes.set_xscale("log")
     axes.set_xticks(clips, [f"{each:,}" for each in clips])
     axes.minorticks_off()
+
+
+def _find_range(found: ScalingTable, measure: str) -> tuple[float, float]:
+    """Return the limits of an axis that has room for all values of a measure with their intervals."""
+    values = [each for curve in found.curves if curve.measure == measure for each in curve.values]
+    low, high = min(each.low for each in values), max(each.high for each in values)
+    margin = 0.1 * (high - low) or 1.0
+    return low - margin, high + margin
 
 
 def blame_by_arm(found: Blame) -> Markup:
