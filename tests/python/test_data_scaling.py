@@ -371,3 +371,15 @@ def test_a_dataset_without_depth_is_refused(dataset: Path, tmp_path: Path) -> No
     (tmp_path / "data" / "meta.json").write_text(json.dumps(meta))
     with pytest.raises(ArgumentError, match="expected a dataset with depth"):
         make_plan(tmp_path / "data", SETTINGS)
+
+
+def test_without_a_dataset_it_collects_its_own(two_rooms: str, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr("wiw.studies.data_scaling.SMALL_SCENES", two_rooms)
+    monkeypatch.setattr("wiw.studies.data_scaling.SMALL_SIZE", (32, 64))
+    seen: list[tuple[Any, ...]] = []
+    with pytest.raises(ArgumentError, match="collect more scenes"):  # one is not enough
+        wiw.data_scaling(
+            None, tmp_path, SETTINGS, watch=lambda name, done, total, text: seen.append((name, done, total))
+        )
+    assert seen == [("scenes", 1, 1)]
+    assert NavigationData(tmp_path / "data")[0].images.shape[1:] == (32, 64, 3)
