@@ -99,7 +99,7 @@ class Split:
     def verdict(self) -> str:
         """Main cause of the gain, as far as the intervals say."""
         if not self.total.low > 0:
-            return "no gain beyond chance"
+            return "no gain"
         if self.share.low > 50:
             return "mostly updates"
         return "mostly data" if self.share.high < 50 else "undecided"

@@ -168,14 +168,14 @@ def _show_fit(fit: PowerLaw) -> list[str]:
 def _show_split(found: ModelSplit) -> list[str]:
     split, form = found.split, _choose_form(found.split.total.value)
     parts = [show_interval(each, form) for each in (split.total, split.updates, split.data)]
-    share = "–" if split.verdict == "no gain beyond chance" else f"{show_interval(split.share, '.0f')} %"
+    share = "–" if split.verdict == "no gain" else f"{show_interval(split.share, '.0f')} %"
     return [*parts, share, split.verdict]
 
 
 def _tell_split(found: ModelSplit) -> str:
     split, form = found.split, _choose_form(found.split.total.value)
     who = f"{found.model}, {found.measure}"
-    if split.verdict == "no gain beyond chance":
+    if split.verdict == "no gain":
         return f"{who}: from the smallest to the largest size there is no gain beyond chance, so nothing to split."
     return (
         f"{who}: of the gain of {show_interval(split.total, form)} from the smallest to the largest size, "
