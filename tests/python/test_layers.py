@@ -28,6 +28,7 @@ FACES = {
     "files",
     "gymnasium_ids",
     "json_text",
+    "mapping_files",
     "registry",
     "suggestions",
     "networks",
