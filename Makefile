@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo | test | bench | lint | wheel    each does all the set-up it needs (Debian packages, .venv, build).
-.PHONY: help setup demo test bench lint wheel sanitize clean
+.PHONY: help setup demo test bench nightly lint wheel sanitize clean
 .DEFAULT_GOAL := help
 BIN := .venv/bin
 TESTS := build/tests
@@ -26,6 +26,10 @@ test:       ## all tests: ctest, then pytest
 bench:      ## every speed claim, side by side with what a user would pick instead
 	@scripts/setup test
 	$(BIN)/python tests/benchmark/run_all.py
+
+nightly:    ## what takes too long for every change: the small data-scaling study, from collecting to its page
+	@scripts/setup torch export
+	$(BIN)/wiw study data-scaling --small --workers $(JOBS) --out build/nightly/data-scaling
 
 lint:       ## ruff, mypy, clang-format, clang-tidy
 	@scripts/setup test lint

@@ -34,6 +34,7 @@ __all__ = [
     "collect",
     "collect_navigation",
     "compare",
+    "data_scaling",
     "envs",
     "errors",
     "evaluate",
@@ -76,6 +77,7 @@ _HOME = {
     "collect": "wiw.training.collect",
     "collect_navigation": "wiw.training.collect_navigation",
     "compare": "wiw.studies.compare",
+    "data_scaling": "wiw.studies.data_scaling",
     "evaluate": "wiw.studies.evaluate",
     "import_prompts": "wiw.policies.vlm.prompt_import",
     "judge": "wiw.studies.judge",
@@ -147,6 +149,7 @@ if TYPE_CHECKING:
     from wiw.runs.verify import verify
     from wiw.studies.blame import blame
     from wiw.studies.compare import compare
+    from wiw.studies.data_scaling import data_scaling
     from wiw.studies.evaluate import evaluate
     from wiw.studies.judge import judge
     from wiw.studies.model_check import check_model

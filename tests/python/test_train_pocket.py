@@ -20,13 +20,13 @@ torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.training.held_out_clips import imagine_with, select_clips  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
-from wiw.training.pocket.frames import ReducedFrames, reduce_frames  # noqa: E402
 from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
 from wiw.training.pocket.recipe import PocketRecipe  # noqa: E402
 from wiw.training.pocket.train import create_sampler, train_pocket  # noqa: E402
 from wiw.training.pocket.trainer import PocketTrainer, average_sphere  # noqa: E402
 from wiw.training.post_training.recipe import load_recipe  # noqa: E402
 from wiw.training.post_training.validation import ValidationSet  # noqa: E402
+from wiw.training.reduced_frames import ReducedFrames, reduce_frames  # noqa: E402
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
 from wiw.world_models.pocket.weights import load  # noqa: E402
 from wiw.world_models.warpnet.network import warp  # noqa: E402
@@ -74,7 +74,7 @@ def test_frames_are_decoded_once_and_show_what_the_dataset_shows(
             picture = int(frames.pictures[first + at])
             shown = np.roll(frames.images[picture], int(segment.rolls[at]), axis=1)
             np.testing.assert_array_equal(shown, segment.images[at])
-    monkeypatch.setattr("wiw.training.pocket.frames._build_arrays", None)
+    monkeypatch.setattr("wiw.training.reduced_frames._build_arrays", None)
     again = reduce_frames(data, (64, 128), tmp_path)
     np.testing.assert_array_equal(again.images, frames.images)
 

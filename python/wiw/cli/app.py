@@ -37,6 +37,7 @@ from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.status import status
 from wiw.cli.stop import EXIT_RESUME, Terminated, end_process, raise_on_stop_signals
+from wiw.cli.study import study_data_scaling
 from wiw.cli.submit import cancel, submit
 from wiw.cli.terminal import printable
 from wiw.cli.train import train
@@ -144,6 +145,16 @@ GROUPS: Mapping[str, Group] = {
 
   $ wiw prompts import paper/main.tex --out prompts/paper""",
         ((import_prompts, "import", "Write a folder of prompts from LaTeX source or published code."),),
+    ),
+    "study": Group(
+        "Train and measure many small world models to answer a question.",
+        """Train and measure many small world models to answer a question. Repeat an interrupted command to resume it.
+
+  $ wiw study data-scaling --small --workers 2
+  $ wiw study data-scaling --data data --workers 4
+
+`wiw study WHAT --help` explains each with examples.""",
+        ((study_data_scaling, "data-scaling", "Does a world model get better with data, or with updates?"),),
     ),
 }
 

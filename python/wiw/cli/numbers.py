@@ -39,3 +39,19 @@ def _read_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | Non
         is_instance=lambda value: type(value) in kinds or (kind is float and type(value) is int),
         str_from_instance=lambda value: [str(value)],
     )
+
+
+def parse_numbers(text: str | None, kind: type[int | float], name: str) -> list[Any] | None:
+    """Return the numbers of an option such as "1,2,4"; None where it is not given.
+
+    Raises:
+        ArgumentError: something in it is no number.
+    """
+    from wiw.errors import ArgumentError
+
+    if text is None:
+        return None
+    try:
+        return [kind(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        raise ArgumentError(f"--{name}: expected numbers as in 1,2,4, got '{text}'") from None

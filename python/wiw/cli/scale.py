@@ -6,10 +6,11 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from wiw.cli.numbers import parse_numbers
 from wiw.cli.parts import AgentFlags, TaskFlags
 from wiw.cli.stop import stoppable
 from wiw.loop.config import PlanConfig
@@ -54,7 +55,10 @@ def scale(
     recipe, agent = rules.make_recipe(task, seed), parts.make_recipe(task, search)
     folder = Path(config.out or Path("runs") / f"scale-{datetime.now():%Y%m%d-%H%M%S}")
     settings = replace(config, seed=seed, out=folder)
-    counts, shares = _numbers(candidates, int, "candidates"), _numbers(imagine_fraction, float, "imagine-fraction")
+    counts, shares = (
+        parse_numbers(candidates, int, "candidates"),
+        parse_numbers(imagine_fraction, float, "imagine-fraction"),
+    )
     found = stoppable(lambda: run_scale(recipe, agent, counts, shares, config=settings), folder)
     found.summary()
     for path in found.save():
@@ -63,14 +67,3 @@ def scale(
     for reason in problems:
         print(f"INVALID RUN, do not report: {reason}")
     return 1 if problems else 0
-
-
-def _numbers(text: str | None, kind: Any, name: str) -> list[Any] | None:
-    from wiw.errors import ArgumentError
-
-    if text is None:
-        return None
-    try:
-        return [kind(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        raise ArgumentError(f"--{name}: expected numbers as in 1,2,4, got '{text}'") from None

@@ -152,6 +152,35 @@ class Clips(Sequence[NavigationSegment]):
         return segment, (at - (self._ends[segment - 1] if segment else 0)) * self._stride
 
 
+class SelectedClips(Sequence[NavigationSegment]):
+    """Some of the clips of a dataset.
+
+    Args:
+        clips: all of them.
+        rows: int [N]: which ones.
+    """
+
+    def __init__(self, clips: Clips, rows: Sequence[int]) -> None:
+        self._clips, self._rows = clips, list(rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: Any) -> Any:
+        """Return one clip, or a list of those of a slice, as `Clips` does."""
+        if isinstance(index, slice):
+            return [self._clips[row] for row in self._rows[index]]
+        return self._clips[self._rows[index]]
+
+    def describe(self, index: int) -> str:
+        """Return scene, segment and first frame of a clip, in words."""
+        return self._clips.describe(self._rows[index])
+
+    def locate(self, index: int) -> tuple[int, int]:
+        """Return the segment of a clip, and the frame of it that the clip begins with."""
+        return self._clips.locate(self._rows[index])
+
+
 def part_of(scene: str, held_out: float) -> Literal["train", "held-out"]:
     """Return the part that a scene belongs to, by a hash of its name, so that adding scenes moves no other."""
     number = int.from_bytes(blake2b(scene.encode(), digest_size=8).digest(), "little")

@@ -7,6 +7,7 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from matplotlib.ticker import MaxNLocator
 
 from wiw.analysis.blame import Blame
 from wiw.analysis.breakdowns import Breakdown
+from wiw.analysis.data_scaling import EQUAL_UPDATES, FEWER_SCENES, ONE_EPOCH, ScalingTable
 from wiw.analysis.fidelity import ArmFidelity
 from wiw.analysis.intervals import wilson
 from wiw.analysis.marks import BLIND
@@ -44,6 +46,8 @@ BLAME_COLORS = {
 }
 TICKS = 5
 """Most intervals between the numbers of an axis: more collide where names of arms or fonts are wide."""
+WIDEST_LABEL = 36
+"""Characters on a line of a long label beside an axis."""
 FEW = 24
 """Below this many episodes single outcomes are shown instead of binned rates."""
 
@@ -135,11 +139,7 @@ def draw_success_by_measures(found: QualityTable, measures: Mapping[str, str], f
     handles, texts = figure.axes[0].get_legend_handles_labels()
     columns = min(6, len(texts))
     figure.legend(handles, texts, frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="outside upper left")
-    buffer = io.BytesIO()
-    metadata: dict[str, Any] = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
-    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "quality", "font.family": "sans-serif"}):
-        figure.savefig(buffer, format=form, dpi=160, facecolor="white", metadata=metadata)
-    return buffer.getvalue()
+    return _draw_on_white(figure, form, "quality")
 
 
 def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, label: str) -> None:
@@ -156,6 +156,83 @@ def _draw_success_by_measure(axes: Axes, found: QualityTable, measure: str, labe
     axes.xaxis.set_major_locator(MaxNLocator(TICKS))
     axes.set_xlabel(label)
     axes.set_ylabel("success rate, %" if found.outcome == "SR" else f"{found.outcome.lower()}, %")
+
+
+def scaling_curves(found: ScalingTable) -> Markup:
+    """Plot the primary measures of a data-scaling study over numbers of clips."""
+    return _svg(_draw_scaling(found), "data-scaling")
+
+
+def draw_scaling(found: ScalingTable, form: str) -> bytes:
+    """Return the same picture on white, as "svg" or "png"."""
+    return _draw_on_white(_draw_scaling(found), form, "data-scaling")
+
+
+def _draw_scaling(found: ScalingTable) -> Figure:
+    """Draw a row of axes a model, with an axes a primary measure."""
+    rows, columns = len(found.models), len(found.primary)
+    figure = Figure(figsize=(4.7 * columns, 3.1 * rows + 0.4), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False, sharey="col")
+    for model, own in zip(found.models, grid, strict=True):
+        for (measure, label), axes in zip(found.primary.items(), own, strict=True):
+            _style(axes)
+            _draw_scaling_measure(axes, found, model, measure)
+            axes.set_title(model, loc="left", fontsize=11, color=INK)
+            axes.set_xlabel("clips")
+            axes.set_ylabel(fill(label, WIDEST_LABEL), fontsize=9)
+    handles, texts = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, texts, frameon=False, labelcolor=INK, fontsize=9, ncols=4, loc="outside upper left")
+    return figure
+
+
+def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: str) -> None:
+    arms = {name: found.find_curve(model, name, measure) for name in (ONE_EPOCH, EQUAL_UPDATES)}
+    clips = arms[ONE_EPOCH].arm.amounts
+    for (name, curve), color, shift in zip(arms.items(), PALETTE, (0.97, 1.03), strict=False):
+        x = shift * np.array(clips)
+        bars = [[each.value - each.low, each.high - each.value] for each in curve.values]
+        middle = [each.value for each in curve.values]
+        axes.errorbar(
+            x, middle, np.clip(np.array(bars).T, 0, None), fmt="o", color=color, ms=6, elinewidth=2, label=name
+        )
+        for at, seeds in zip(x, curve.by_seed, strict=True):
+            axes.plot([at] * len(seeds), seeds, "_", color=color, ms=9, alpha=0.7)
+        if curve.fit is not None:
+            fine = np.geomspace(clips[0], clips[-1], 60)
+            fitted = curve.fit.a.value + curve.fit.b.value * (fine / clips[0]) ** -curve.fit.c.value
+            axes.plot(fine, fitted, color=color, lw=1.4, ls=(0, (4, 3)))
+    few = found.find_curve(model, FEWER_SCENES, measure)
+    for scenes, each in list(zip(few.arm.amounts, few.values, strict=True))[:-1]:
+        axes.errorbar(
+            few.arm.clips,
+            each.value,
+            [[max(0, each.value - each.low)], [max(0, each.high - each.value)]],
+            fmt="D",
+            color=PALETTE[2],
+            ms=6,
+            elinewidth=2,
+            label=f"from {scenes} scenes",
+        )
+    low, high = _find_range(found, measure)
+    axes.set_ylim(low, high)
+    levels = sorted((values[measure], name) for name, values in found.references.items() if measure in values)
+    for row, (level, name) in enumerate(each for each in levels if low < each[0] < high):
+        axes.axhline(level, color=ROLE_COLORS["none"], lw=1, ls=":")
+        at, side = (clips[-1 - row], level), "center" if row else "right"
+        axes.annotate(name, at, (0, 2), textcoords="offset points", ha=side, fontsize=8, color=INK)
+    far = ", ".join(f"{name} {level:.3g}" for level, name in levels if not low < level < high)
+    axes.set_title(f"out of range: {far}" if far else "", loc="right", fontsize=8, color=INK)
+    axes.set_xscale("log")
+    axes.set_xticks(clips, [f"{each:,}" for each in clips])
+    axes.minorticks_off()
+
+
+def _find_range(found: ScalingTable, measure: str) -> tuple[float, float]:
+    """Return the limits of an axis that has room for all values of a measure with their intervals."""
+    values = [each for curve in found.curves if curve.measure == measure for each in curve.values]
+    low, high = min(each.low for each in values), max(each.high for each in values)
+    margin = 0.1 * (high - low) or 1.0
+    return low - margin, high + margin
 
 
 def blame_by_arm(found: Blame) -> Markup:
@@ -344,6 +421,15 @@ def _legend(axes: Axes) -> None:
     widest = 4 if longest < 11 else 2 if longest < 20 else 1  # columns that fit the drawing's width
     columns = math.ceil(len(texts) / math.ceil(len(texts) / widest)) if texts else 1  # rows of about equal length
     axes.legend(frameon=False, labelcolor=INK, fontsize=9, ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
+
+
+def _draw_on_white(figure: Figure, form: str, salt: str) -> bytes:
+    """Return a figure as "svg" or "png"; `salt` makes ids in SVG."""
+    buffer = io.BytesIO()
+    metadata: dict[str, Any] = {"Date": None, "Creator": None} if form == "svg" else {"Software": None}
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": salt, "font.family": "sans-serif"}):
+        figure.savefig(buffer, format=form, dpi=160, facecolor="white", metadata=metadata)
+    return buffer.getvalue()
 
 
 def _svg(figure: Figure, name: str) -> Markup:

@@ -97,14 +97,16 @@ def print_fidelity(run: Run) -> None:
     )
 
 
-def print_stacked(title: str, arms: list[str], titles: list[str], rows: list[list[str]]) -> None:
+def print_stacked(
+    title: str, arms: Sequence[str], titles: Sequence[str], rows: Sequence[Sequence[str]], heading: str = "arm"
+) -> None:
     """Print a row per arm, in several tables where the terminal is too narrow for one."""
     if not arms:
         return
     console = Console()
     console = Console(width=None if console.is_terminal else max(console.width, ROOMY))
     columns = [Column(title, [row[index] for row in rows]) for index, title in enumerate(titles)]
-    for table in stack_tables(title, arms, columns, console.width):
+    for table in stack_tables(title, arms, columns, console.width, heading):
         console.print(table)
 
 

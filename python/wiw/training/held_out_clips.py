@@ -188,8 +188,8 @@ def compare_frames(clips: HeldOutClips, own: Frames, other: Frames) -> ClipError
     )
 
 
-def turn_panoramas(frames: Frames, azimuth: NDArray[np.float64]) -> Frames:
-    """Turn panoramas [..., H, W, 3] left by azimuths [...] in radians, rounded to columns."""
+def turn_panoramas(frames: NDArray[Any], azimuth: NDArray[np.float64]) -> NDArray[Any]:
+    """Turn panoramas [..., H, W, C] left by azimuths [...] in radians, rounded to columns."""
     width = frames.shape[-2]
     columns = np.rint(azimuth / (2 * np.pi) * width).astype(np.int64)
     sources = (np.arange(width) - columns[..., None]) % width

@@ -54,7 +54,7 @@ def run_jobs(jobs: Sequence[Job[Result]], workers: int) -> Iterator[tuple[Any, R
             yield running[each], each.result()
     except BrokenProcessPool as error:
         raise InfrastructureError(
-            "collect: a worker process died, perhaps for lack of memory; run the same again, with fewer workers"
+            "a worker process died, perhaps for lack of memory; run the same again, with fewer workers"
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)

@@ -18,10 +18,11 @@ from wiw.datasets.worlds import world
 from wiw.errors import ArgumentError
 from wiw.networks import has_bfloat16
 from wiw.reproject import pose, warp
+from wiw.training.reduced_frames import compute_log_distances
 from wiw.training.trainer import run_training, warmup_cosine_schedule
 from wiw.training.walks import Walks, find_straight_paths
 from wiw.world_models.warpnet.model import WarpNet, to_network
-from wiw.world_models.warpnet.network import FARTHEST, NEAREST, Network, Prediction
+from wiw.world_models.warpnet.network import Network, Prediction
 
 STRIDE = 0.2
 """Metres of a step ahead."""
@@ -95,7 +96,7 @@ class _Trainer:
         pairs = sample_pairs(self.walks, self.recipe.batch, self._rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.recipe.bfloat16 and has_bfloat16()):
             found = self.network.train()(pairs.source, pairs.ahead)
-        loss = _compute_loss(found, pairs, self.recipe)
+        loss = compute_losses(found, pairs, self.recipe).mean()
         self._optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
@@ -117,24 +118,42 @@ class Pairs:
 
 
 def sample_pairs(walks: Walks, count: int, rng: np.random.Generator) -> Pairs:
-    """Sample pairs of panoramas of a walk, in either direction, half of them mirrored, with other brightness and
-    tint.
-    """
+    """Sample pairs of panoramas of a walk, in either direction."""
     stops = walks.places.shape[1]
     paths = rng.integers(0, len(walks), count)
     first = rng.integers(0, stops, count)
     second = (first + rng.integers(1, stops, count)) % stops
     ahead = walks.places[paths, second] - walks.places[paths, first]
-    back, mirrored = ahead < 0, rng.random(count) < 0.5
-    light = rng.uniform(0.8, 1.2, (count, 1, 1, 1)) * rng.uniform(0.92, 1.08, (count, 1, 1, 3))
+    log_distances = compute_log_distances(walks.distances[paths, second])
+    return build_pairs(walks.images[paths, first], walks.images[paths, second], log_distances, ahead, rng)
+
+
+def build_pairs(
+    source: NDArray[np.uint8],
+    target: NDArray[np.uint8],
+    log_distances: NDArray[Any],
+    ahead: NDArray[Any],
+    rng: np.random.Generator,
+) -> Pairs:
+    """Build pairs of panoramas, half of them mirrored, with other brightness and tint.
+
+    Args:
+        source: uint8 [B, H, W, 3].
+        target: the same, seen from further ahead.
+        log_distances: [B, H, W] of the target.
+        ahead: [B]: metres; where below 0, the target is behind, and both are turned around.
+        rng: draws the augmentation.
+    """
+    back, mirrored = ahead < 0, rng.random(len(ahead)) < 0.5
+    light = rng.uniform(0.8, 1.2, (len(ahead), 1, 1, 1)) * rng.uniform(0.92, 1.08, (len(ahead), 1, 1, 3))
     gain = torch.from_numpy(light.astype(np.float32)).permute(0, 3, 1, 2)
-    source, target = (
-        (to_network(_augment_panoramas(walks.images[paths, stop], back, mirrored)) + 1) * gain - 1
-        for stop in (first, second)
+    before, after = (
+        (to_network(_augment_panoramas(images, back, mirrored)) + 1) * gain - 1 for images in (source, target)
     )
-    metres = _augment_panoramas(walks.distances[paths, second], back, mirrored).astype(np.float32)
-    log_distance = np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST))
-    return Pairs(source, torch.from_numpy(np.abs(ahead)), target, torch.from_numpy(log_distance)[:, None])
+    distances = _augment_panoramas(log_distances, back, mirrored).astype(np.float32)
+    return Pairs(
+        before, torch.from_numpy(np.abs(ahead).astype(np.float32)), after, torch.from_numpy(distances)[:, None]
+    )
 
 
 def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrored: NDArray[np.bool_]) -> NDArray[Any]:
@@ -145,23 +164,27 @@ def _augment_panoramas(panoramas: NDArray[Any], back: NDArray[np.bool_], mirrore
     return made
 
 
-def _compute_loss(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
+def compute_losses(found: Prediction, pairs: Pairs, recipe: Recipe) -> Tensor:
+    """Return the loss of each pair, float32 [B]."""
     height = pairs.target.shape[2]
     weights = torch.cos(torch.pi * ((torch.arange(height) + 0.5) / height - 0.5))[:, None]
 
+    def average(values: Tensor, weights: Tensor) -> Tensor:
+        return (values * weights).mean(dim=(1, 2, 3))
+
     def error(a: Tensor, b: Tensor) -> Tensor:
-        return ((a - b).abs() * weights).mean() / weights.mean()
+        return average((a - b).abs(), weights) / weights.mean()
 
     def edges(a: Tensor, b: Tensor) -> Tensor:
         across = error(a - a.roll(1, -1), b - b.roll(1, -1))
-        return across + ((a - b)[:, :, 1:] - (a - b)[:, :, :-1]).abs().mul(weights[1:]).mean() / weights.mean()
+        return across + average(((a - b)[:, :, 1:] - (a - b)[:, :, :-1]).abs(), weights[1:]) / weights.mean()
 
     return (
         error(found.colours, pairs.target)
         + recipe.edges * edges(found.colours, pairs.target)
         + recipe.warped * error(found.warped, pairs.target)
         + recipe.distance * error(found.log_distance, pairs.log_distance)
-        + recipe.paint * (found.mask * weights).mean() / weights.mean()
+        + recipe.paint * average(found.mask, weights) / weights.mean()
     )
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wiw.training.pocket.frames import ReducedFrames
+from wiw.training.reduced_frames import ReducedFrames
 from wiw.world_models.warpnet.model import to_network
 
 

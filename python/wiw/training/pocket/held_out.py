@@ -22,7 +22,7 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.training.navigation_rules import NavigationRules
 from wiw.training.pocket.batches import compute_displacements
-from wiw.training.pocket.frames import Bar, reduce_image
+from wiw.training.reduced_frames import Bar, reduce_image
 from wiw.training.traversal import STEP_M, TURN_RAD, plan_scene
 from wiw.training.walks import StraightPath, find_straight_paths
 from wiw.world_models.pocket.model import Pocket

@@ -16,7 +16,6 @@ import wiw
 from wiw.datasets.navigation import NavigationData, Part
 from wiw.files import atomic_file
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
-from wiw.training.pocket.frames import Bar, reduce_frames
 from wiw.training.pocket.recipe import PocketRecipe
 from wiw.training.pocket.trainer import PocketTrainer
 from wiw.training.post_training.clip_trainer import arrange_clips
@@ -24,6 +23,7 @@ from wiw.training.post_training.corpora import NavigationCorpus, require_panoram
 from wiw.training.post_training.stop_signals import SignalledCheckpoint
 from wiw.training.post_training.train import find_held_out, open_log, remove_log, run_steps
 from wiw.training.post_training.validation import CARD, OnValidation, ValidatedTrainer, choose_validation_set
+from wiw.training.reduced_frames import Bar, reduce_frames
 from wiw.world_models.pocket.model import Pocket
 from wiw.world_models.pocket.weights import load, save
 

@@ -3,48 +3,36 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from wiw.datasets.navigation import Clips
 from wiw.networks import has_bfloat16
+from wiw.training.place_trainer import PlaceTrainer
 from wiw.training.pocket.batches import PlaceBatch, draw_batch
-from wiw.training.pocket.frames import ReducedFrames
 from wiw.training.pocket.recipe import PocketRecipe
-from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
 from wiw.training.post_training.noise import draw_shifted_uniform
 from wiw.world_models.pocket.network import Denoiser, Views
 
 
-class PocketTrainer(ClipTrainer):
-    """Train a denoiser from random weights, and average them.
-
-    Args:
-        clips: what is trained on.
-        frames: of the same dataset, in the recipe's size.
-        recipe: of the training.
-
-    Raises:
-        ArgumentError: there are fewer clips than one step takes.
-    """
+class PocketTrainer(PlaceTrainer):
+    """Train a denoiser from random weights, and average them."""
 
     recipe: PocketRecipe
-    clips: Clips
+    network: Denoiser
 
-    def __init__(self, clips: Clips, frames: ReducedFrames, recipe: PocketRecipe) -> None:
-        super().__init__(clips, recipe, torch.device("cpu"))
-        self._frames = frames
-        with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
-            self.network = Denoiser(recipe.size[0], recipe.widths).train()
-        self.start_optimizer(dict(self.network.named_parameters()))
+    def create_network(self) -> Denoiser:
+        """Return a denoiser of random weights."""
+        return Denoiser(self.recipe.size[0], self.recipe.widths)
 
-    def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
+    def compare_views(
+        self, clips: Sequence[NDArray[np.int64]], rng: np.random.Generator, random: torch.Generator
+    ) -> Tensor:
         """Return the loss of each clip."""
-        clips = [self._frames.find_places(*self.clips.locate(int(row)), self.recipe.frames) for row in rows]
-        rng = np.random.default_rng(int(torch.randint(2**62, (), generator=random)))
-        return self._compute_losses(draw_batch(self._frames, clips, self.recipe.places, rng), random)
+        return self._compute_losses(draw_batch(self.frames, clips, self.recipe.places, rng), random)
 
     def _compute_losses(self, batch: PlaceBatch, random: torch.Generator) -> Tensor:
         recipe = self.recipe

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of a navigation dataset in pocket's size, decoded once and kept on disk."""
+"""Frames of a navigation dataset in the size of a small network, decoded once and kept on disk."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def reduce_frames(
         FileError: the dataset is damaged, or the folder cannot be written.
         ArgumentError: the dataset's panoramas cannot be turned by whole columns in that size.
     """
-    place = folder / f"pocket-{_compute_digest(data, size)}"
+    place = folder / f"frames-{_compute_digest(data, size)}"
     if not place.is_dir():
         with atomic_folder(place) as draft:
             for name, array in _build_arrays(data, size, bar).items():
@@ -112,8 +112,13 @@ def reduce_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.
 
 def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float16]:
     """Return log-distances [h, w] of metres [H, W], at pixels' middles; `FARTHEST` where nothing is hit (0)."""
-    metres = cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)
-    return np.log(np.clip(np.where(metres > 0, metres, FARTHEST), NEAREST, FARTHEST)).astype(np.float16)
+    return compute_log_distances(cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)).astype(np.float16)
+
+
+def compute_log_distances(metres: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the logarithms of distances, which are clamped; `FARTHEST` where nothing is hit (0)."""
+    found = metres.astype(np.float32)
+    return np.asarray(np.log(np.clip(np.where(found > 0, found, FARTHEST), NEAREST, FARTHEST)), np.float32)
 
 
 def _decode_small(

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small world models that learn from clips of a navigation dataset within minutes, for studies of data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from wiw.errors import ArgumentError
+from wiw.registry import WORLD_MODELS
+from wiw.world_models import devices
+
+if TYPE_CHECKING:
+    from wiw.training.place_trainer import PlaceTrainer
+    from wiw.training.post_training.recipe import ClipRecipe
+    from wiw.world_models.trained import Trained
+
+LEARNERS = ("warpnet", "pocket")
+
+
+@dataclass(frozen=True)
+class Learner:
+    """How a world model is trained from nothing, kept, and asked."""
+
+    model: type[Trained]
+    """The world model that reads the weights by `weights=FILE`."""
+    trainer: type[PlaceTrainer]
+    create_recipe: Callable[..., ClipRecipe]
+    """Returns a recipe, given `frames`, `size`, `batch`, `clips` and `seed`."""
+    save: Callable[[Path, Any, Mapping[str, Any]], None]
+    """Writes a file of weights, given a path, a network and a card."""
+
+
+def make_learner(name: str) -> Learner:
+    """Return a learner by the name of its world model.
+
+    Raises:
+        ArgumentError: there is none of that name.
+        DependencyError: torch or safetensors is not installed.
+    """
+    if name not in LEARNERS:
+        raise ArgumentError(f"expected a model among {', '.join(LEARNERS)}, got '{name}'")
+    model = WORLD_MODELS.find(name)
+    devices.require(model.requires)
+    if name == "warpnet":
+        from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer
+        from wiw.world_models.warpnet.weights import save
+
+        return Learner(model, WarpNetClipTrainer, WarpNetClipRecipe, save)
+    from wiw.training.pocket.trainer import PocketTrainer
+    from wiw.world_models.pocket.weights import save as save_pocket
+
+    return Learner(model, PocketTrainer, _create_pocket_recipe, save_pocket)
+
+
+def _create_pocket_recipe(**numbers: Any) -> ClipRecipe:
+    """Return the shipped recipe for a network about as large as warpnet, with fewer places of more clips, and without
+    averaged weights, which after few updates are still the random ones.
+    """
+    from wiw.training.pocket.recipe import PocketRecipe
+    from wiw.training.post_training.recipe import load_recipe
+
+    options = {"widths": [32, 64, 96, 128], "places": 3, "ema": 0.0}
+    return load_recipe("pocket", options={**options, **numbers}, kind=PocketRecipe)

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training of small networks on views from the places of clips, which are kept in memory."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from wiw.datasets.navigation import Clips, SelectedClips
+from wiw.training.post_training.clip_trainer import ClipTrainer, mix_seed, seed_torch
+from wiw.training.post_training.recipe import ClipRecipe
+from wiw.training.reduced_frames import ReducedFrames
+
+
+class PlaceTrainer(ClipTrainer):
+    """Train a network from random weights.
+
+    Args:
+        clips: what is trained on.
+        frames: of the same dataset, in the recipe's size.
+        recipe: of the training.
+
+    Raises:
+        ArgumentError: there are fewer clips than one step takes.
+    """
+
+    clips: Clips | SelectedClips
+    network: nn.Module
+
+    def __init__(self, clips: Clips | SelectedClips, frames: ReducedFrames, recipe: ClipRecipe) -> None:
+        super().__init__(clips, recipe, torch.device("cpu"))
+        self.frames = frames
+        with seed_torch(mix_seed(recipe.seed, "weights"), self.device):
+            self.network = self.create_network().train()
+        self.start_optimizer(dict(self.network.named_parameters()))
+
+    @abstractmethod
+    def create_network(self) -> nn.Module:
+        """Return the network with random weights."""
+
+    @abstractmethod
+    def compare_views(
+        self, clips: Sequence[NDArray[np.int64]], rng: np.random.Generator, random: torch.Generator
+    ) -> Tensor:
+        """Return the loss of each clip, given as its panoramas in order; both generators are of this step alone."""
+
+    def compute_losses(self, rows: NDArray[np.int64], random: torch.Generator) -> Tensor:
+        """Return the loss of each clip."""
+        clips = [self.frames.find_places(*self.clips.locate(int(row)), self.recipe.frames) for row in rows]
+        rng = np.random.default_rng(int(torch.randint(2**62, (), generator=random)))
+        return self.compare_views(clips, rng, random)
