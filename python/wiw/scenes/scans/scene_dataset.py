@@ -1,0 +1,2 @@
+ENDING = ".scene_instance.json"
+read = find = None
