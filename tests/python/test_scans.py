@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from wiw import scenes
+from wiw.cli.parts import TaskFlags
 from wiw.errors import DependencyError, FileError
 from wiw.render import Renderer
 from wiw.scenes.scans import basis, hm3d
@@ -346,3 +347,25 @@ def test_specs_name_the_scans_of_a_folder(tmp_path: Path) -> None:
         scenes.resolve(f"hm3d:{tmp_path / 'hm3d'}:train")
     with pytest.raises(FileError, match="holds no scan; expected Replica's"):
         scenes.resolve(f"replica:{tmp_path}")
+
+
+@needs_decoder
+def test_a_scan_without_its_textures_stops_a_run_unless_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = files.write_hm3d(tmp_path)
+    path.write_bytes(files.basis_glb([(files.DATA / "wall_etc1s.basis").read_bytes(), b"none"]).bytes())
+    with pytest.raises(FileError, match=r"[0-9]+% of its surface lacks its texture .*--allow-missing-textures"):
+        scenes.open_scene(str(path))
+    monkeypatch.setenv(scenes.ALLOW_VARIABLE, "1")
+    assert scenes.open_scene(str(path)).missing_texture_share > 0.3
+    monkeypatch.setattr(basis, "has_decoder", lambda: False)
+    assert load(path).missing_texture_share == 1
+
+
+def test_the_flag_reaches_the_processes_of_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(scenes.ALLOW_VARIABLE, "0")
+    TaskFlags(scenes="apartments:val:1").make_recipe("imagenav", 0)
+    assert not scenes.missing_textures_allowed()
+    recipe = TaskFlags(scenes="apartments:val:1", allow_missing_textures=True).make_recipe("imagenav", 0)
+    assert scenes.missing_textures_allowed() and "allow_missing_textures" not in recipe.options

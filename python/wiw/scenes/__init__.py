@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -23,13 +24,17 @@ from wiw.suggestions import did_you_mean
 Scene = _core.scene.Scene
 
 __all__ = [
+    "ALLOW_VARIABLE",
     "COLORS",
+    "MOST_MISSING",
     "Scene",
     "absolute",
+    "allow_missing_textures",
     "apartment",
     "apartment_table",
     "is_generated",
     "load",
+    "missing_textures_allowed",
     "open_outline",
     "open_scene",
     "possible_edits",
@@ -42,6 +47,11 @@ COLORS = (
     "pink",
 )  # fmt: skip
 """Colour words of apartments. Weights count classes by their order."""
+
+MOST_MISSING = 0.05
+"""Share of a scan's surface whose texture may be missing."""
+ALLOW_VARIABLE = "WIW_ALLOW_MISSING_TEXTURES"
+"""Environment variable that allows more, also in the processes that a run starts."""
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -91,7 +101,7 @@ def load(
     }
     reader = scans.find_reader(file)
     if reader is not None:
-        options["scan"] = reader
+        options |= {"scan": reader, "allow_missing_textures": missing_textures_allowed()}
     scene = _load(file, options, cache, isolate)
     for warning in scene.warnings:
         _log.warning("%s: %s", scene.name, warning)
@@ -259,11 +269,35 @@ def _did_you_mean(spec: str) -> str:
 
 
 def open_scene(name: str) -> Scene:
-    """Load one scene of `resolve`."""
+    """Load one scene of `resolve`.
+
+    Raises:
+        FileError: it cannot be read; or it is a scan, more than `MOST_MISSING` of its surface lacks its texture, and
+            `$WIW_ALLOW_MISSING_TEXTURES` is not set.
+    """
     if is_generated(name):
         seed, split, edits = _parse_single(name)
         return apartment(seed, split, edits=edits)
-    return load(name)
+    scene = load(name)
+    is_grey = "dataset" in scene.attributes and scene.missing_texture_share > MOST_MISSING
+    if is_grey and not missing_textures_allowed():
+        cause = next((warning for warning in scene.warnings if "texture" in warning or "image" in warning), "")
+        raise FileError(
+            f"{name}: {scene.missing_texture_share:.0%} of its surface lacks its texture and would be drawn grey "
+            f"({cause}); at most {MOST_MISSING:.0%} may. Put the textures where the file names them, or allow it with "
+            f"--allow-missing-textures ({ALLOW_VARIABLE}=1)"
+        )
+    return scene
+
+
+def allow_missing_textures() -> None:
+    """Allow this process and those that it starts to use scans that lack more than `MOST_MISSING` of their textures."""
+    os.environ[ALLOW_VARIABLE] = "1"
+
+
+def missing_textures_allowed() -> bool:
+    """Return whether scans may be used that lack more than `MOST_MISSING` of their textures."""
+    return os.environ.get(ALLOW_VARIABLE, "") not in ("", "0")
 
 
 def open_outline(name: str) -> Scene:
@@ -271,4 +305,4 @@ def open_outline(name: str) -> Scene:
     if is_generated(name):
         seed, split, edits = _parse_single(name)
         return apartment_table(seed, split, edits=edits)
-    return load(name)
+    return open_scene(name)
