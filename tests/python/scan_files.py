@@ -101,7 +101,7 @@ Grid = tuple[NDArray[np.float32], NDArray[np.uint32], NDArray[np.int32], NDArray
 
 
 def grids(quads: list[Quad], step: float = 100.0) -> Grid:
-    """Vertices [V, 3], quads [F, 4], object of each quad [F], texture coordinates [V, 2]; no edge longer than `step`."""
+    """Vertices [V, 3], quads [F, 4], object of each quad [F], texture coordinates [V, 2]; edges up to `step`."""
     vertices, faces, labels, uvs = [], [], [], []
     first = 0
     for q in quads:
@@ -253,7 +253,9 @@ def color_of(label: int) -> int:
 
 def annotation_text(rows: list[tuple[int, int, str, int]] | None = None) -> str:
     """HM3D's table of labels: objects by id from 1, the floor last."""
-    listed = rows or [(hm3d_id(i), color_of(i), name, room) for i, (name, room) in enumerate(zip(NAMES, ROOM_OF))]
+    listed = rows or [
+        (hm3d_id(i), color_of(i), name, room) for i, (name, room) in enumerate(zip(NAMES, ROOM_OF, strict=True))
+    ]
     return "HM3D Semantic Annotations\n" + "".join(f'{i},{c:06X},"{name}",{room}\n' for i, c, name, room in listed)
 
 
@@ -301,3 +303,78 @@ def write_hm3d(folder: Path, name: str = "00800-TEEsavR23oF", how: str = "textur
     (place / f"{stem}.semantic.glb").write_bytes(painted_glb(how).bytes())
     (place / f"{stem}.semantic.txt").write_text(annotation_text())
     return place / f"{stem}.basis.glb"
+
+
+def brick(size: tuple[float, float, float], low: tuple[float, float, float] = (0, 0, 0)) -> bytes:
+    """A GLB with a box, by default with its least corner at the origin."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) * size + np.array(low)
+    sides = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([(a, b, c) for s in sides for a, b, c in ((s[0], s[1], s[2]), (s[0], s[2], s[3]))], np.uint32)
+    glb = Glb()
+    glb.materials.append({"pbrMetallicRoughness": {"baseColorFactor": [0.6, 0.3, 0.2, 1]}})
+    glb.node(glb.mesh(triangles, 0, POSITION=corners.astype(np.float32)))
+    return glb.bytes()
+
+
+SCENE_OBJECTS = [
+    {"template_name": "chair", "translation": [2, 0, -1], "rotation": [0.70710678, 0, 0.70710678, 0]},
+    {"template_name": "objects/sofa", "translation": [4, 0.25, -2], "non_uniform_scale": [2, 1, 1],
+     "translation_origin": "COM"},
+    {"template_name": "sofa_part_1", "translation": [1, 1, -3], "translation_origin": "asset_local"},
+]  # fmt: skip
+"""A chair turned to the left by 90 degrees, a sofa of twice its length, put down by its centre, and a part of another."""
+DRAWER_OPEN = 0.3
+
+
+def write_scene_dataset(folder: Path) -> Path:
+    """A dataset in Habitat's format with one scene: a room, three objects and a chest with a drawer; Y is up."""
+    for place in ("stages", "objects/decomposed/sofa", "urdf/chest", "scenes", "semantics", "navmeshes"):
+        (folder / place).mkdir(parents=True, exist_ok=True)
+    config = {
+        "stages": {"paths": {".json": ["stages/*.stage_config.json"]}},
+        "objects": {"paths": {".json": ["objects", "objects/decomposed/*"], ".glb": ["objects"]}},
+        "articulated_objects": {"paths": {".urdf": ["urdf/*/"]}},
+        "scene_instances": {"paths": {".json": ["scenes"]}},
+        "semantic_scene_descriptor_instances": {"paths": {".json": ["semantics"]}},
+        "navmesh_instances": {"home": "navmeshes/flat.navmesh"},
+    }
+    write_json(folder / "tiny.scene_dataset_config.json", config)
+    room = [q for q in seen() if q.label in (FLOOR, WALL)]
+    vertices, faces, _, uv = grids(room)
+    glb = Glb()
+    stage = glb.textured(glb.image(png(paintings()[0])))
+    glb.node(glb.mesh(triangles_of(faces), stage, POSITION=vertices, TEXCOORD_0=uv))
+    (folder / "stages/flat.glb").write_bytes(glb.bytes())
+    write_json(
+        folder / "stages/flat.stage_config.json", {"render_asset": "flat.glb", "up": [0, 0, 1], "front": [0, 1, 0]}
+    )
+    (folder / "objects/chair.glb").write_bytes(brick((0.4, 0.9, 0.6)))
+    (folder / "objects/sofa_mesh.glb").write_bytes(brick((0.8, 0.5, 0.6), (1, 0, 0)))
+    write_json(folder / "objects/sofa.object_config.json", {"render_asset": "sofa_mesh.glb", "semantic_id": 3})
+    part = {"render_asset": "part.glb", "scale": [1, 2, 1]}
+    write_json(folder / "objects/decomposed/sofa/sofa_part_1.object_config.json", part)
+    (folder / "objects/decomposed/sofa/part.glb").write_bytes(brick((0.3, 0.1, 0.3)))
+    write_json(folder / "semantics/tiny_lexicon.json", {"classes": [{"id": 3, "name": "Couch"}]})
+    (folder / "urdf/chest/body.glb").write_bytes(brick((1, 0.8, 0.5)))
+    (folder / "urdf/chest/front.glb").write_bytes(brick((0.9, 0.2, 0.05)))
+    (folder / "urdf/chest/chest.urdf").write_text(
+        """<robot name="chest"><link name="body"><visual><geometry><mesh filename="body.glb"/></geometry></visual></link>
+        <link name="drawer"><visual><origin xyz="0 0.1 0"/><geometry><mesh filename="front.glb" scale="1 2 1"/></geometry>
+        </visual></link><joint name="slide" type="prismatic"><parent link="body"/><child link="drawer"/>
+        <origin xyz="0.05 0.3 0.5"/><axis xyz="0 0 1"/></joint></robot>"""
+    )
+    scene = {
+        "stage_instance": {"template_name": "stages/flat"},
+        "translation_origin": "asset_local",
+        "object_instances": SCENE_OBJECTS,
+        "articulated_object_instances": [
+            {"template_name": "chest", "translation": [5, 0, -1], "initial_joint_pose": {"slide": DRAWER_OPEN}}
+        ],
+        "navmesh_instance": "home",
+    }
+    write_json(folder / "scenes/home.scene_instance.json", scene)
+    return folder / "scenes/home.scene_instance.json"
+
+
+def write_json(path: Path, body: object) -> None:
+    path.write_text(json.dumps(body))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,12 @@ from numpy.typing import NDArray
 
 from wiw import scenes
 from wiw.cli.parts import TaskFlags
+from wiw.datasets.worlds import navmesh_file
 from wiw.errors import DependencyError, FileError
+from wiw.nav import NavMesh
 from wiw.render import Renderer
 from wiw.scenes.scans import basis, hm3d
+from wiw.scenes.scans.scene_dataset import words_of
 
 EYES = ((2.6, 2.6, 1.2), (4.6, 3.2, 1.5), (6.5, 0.6, 1.0))
 """Places in both rooms, Z up."""
@@ -247,10 +251,10 @@ class TestHm3d:
     @pytest.mark.parametrize(
         ("row", "message"),
         [
-            ("x,00FF00,\"bed\",0", "line 2: expected id,RRGGBB"),
-            ("1,GG0000,\"bed\",0", "line 2: expected id,RRGGBB"),
-            ("1,00FF00,\"bed\"", "line 2: expected id,RRGGBB"),
-            ("1,00FF00,\"bed\",0\n1,00FF01,\"sofa\",0", "line 3: .*is there already"),
+            ('x,00FF00,"bed",0', "line 2: expected id,RRGGBB"),
+            ('1,GG0000,"bed",0', "line 2: expected id,RRGGBB"),
+            ('1,00FF00,"bed"', "line 2: expected id,RRGGBB"),
+            ('1,00FF00,"bed",0\n1,00FF01,"sofa",0', "line 3: .*is there already"),
         ],
     )
     def test_a_damaged_table_is_named(self, tmp_path: Path, row: str, message: str) -> None:
@@ -369,3 +373,110 @@ def test_the_flag_reaches_the_processes_of_a_run(monkeypatch: pytest.MonkeyPatch
     assert not scenes.missing_textures_allowed()
     recipe = TaskFlags(scenes="apartments:val:1", allow_missing_textures=True).make_recipe("imagenav", 0)
     assert scenes.missing_textures_allowed() and "allow_missing_textures" not in recipe.options
+
+
+def by_name(scene: scenes.Scene, name: str) -> NDArray[np.float32]:
+    return next(thing["bounds"] for thing in scene.instances if thing["name"] == name)
+
+
+class TestSceneDataset:
+    def test_everything_is_where_it_is_placed(self, tmp_path: Path) -> None:
+        scene = load(files.write_scene_dataset(tmp_path))
+        assert np.allclose(by_name(scene, "stage"), [[0, 0, -4], [7, 2.6, 0]], atol=1e-5)
+        # x becomes -z by a left turn: [0, 0.4] along x and [0, 0.6] along z become [-0.4, 0] along z, [0, 0.6] along x
+        assert np.allclose(by_name(scene, "chair 1"), [[2, 0, -1.4], [2.6, 0.9, -1]], atol=1e-5)
+        assert np.allclose(by_name(scene, "sofa 2"), [[3.2, 0, -2.3], [4.8, 0.5, -1.7]], atol=1e-5)
+        assert np.allclose(by_name(scene, "sofa_part_1 3"), [[1, 1, -3], [1.3, 1.2, -2.7]], atol=1e-5)
+        assert np.allclose(by_name(scene, "chest 4"), [[5, 0, -1], [6, 0.8, -0.15]], atol=1e-5)
+        assert [thing["category"] for thing in scene.instances] == ["", "chair", "couch", "sofa part", "chest"]
+        assert scene.texture_count == 1 and scene.attributes["dataset"] == "tiny" and not scene.warnings
+
+    def test_rays_hit_what_a_slow_placement_says(self, tmp_path: Path) -> None:
+        scene = load(files.write_scene_dataset(tmp_path))
+        boxes = [by_name(scene, name).astype(float) for name in ("chair 1", "sofa 2", "sofa_part_1 3")]
+        views, directions = look(scene), rays((64, 128)).reshape(-1, 3)
+        for eye, ids in zip(y_up(np.array(EYES)), views["instance"], strict=True):
+            for number, box in enumerate(boxes, 2):
+                with np.errstate(divide="ignore"):
+                    low, high = (box[0] - eye) / directions, (box[1] - eye) / directions
+                near, far = np.minimum(low, high).max(axis=-1), np.maximum(low, high).min(axis=-1)
+                through = (near <= far) & (far > 0)
+                assert not (ids.reshape(-1) == number)[~through].any()
+
+    def test_the_origin_may_be_chosen_for_one_object(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        body = json.loads(path.read_text()) | {"translation_origin": "COM"}
+        files.write_json(path, body)
+        scene = load(path)
+        assert np.allclose(by_name(scene, "chair 1").mean(axis=0), [2, 0, -1], atol=1e-5)
+        assert np.allclose(by_name(scene, "sofa_part_1 3")[0], [1, 1, -3], atol=1e-5)
+
+    def test_all_that_is_missing_is_named_at_once(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        (tmp_path / "objects/chair.glb").unlink()
+        (tmp_path / "objects/decomposed/sofa/part.glb").unlink()
+        (tmp_path / "urdf/chest/front.glb").unlink()
+        with pytest.raises(FileError) as caught:
+            load(path)
+        message = str(caught.value)
+        assert "home.scene_instance.json: 3 things" in message
+        assert all(name in message for name in ("objects: chair", "part.glb", "front.glb"))
+
+    def test_the_navigation_mesh_that_the_scene_names_is_used(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        assert navmesh_file(str(path)) is None
+        NavMesh.build(load(path)).save(tmp_path / "navmeshes/flat.navmesh")
+        assert navmesh_file(str(path)) == tmp_path / "navmeshes/flat.navmesh"
+
+    def test_specs_name_the_scenes_of_the_dataset(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        for kind in ("hssd", "replicacad", "procthor"):
+            assert scenes.resolve(f"{kind}:{tmp_path}") == [str(path)]
+        with pytest.raises(FileError, match="holds no scan"):
+            scenes.resolve(f"hssd:{tmp_path}:val")
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"stage_instance": {}}, "cannot be read as a scene instance .*KeyError: 'template_name'"),
+            ({"object_instances": [{"template_name": "chair", "rotation": [0, 0, 0, 0]}]}, "is no quaternion"),
+            ({"object_instances": [{"template_name": "chair", "translation": [1, 2]}]}, "three finite numbers"),
+            ({"object_instances": 3}, "cannot be read as a scene instance"),
+        ],
+    )
+    def test_a_damaged_scene_is_named(self, tmp_path: Path, change: dict[str, Any], message: str) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        files.write_json(path, json.loads(path.read_text()) | change)
+        with pytest.raises(FileError, match=rf"home\.scene_instance\.json: .*{message}"):
+            load(path)
+
+    def test_a_scene_needs_its_dataset(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        (tmp_path / "tiny.scene_dataset_config.json").unlink()
+        with pytest.raises(FileError, match="no .*scene_dataset_config.json in the folders above names this scene"):
+            load(path)
+
+    @pytest.mark.parametrize(
+        ("name", "category"),
+        [
+            ("Dining_Table_20_1", "dining table"),
+            ("frl_apartment_wall_cabinet_01", "wall cabinet"),
+            ("RoboTHOR_floor_lamp_v", "floor lamp"),
+            ("0ab13f2c7d8e9f001122_part_3", ""),
+        ],
+    )
+    def test_categories_are_read_from_names_last(self, name: str, category: str) -> None:
+        assert words_of(name) == category
+
+    def test_a_urdf_that_is_none_is_named(self, tmp_path: Path) -> None:
+        path = files.write_scene_dataset(tmp_path)
+        urdf = tmp_path / "urdf/chest/chest.urdf"
+        whole = urdf.read_text()
+        for text, message in (
+            (whole[:80], "ParseError"),
+            (whole.replace('xyz="0 0 1"', 'xyz="0 0 x"'), "ValueError"),
+            (whole.replace('parent link="body"', 'parent link="drawer"'), "circle"),
+        ):
+            urdf.write_text(text)
+            with pytest.raises(FileError, match=rf"chest\.urdf: no URDF .*{message}"):
+                load(path)

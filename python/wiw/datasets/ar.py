@@ -166,7 +166,9 @@ def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
     if not 1 <= instance <= len(things):
         raise ArgumentError(f"{where}: target {instance} is no instance of {world.name}, which has 1 to {len(things)}")
     if world.scene.attributes.get("labels") == "none":
-        raise ArgumentError(f"{where}: {world.name} has no labels, so that target {instance} is unknown; {LABELS_NEEDED}")
+        raise ArgumentError(
+            f"{where}: {world.name} has no labels, so that target {instance} is unknown; {LABELS_NEEDED}"
+        )
     if not things[instance - 1]["triangle_count"]:
         raise ArgumentError(f"{where}: target {instance} has no surface in {world.name}")
     return np.asarray(things[instance - 1]["bounds"], np.float64).mean(axis=0)

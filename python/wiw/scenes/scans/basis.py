@@ -3,17 +3,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw.errors import DependencyError
+from wiw import _core
+from wiw.errors import DependencyError, Error, FileError
 from wiw.scenes.scans.glb import UNREADABLE, Glb
+from wiw.scenes.scans.scan import import_options
 
 EXTENSIONS = ("GOOGLE_texture_basis", "KHR_texture_basisu")
 """glTF extensions that name a texture's image in Basis Universal: bare `.basis` files, and KTX2 files."""
@@ -98,3 +102,40 @@ def _encode(glb: Glb, index: int) -> bytes | str:
         return str(error) or type(error).__name__
     fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
     return bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA), fast)[1])
+
+
+def import_textured(
+    file: Path, options: Mapping[str, Any], up: str
+) -> tuple[_core.scene.Scene, list[Path], list[Path], list[str]]:
+    """Import a mesh, its Basis Universal textures decoded first.
+
+    Returns:
+        The scene, files read, files looked for in vain, and warnings of textures that cannot be decoded.
+
+    Raises:
+        FileError: it is missing or damaged.
+        DependencyError: the decoder is not installed, and `options` do not allow textures to be missing.
+    """
+    plain = import_options(options, up)
+    glb = Glb.read(file) if file.suffix.lower() == ".glb" else None
+    try:
+        if glb is None or not find_images(glb) or not _is_ready(file, options):
+            scene, read, absent = _core.scene.import_scene(file, **plain)
+            return scene, list(dict.fromkeys([file, *read])), list(absent), []
+        decoded, warnings = with_png_textures(glb)
+    except Error:
+        raise
+    except UNREADABLE as error:
+        raise FileError(f"{file}: its textures cannot be read: {error} (damaged file?)") from error
+    with TemporaryDirectory(prefix="wiw-scan-") as folder:
+        copy = Path(folder) / file.name
+        copy.write_bytes(decoded.bytes())
+        scene, _, absent = _core.scene.import_scene(copy, **plain)
+    return scene, [file], [path for path in absent if not path.is_relative_to(folder)], warnings
+
+
+def _is_ready(file: Path, options: Mapping[str, Any]) -> bool:
+    """Return whether the decoder is installed, which it need not be where textures may be missing."""
+    if not options.get("allow_missing_textures"):
+        require_decoder(file)
+    return has_decoder()

@@ -88,7 +88,11 @@ class Glb:
         dtype, width = np.dtype(_DTYPES[accessor["componentType"]]), _WIDTHS[accessor["type"]]
         count, stride = int(accessor["count"]), int(view.get("byteStride", 0)) or width * dtype.itemsize
         data, start = self.view(accessor["bufferView"]), int(accessor.get("byteOffset", 0))
-        if count < 0 or start < 0 or start + max(0, count - 1) * stride + (count > 0) * width * dtype.itemsize > len(data):
+        if (
+            count < 0
+            or start < 0
+            or start + max(0, count - 1) * stride + (count > 0) * width * dtype.itemsize > len(data)
+        ):
             raise ValueError(f"accessor {index} reaches beyond its buffer view")
         values = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         return values[:, 0] if width == 1 else values

@@ -10,22 +10,19 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from wiw import _core
 from wiw.errors import FileError
-from wiw.scenes.scans import basis
 from wiw.scenes.scans import labels as transfer
+from wiw.scenes.scans.basis import import_textured
 from wiw.scenes.scans.glb import UNREADABLE, Glb
 from wiw.scenes.scans.scan import (
     Imported,
     ScanObject,
-    import_options,
     number_objects,
     read_text,
     require_file,
@@ -88,7 +85,7 @@ def read_annotations(path: Path) -> Annotations:
                 raise ValueError("its id or colour is there already, or is none")
         except (ValueError, IndexError) as error:
             raise FileError(
-                f"{path}: line {number}: expected id,RRGGBB,\"category\",region, got {','.join(row)!r:.80} ({error})"
+                f'{path}: line {number}: expected id,RRGGBB,"category",region, got {",".join(row)!r:.80} ({error})'
             ) from error
         if index > 0:  # 0 is unknown
             table.objects[index] = ScanObject(f"{category} {index}", category, {"region": str(region)})
@@ -99,7 +96,7 @@ def read_annotations(path: Path) -> Annotations:
 def read(file: Path, options: dict[str, Any]) -> Imported:
     """Read a scan; one without labels, as most are, has no instances of objects, and a warning."""
     up = options.get("up") or "z"
-    scene, read, absent, warnings = _import_textured(file, options, up)
+    scene, read, absent, warnings = import_textured(file, options, up)
     painted, listed = _labels(file)
     surface = transfer.Surface(*scene.world_triangles()[:2])
     about = {"up": f"{up.upper()} (HM3D)", "dataset": "HM3D"}
@@ -137,32 +134,6 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
         warnings=warnings,
     )
     return Imported(scene, [*read, painted, listed], absent)
-
-
-def _import_textured(
-    file: Path, options: dict[str, Any], up: str
-) -> tuple[_core.scene.Scene, list[Path], list[Path], list[str]]:
-    """Import the mesh that is seen, its Basis Universal textures decoded first."""
-    plain = import_options(options, up)
-    glb = Glb.read(file)
-    try:
-        is_basis = bool(basis.find_images(glb))
-    except UNREADABLE as error:
-        raise FileError(f"{file}: its textures cannot be read: {error} (damaged file?)") from error
-    if is_basis and not options.get("allow_missing_textures"):
-        basis.require_decoder(file)
-    if not is_basis or not basis.has_decoder():
-        scene, read, absent = _core.scene.import_scene(file, **plain)
-        return scene, list(read) or [file], list(absent), []
-    try:
-        decoded, warnings = basis.with_png_textures(glb)
-    except UNREADABLE as error:
-        raise FileError(f"{file}: its textures cannot be read: {error} (damaged file?)") from error
-    with TemporaryDirectory(prefix="wiw-scan-") as folder:
-        copy = Path(folder) / file.name
-        copy.write_bytes(decoded.bytes())
-        scene, _, absent = _core.scene.import_scene(copy, **plain)
-    return scene, [file], [path for path in absent if not path.is_relative_to(folder)], warnings
 
 
 def read_painted(path: Path, table: Annotations, up: str) -> tuple[transfer.LabelledSurface, float]:
@@ -245,7 +216,7 @@ def _placed_primitive(glb: Glb, primitive: dict[str, Any], transform: NDArray[np
         corners = glb.values(primitive["indices"]).astype(np.uint32).reshape(-1, 3)
     else:
         corners = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
-    if corners.size and corners.max() >= len(vertices) or not np.isfinite(vertices).all():
+    if (corners.size and corners.max() >= len(vertices)) or not np.isfinite(vertices).all():
         raise ValueError("a triangle names a vertex that is not there, or one is not finite")
     uv = glb.values(attributes["TEXCOORD_0"]).astype(np.float32) if "TEXCOORD_0" in attributes else None
     colors = _vertex_colors(glb.values(attributes["COLOR_0"])) if "COLOR_0" in attributes else None

@@ -89,7 +89,9 @@ def _count_parts(corners: NDArray[np.float32], spacing: float, path: object) -> 
     longest = np.linalg.norm(edges, axis=-1).max(axis=1)
     counts = np.ceil(longest / spacing).clip(1, _MOST_PARTS).astype(np.int64)
     if (counts**2).sum() > MOST_SAMPLES:
-        raise FileError(f"{path}: its surface is too large to be labelled: {longest.max():.0f} m along an edge (damaged?)")
+        raise FileError(
+            f"{path}: its surface is too large to be labelled: {longest.max():.0f} m along an edge (damaged?)"
+        )
     return counts
 
 

@@ -222,7 +222,9 @@ def read(file: Path, options: dict[str, Any]) -> Imported:
         rooms=listed,
         flat=True,
         attributes={**about, "labels": "Matterport3D objects"},
-        warnings=_warnings(semantic, shown, set(objects), np.unique(object_ids), transfer.unlabelled_share(surface, pieces)),
+        warnings=_warnings(
+            semantic, shown, set(objects), np.unique(object_ids), transfer.unlabelled_share(surface, pieces)
+        ),
     )
     return Imported(scene, [*files, semantic], list(absent))
 
@@ -253,7 +255,9 @@ def _warnings(
     lost = sorted(known - shown)
     warnings = []
     if strange:
-        warnings.append(f"{semantic.name} labels {len(strange)} objects that the house file does not have: {_some(strange)}")
+        warnings.append(
+            f"{semantic.name} labels {len(strange)} objects that the house file does not have: {_some(strange)}"
+        )
     if lost:
         warnings.append(f"{len(lost)} of {len(known)} objects have no surface: {_some(lost)}")
     if unlabelled > 0.01:
