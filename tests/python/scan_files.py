@@ -322,7 +322,7 @@ SCENE_OBJECTS = [
      "translation_origin": "COM"},
     {"template_name": "sofa_part_1", "translation": [1, 1, -3], "translation_origin": "asset_local"},
 ]  # fmt: skip
-"""A chair turned to the left by 90 degrees, a sofa of twice its length, put down by its centre, and a part of another."""
+"""A chair turned left by 90 degrees, a sofa of twice its length, put down by its centre, and a part of another."""
 DRAWER_OPEN = 0.3
 
 
@@ -358,9 +358,11 @@ def write_scene_dataset(folder: Path) -> Path:
     (folder / "urdf/chest/body.glb").write_bytes(brick((1, 0.8, 0.5)))
     (folder / "urdf/chest/front.glb").write_bytes(brick((0.9, 0.2, 0.05)))
     (folder / "urdf/chest/chest.urdf").write_text(
-        """<robot name="chest"><link name="body"><visual><geometry><mesh filename="body.glb"/></geometry></visual></link>
-        <link name="drawer"><visual><origin xyz="0 0.1 0"/><geometry><mesh filename="front.glb" scale="1 2 1"/></geometry>
-        </visual></link><joint name="slide" type="prismatic"><parent link="body"/><child link="drawer"/>
+        """<robot name="chest">
+        <link name="body"><visual><geometry><mesh filename="body.glb"/></geometry></visual></link>
+        <link name="drawer"><visual><origin xyz="0 0.1 0"/>
+        <geometry><mesh filename="front.glb" scale="1 2 1"/></geometry></visual></link>
+        <joint name="slide" type="prismatic"><parent link="body"/><child link="drawer"/>
         <origin xyz="0.05 0.3 0.5"/><axis xyz="0 0 1"/></joint></robot>"""
     )
     scene = {

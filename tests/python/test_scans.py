@@ -453,7 +453,7 @@ class TestSceneDataset:
     def test_a_scene_needs_its_dataset(self, tmp_path: Path) -> None:
         path = files.write_scene_dataset(tmp_path)
         (tmp_path / "tiny.scene_dataset_config.json").unlink()
-        with pytest.raises(FileError, match="no .*scene_dataset_config.json in the folders above names this scene"):
+        with pytest.raises(FileError, match=r"no .*scene_dataset_config\.json in the folders above names this scene"):
             load(path)
 
     @pytest.mark.parametrize(

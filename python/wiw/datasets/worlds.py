@@ -46,7 +46,7 @@ def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
         _worlds.move_to_end(key)
         return _worlds[key]
     loaded = open_scene(scene)
-    made = World(scene, loaded, Renderer(loaded, backend=backend), _navmesh(path, loaded), Ground(loaded), backend)
+    made = World(scene, loaded, Renderer(loaded, backend=backend), open_navmesh(path, loaded), Ground(loaded), backend)
     _worlds[key] = made
     while len(_worlds) > CAPACITY:
         _worlds.popitem(last=False)
@@ -66,7 +66,7 @@ def navmesh_file(scene: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def _navmesh(path: Path | None, scene: Scene) -> NavMesh:
+def open_navmesh(path: Path | None, scene: Scene) -> NavMesh:
     """Return the mesh that came with the scene, else one built from it.
 
     Raises:

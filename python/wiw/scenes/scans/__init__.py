@@ -6,15 +6,16 @@ A scan is opened by its mesh file, as any scene is; `find_reader` tells by the f
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from wiw import _core
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.scenes.scans import hm3d, matterport, replica, scene_dataset
-from wiw.scenes.scans.scan import Imported
+from wiw.scenes.scans.scan import Imported, require_folder, require_scans
 
-__all__ = ["KINDS", "find_reader", "find_scans", "parse_spec", "read_scene"]
+__all__ = ["KINDS", "compare_tables", "find_all", "find_reader", "find_scans", "parse_spec", "read_scene"]
 
 VERSION = 1
 """Raised when the same files give another scene."""
@@ -84,3 +85,27 @@ def find_scans(kind: str, folder: Path, split: str = "") -> list[Path]:
         raise ArgumentError(f"'{kind}' is no kind of scan; expected one of {', '.join(KINDS)}")
     find = {"mp3d": matterport.find, "hm3d": hm3d.find, "replica": replica.find}.get(kind, scene_dataset.find)
     return find(folder, split)
+
+
+def find_all(folder: Path) -> list[Path]:
+    """Return the scans of every kind in a folder, in order.
+
+    Raises:
+        FileError: there is no such folder, or it holds none.
+    """
+    found: set[Path] = set()
+    for kind in ("mp3d", "hm3d", "replica", "hssd"):
+        with suppress(FileError):
+            found |= set(find_scans(kind, folder))
+    kinds = ", ".join(KINDS)
+    return require_scans(sorted(found), require_folder(folder, ""), f"scans in the layout of one of {kinds}")
+
+
+def compare_tables(file: Path, scene: _core.scene.Scene) -> list[str]:
+    """Return where a scan is not what its dataset's own tables say, one sentence each.
+
+    Raises:
+        FileError: a table is missing or damaged.
+    """
+    reader = find_reader(file)
+    return matterport.compare_boxes(file, scene) if reader and reader[0] == "mp3d" else []

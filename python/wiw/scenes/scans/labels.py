@@ -24,9 +24,9 @@ REACH = 0.25
 """Metres beyond which a surface has no label."""
 TILT = 0.1
 """Metres that a right angle between two surfaces counts for, by the square root of two."""
-MOST_SAMPLES = 100_000_000
-_MOST_PARTS = 2000
-"""Along the edge of one triangle: 100 m."""
+MOST_SAMPLES = 50_000_000
+_MOST_PARTS = 400
+"""Along the edge of one triangle; those longer than 20 m, which no room has, are sampled more coarsely."""
 _CHUNK = 1 << 20
 
 
@@ -74,7 +74,7 @@ class Pieces:
 
 @cache
 def _parts(count: int) -> NDArray[np.float32]:
-    """Return the corners, float32 [count * count, 3, 3], of the congruent parts of a triangle, `count` along an edge."""
+    """Return the corners, float32 [count * count, 3, 3], of congruent parts of a triangle, `count` along an edge."""
     i, j = np.divmod(np.arange(count * count), count)
     upright = i + j < count
     i, j = np.where(upright, i, count - i), np.where(upright, j, count - 1 - j)

@@ -265,5 +265,24 @@ def _warnings(
     return warnings
 
 
+FAR = 0.5
+"""Metres between the middle of an object's surface and that of its box in the house file that are worth a word."""
+
+
+def compare_boxes(file: Path, scene: _core.scene.Scene) -> list[str]:
+    """Return where the objects of a scan are not where its house file has their boxes, one sentence each."""
+    up = scene.attributes["up"][0].lower()
+    things = {thing["attributes"].get("scan_id"): thing for thing in scene.instances if thing["triangle_count"]}
+    far = []
+    for index, thing in read_house(_house(file)).objects.items():
+        if str(index) in things:
+            low, high = things[str(index)]["bounds"]
+            distance = np.linalg.norm((low + high) / 2 - to_y_up(thing.centre, up))
+            far.extend([index] * bool(distance > FAR))
+    if not far:
+        return []
+    return [f"{len(far)} of {len(things)} objects lie over {FAR} m from their boxes in the house file: {_some(far)}"]
+
+
 def _some(numbers: Sequence[int]) -> str:
     return ", ".join(map(str, numbers[:8])) + (", ..." if len(numbers) > 8 else "")

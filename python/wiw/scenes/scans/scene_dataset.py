@@ -84,7 +84,7 @@ class Dataset:
         paths = self.section(section).get("paths", {})
         found: dict[Path, None] = {}
         for pattern in paths.get(kind, []) if isinstance(paths, Mapping) else []:
-            for match in sorted(glob.glob(str(self.path.parent / str(pattern)))):
+            for match in sorted(glob.glob(str(self.path.parent / str(pattern)))):  # noqa: PTH207 - may lead up, by ".."
                 place = Path(match)
                 files = sorted(place.glob(f"*{ending}")) if place.is_dir() else [place]
                 found |= {file: None for file in files if file.name.endswith(ending)}
@@ -162,7 +162,7 @@ def read_object(path: Path) -> Mapping[str, Any]:
 
 
 def find(folder: Path, split: str) -> list[Path]:
-    """Return the scenes of a dataset: those that its configurations name, in folders of the split's name if one is given."""
+    """Return the scenes that a dataset's configurations name; of a split, those below a folder of its name."""
     place = require_folder(folder, "")
     configs = sorted(place.glob(f"*{CONFIG}"))
     if not configs:
