@@ -194,7 +194,8 @@ void bind_scene_class(py::module_& module) {
       .def_property_readonly(
           "instances", &instances_to_list,
           "One dict a placed object: id (what the instance image holds), name, category, attributes, "
-          "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world (NaN without triangles), triangle_count.")
+          "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world (NaN without triangles), "
+          "triangle_count.")
       .def_property_readonly(
           "sun", &sun_to_dict,
           "The light that casts shadows: dict with direction (towards it), strength and ambient, or None.")

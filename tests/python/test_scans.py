@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,9 +16,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from wiw import scenes
+from wiw.cli.app import main
 from wiw.cli.parts import TaskFlags
-from wiw.datasets.worlds import navmesh_file
-from wiw.errors import DependencyError, FileError
+from wiw.datasets.ar import centre_of
+from wiw.datasets.worlds import navmesh_file, world
+from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.nav import NavMesh
 from wiw.render import Renderer
 from wiw.scenes.scans import basis, hm3d
@@ -480,3 +483,59 @@ class TestSceneDataset:
             urdf.write_text(text)
             with pytest.raises(FileError, match=rf"chest\.urdf: no URDF .*{message}"):
                 load(path)
+
+
+def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files.write_matterport(tmp_path / "all", "whole")
+    moved = files.write_matterport(tmp_path / "all", "moved").with_suffix(".house")
+    moved.write_text(moved.read_text().replace("O 2 0 2 1.2 ", "O 2 0 2 3.2 "))
+    damaged = files.write_replica(tmp_path / "all")
+    damaged.with_name("info_semantic.json").write_text("{")
+    assert main(["scenes", "verify", str(tmp_path / "all")]) == 1
+    out = capsys.readouterr().out
+    assert "3 scans, 2 with something wrong" in out and "info_semantic.json: no table of Replica's" in out
+    assert "1 of 6 objects lie over 0.5 m from their boxes in the house file: 2" in out
+    row = next(line.split() for line in out.splitlines() if line.startswith("whole"))
+    assert row[2:7] == ["2", "0.0", "6", "6", "2"]
+    assert main(["scenes", "verify", f"mp3d:{tmp_path / 'all' / 'whole'}"]) == 0
+
+
+def test_active_recognition_refuses_a_scan_without_labels(tmp_path: Path) -> None:
+    path = files.write_matterport(tmp_path)
+    labels = path.with_name(f"{path.stem}_semantic.ply")
+    assert np.allclose(centre_of(world(str(path)), files.BED, "here")[[0, 2]], [1.2, -0.95], atol=0.1)
+    with pytest.raises(ArgumentError, match="here: target 6 has no surface"):
+        centre_of(world(str(path)), files.LAMP, "here")
+    bare = path.rename(path.with_name("bare.glb"))
+    path.with_suffix(".house").rename(bare.with_suffix(".house"))
+    labels.unlink()
+    with pytest.raises(ArgumentError, match=r"here: .*bare\.glb has no labels"):
+        centre_of(world(str(bare)), 1, "here")
+
+
+def mutate(data: bytes, rng: random.Random) -> bytes:
+    """A file with some bytes changed, or cut short."""
+    if rng.random() < 0.2:
+        return data[: rng.randrange(len(data))]
+    changed = bytearray(data)
+    for _ in range(rng.choice([1, 2, 8])):
+        at = rng.randrange(len(changed))
+        changed[at : at + rng.choice([0, 1, 1, 4])] = rng.choice([b"\xff", b"-1", b"nan", b"[]", b"\0\0\0\0", b"9"])
+    return bytes(changed)
+
+
+@pytest.mark.parametrize("kind", ["matterport", "hm3d", "replica", "scene_dataset"])
+def test_mutated_files_end_in_an_error_of_ours_or_a_scene(tmp_path: Path, kind: str) -> None:
+    path = getattr(files, f"write_{kind}")(tmp_path)
+    rng, refused = random.Random(7), 0
+    parts = sorted(file for file in tmp_path.rglob("*") if file.is_file())
+    for _ in range(16):
+        part = rng.choice(parts)
+        whole = part.read_bytes()
+        part.write_bytes(mutate(whole, rng))
+        try:
+            load(path)
+        except (ArgumentError, FileError):
+            refused += 1
+        part.write_bytes(whole)
+    assert refused > 2

@@ -13,7 +13,7 @@ namespace wiw::scene {
 /// A model's place in a scene; an instance may have several.
 struct Placement {
   std::uint32_t part = 0;
-  std::uint32_t instance = 0;  // Instance::id, from 1
+  std::uint32_t instance = 0;                                  // Instance::id, from 1
   Eigen::Affine3f T_world_part = Eigen::Affine3f::Identity();  // may scale and mirror
 };
 

@@ -24,6 +24,8 @@ REACH = 0.25
 """Metres beyond which a surface has no label."""
 TILT = 0.1
 """Metres that a right angle between two surfaces counts for, by the square root of two."""
+FARTHEST = 1e7
+"""Metres from the origin; beyond, a file is damaged."""
 MOST_SAMPLES = 50_000_000
 _MOST_PARTS = 400
 """Along the edge of one triangle; those longer than 20 m, which no room has, are sampled more coarsely."""
@@ -110,6 +112,8 @@ def sample(surface: Surface, path: object, spacing: float = SPACING) -> Samples:
     Raises:
         FileError: the surface is too large; names `path`.
     """
+    if not (np.abs(surface.vertices) <= FARTHEST).all():
+        raise FileError(f"{path}: a vertex lies more than {FARTHEST:.0f} m from the origin (damaged file?)")
     triangles, weights = [], []
     for count, members in _groups(_count_parts(surface.corners(), spacing, path)):
         triangles.append(np.repeat(members, count**2))

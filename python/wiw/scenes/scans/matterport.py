@@ -272,7 +272,8 @@ FAR = 0.5
 def compare_boxes(file: Path, scene: _core.scene.Scene) -> list[str]:
     """Return where the objects of a scan are not where its house file has their boxes, one sentence each."""
     up = scene.attributes["up"][0].lower()
-    things = {thing["attributes"].get("scan_id"): thing for thing in scene.instances if thing["triangle_count"]}
+    shown = [thing for thing in scene.instances if thing["triangle_count"] and "scan_id" in thing["attributes"]]
+    things = {thing["attributes"]["scan_id"]: thing for thing in shown}
     far = []
     for index, thing in read_house(_house(file)).objects.items():
         if str(index) in things:
