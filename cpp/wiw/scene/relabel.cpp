@@ -35,7 +35,7 @@ std::vector<PlacedMesh> placed_meshes(const Scene& scene) {
 }
 
 /// Vertex arrays that grow piece by piece.
-struct Draft {
+struct MeshDraft {
   std::vector<Eigen::Vector3f> positions;
   std::vector<Eigen::Vector3f> normals;
   std::vector<Eigen::Vector2f> uv;
@@ -74,11 +74,11 @@ struct Draft {
 
 /// By instance, then by placed mesh: vertex arrays of one draft come from one source, so all of them have the same
 /// attributes.
-using Drafts = std::map<std::pair<std::uint32_t, std::size_t>, Draft>;
+using MeshDrafts = std::map<std::pair<std::uint32_t, std::size_t>, MeshDraft>;
 
-Drafts cut(const std::vector<PlacedMesh>& placed, std::span<const LabelledPiece> pieces, std::size_t instances) {
+MeshDrafts cut(const std::vector<PlacedMesh>& placed, std::span<const LabelledPiece> pieces, std::size_t instances) {
   const std::size_t count = placed.empty() ? 0 : placed.back().first + placed.back().mesh->triangles.size();
-  Drafts drafts;
+  MeshDrafts drafts;
   for (const LabelledPiece& piece : pieces) {
     if (piece.triangle >= count || piece.instance < 1 || piece.instance > instances) {
       throw ArgumentError("relabel: a piece names triangle " + std::to_string(piece.triangle) + " of " +
@@ -89,7 +89,7 @@ Drafts cut(const std::vector<PlacedMesh>& placed, std::span<const LabelledPiece>
     const auto source = static_cast<std::size_t>(after - placed.begin()) - 1;
     const PlacedMesh& from = placed[source];
     const Triangle triangle = from.mesh->triangles[piece.triangle - from.first];
-    Draft& draft = drafts[{piece.instance, source}];
+    MeshDraft& draft = drafts[{piece.instance, source}];
     for (int corner = 0; corner < 3; ++corner) draft.add(from, triangle, piece.corners.row(corner).transpose());
   }
   return drafts;
@@ -99,7 +99,7 @@ Drafts cut(const std::vector<PlacedMesh>& placed, std::span<const LabelledPiece>
 
 ScenePtr relabel(const Scene& scene, std::span<const LabelledPiece> pieces, SceneLabels labels) {
   const std::vector<PlacedMesh> placed = placed_meshes(scene);
-  Drafts drafts = cut(placed, pieces, labels.instances.size());
+  MeshDrafts drafts = cut(placed, pieces, labels.instances.size());
   auto result = std::make_shared<Scene>(scene);
   result->meshes.clear();
   set_labels(std::move(labels), *result);

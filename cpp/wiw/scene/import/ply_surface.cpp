@@ -24,9 +24,9 @@ T swapped(T value) {
 }
 
 /// Walks over the body of a file that `check_ply` has found complete.
-class Body {
+class PlyBody {
  public:
-  Body(std::string_view file, std::size_t at, bool big_endian) : file_(file), at_(at), swap_(big_endian) {}
+  PlyBody(std::string_view file, std::size_t at, bool big_endian) : file_(file), at_(at), swap_(big_endian) {}
 
   double number(std::string_view type) {
     if (type == "char" || type == "int8") return take<std::int8_t>();
@@ -78,7 +78,7 @@ bool has(const PlyElement& element, std::string_view name, bool is_list = false)
   });
 }
 
-void read_vertices(const PlyElement& element, Body& body, const std::string& path, PlySurface& surface) {
+void read_vertices(const PlyElement& element, PlyBody& body, const std::string& path, PlySurface& surface) {
   for (const std::string_view axis : kAxes) {
     if (!has(element, axis)) throw FileError(path, "has vertices without " + std::string(axis));
   }
@@ -109,7 +109,7 @@ bool is_corner_list(const PlyProperty& property) {
   return property.count_bytes > 0 && (property.name == "vertex_indices" || property.name == "vertex_index");
 }
 
-void read_corners(const PlyProperty& property, Body& body, const std::string& where, std::size_t vertices,
+void read_corners(const PlyProperty& property, PlyBody& body, const std::string& where, std::size_t vertices,
                   std::vector<unsigned>& corners) {
   corners.resize(body.length(property.count_bytes));
   for (unsigned& corner : corners) {
@@ -121,7 +121,7 @@ void read_corners(const PlyProperty& property, Body& body, const std::string& wh
   }
 }
 
-void read_faces(const PlyElement& element, const std::string& label, Body& body, const std::string& path,
+void read_faces(const PlyElement& element, const std::string& label, PlyBody& body, const std::string& path,
                 const ImportLimits& limits, PlySurface& surface) {
   if (!has(element, label)) {
     throw FileError(path, "has faces without the property '" + label + "', which says what object each belongs to");
@@ -152,7 +152,7 @@ PlySurface read_surface(const std::filesystem::path& path, const std::string& la
   const std::string_view file(reinterpret_cast<const char*>(bytes.data()), bytes.size());
   const PlyHeader header = read_ply_header(file, path.string());
   if (header.format == "ascii") throw FileError(path.string(), "is a PLY file of text; expected a binary one");
-  Body body(file, header.bytes, header.format == "binary_big_endian");
+  PlyBody body(file, header.bytes, header.format == "binary_big_endian");
   PlySurface surface;
   for (const PlyElement& element : header.elements) {
     if (element.name == "vertex") {

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from wiw.errors import FileError
 from wiw.json_text import parse_json
+from wiw.scenes.scans.scan import rotation_of
 
 _JSON, _BIN = 0x4E4F534A, 0x004E4942
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -134,14 +135,7 @@ def _local(node: dict[str, Any]) -> NDArray[np.float64]:
     if "matrix" in node:
         return np.array(node["matrix"], float).reshape(4, 4).T
     x, y, z, w = np.array(node.get("rotation", (0, 0, 0, 1)), float)
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     result = np.eye(4)
-    result[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), float)
+    result[:3, :3] = rotation_of((w, x, y, z)) * np.array(node.get("scale", (1, 1, 1)), float)
     result[:3, 3] = node.get("translation", (0, 0, 0))
     return result

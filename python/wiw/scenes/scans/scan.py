@@ -104,6 +104,22 @@ def box_to_y_up(low: Iterable[float], high: Iterable[float], up: str) -> NDArray
     return np.stack([corners.min(axis=0), corners.max(axis=0)])
 
 
+def rotation_of(quaternion: Iterable[float]) -> NDArray[np.float64]:
+    """Return the rotation [3, 3] of a quaternion in order wxyz, of any length but zero."""
+    w, x, y, z = np.array(list(quaternion), float)
+    length = np.sqrt(w * w + x * x + y * y + z * z)
+    if not length > 0 or not np.isfinite(length):
+        raise ValueError("a rotation is no quaternion")
+    w, x, y, z = w / length, x / length, y / length, z / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
 def read_text(path: Path, most_bytes: int = 256 << 20) -> str:
     """Return a text file; bytes that are not UTF-8 are replaced.
 

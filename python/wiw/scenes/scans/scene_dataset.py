@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import glob
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,7 @@ from wiw import _core
 from wiw.errors import Error, FileError
 from wiw.json_text import parse_json
 from wiw.scenes.scans.basis import import_textured
-from wiw.scenes.scans.scan import Imported, box_to_y_up, read_text, require_folder, require_scans
+from wiw.scenes.scans.scan import Imported, box_to_y_up, read_text, require_folder, require_scans, rotation_of
 from wiw.scenes.scans.urdf import read_visuals
 
 ENDING = ".scene_instance.json"
@@ -204,22 +204,6 @@ def find_navmesh(file: Path) -> Path | None:
 
 
 # ---- transforms
-
-
-def rotation_of(quaternion: Iterable[float]) -> NDArray[np.float64]:
-    """Return the rotation [3, 3] of a quaternion in order wxyz, of any length but zero."""
-    w, x, y, z = np.array(list(quaternion), float)
-    length = np.sqrt(w * w + x * x + y * y + z * z)
-    if not length > 0 or not np.isfinite(length):
-        raise ValueError("a rotation is no quaternion")
-    w, x, y, z = w / length, x / length, y / length, z / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def _vector(values: Any, default: float) -> NDArray[np.float64]:
