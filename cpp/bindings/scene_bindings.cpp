@@ -6,6 +6,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <limits>
 #include <optional>
 
 #include "arrays.hpp"
@@ -13,6 +14,7 @@
 #include "wiw/scene/cache.hpp"
 #include "wiw/scene/describe.hpp"
 #include "wiw/scene/import.hpp"
+#include "wiw/scene/import/ply_surface.hpp"
 #include "wiw/scene/measure.hpp"
 #include "wiw/scene/sdf.hpp"
 
@@ -30,11 +32,13 @@ py::array_t<T> rows_to_array(const std::vector<Eigen::Matrix<T, N, 1>>& rows) {
   return array;
 }
 
+/// NaN for a box around nothing.
 py::array_t<float> box_to_array(const Eigen::AlignedBox3f& box) {
+  constexpr float kNone = std::numeric_limits<float>::quiet_NaN();
   py::array_t<float> array({2, 3});
   for (int axis = 0; axis < 3; ++axis) {
-    array.mutable_at(0, axis) = box.min()[axis];
-    array.mutable_at(1, axis) = box.max()[axis];
+    array.mutable_at(0, axis) = box.isEmpty() ? kNone : box.min()[axis];
+    array.mutable_at(1, axis) = box.isEmpty() ? kNone : box.max()[axis];
   }
   return array;
 }
@@ -149,11 +153,31 @@ py::tuple import_scene(const std::filesystem::path& path, const std::optional<st
   return py::make_tuple(std::const_pointer_cast<Scene>(scene), trace.read, trace.absent);
 }
 
+py::tuple read_ply_surface(const std::filesystem::path& path, const std::string& label, const py::dict& limits) {
+  wiw::scene::ImportLimits most;
+  set_limits(limits, most);
+  wiw::scene::PlySurface surface;
+  {
+    const py::gil_scoped_release release;
+    surface = wiw::scene::read_ply_surface(path, label, most);
+  }
+  py::array_t<std::int64_t> labels(static_cast<py::ssize_t>(surface.labels.size()));
+  std::ranges::copy(surface.labels, labels.mutable_data());
+  py::object colors = py::none();
+  if (!surface.colors.empty()) colors = rows_to_array(surface.colors);
+  return py::make_tuple(rows_to_array(surface.vertices), rows_to_array(surface.triangles), labels, colors);
+}
+
 void bind_scene_class(py::module_& module) {
   py::class_<Scene, std::shared_ptr<Scene>>(module, "Scene", "A scene in memory: metres, Y up, immutable.")
       .def_static("from_arrays", &wiw::bindings::scene_from_arrays, py::arg("meshes"), py::kw_only(),
                   py::arg("name") = "arrays", py::arg("textures") = py::list(), py::arg("materials") = py::list(),
                   py::arg("sun") = py::none(), wiw::bindings::kFromArraysDoc)
+      .def("relabelled", &wiw::bindings::relabelled_scene, py::arg("instances"), py::arg("labels"), py::kw_only(),
+           py::arg("triangles") = py::none(), py::arg("corners") = py::none(), py::arg("rooms") = py::list(),
+           wiw::bindings::kRelabelledDoc)
+      .def_static("assembled", &wiw::bindings::assembled_scene, py::arg("parts"), py::arg("placements"),
+                  py::arg("instances"), py::kw_only(), py::arg("rooms") = py::list(), wiw::bindings::kAssembledDoc)
       .def_property_readonly("name", [](const Scene& scene) { return scene.name; })
       .def_property_readonly(
           "categories", [](const Scene& scene) { return scene.categories; }, "Unique, lower case.")
@@ -170,7 +194,8 @@ void bind_scene_class(py::module_& module) {
       .def_property_readonly(
           "instances", &instances_to_list,
           "One dict a placed object: id (what the instance image holds), name, category, attributes, "
-          "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world, triangle_count.")
+          "T_world_instance float32 [4, 4], bounds float32 [2, 3] in the world (NaN without triangles), "
+          "triangle_count.")
       .def_property_readonly(
           "sun", &sun_to_dict,
           "The light that casts shadows: dict with direction (towards it), strength and ambient, or None.")
@@ -182,6 +207,8 @@ void bind_scene_class(py::module_& module) {
       .def_property_readonly("texture_count", [](const Scene& scene) { return scene.textures.size(); })
       .def_property_readonly("texture_bytes", &wiw::scene::texture_bytes, "Decoded textures in bytes.")
       .def_property_readonly("mesh_bytes", &wiw::scene::mesh_bytes, "Vertex and triangle arrays in bytes.")
+      .def_property_readonly("missing_texture_share", &wiw::scene::missing_texture_share,
+                             "Share of the surface, 0 to 1, whose texture could not be had.")
       .def("__repr__", [](const Scene& scene) { return "<" + wiw::scene::summary(scene) + ">"; })
       .def("describe", &wiw::scene::describe, "Several lines for a person: size, categories, memory, warnings.")
       .def("world_triangles", &triangles_to_arrays,
@@ -199,6 +226,10 @@ void bind_scene(py::module_& module) {
              py::arg("ceiling") = py::none(), py::arg("limits") = py::dict(), py::arg("texture_folders") = Paths{},
              py::arg("model_folders") = Paths{},
              "Reads a mesh or a Gazebo world. Returns (scene, files read, files looked for but absent).");
+  module.def("read_ply_surface", &read_ply_surface, py::arg("path"), py::arg("label"), py::kw_only(),
+             py::arg("limits") = py::dict(),
+             "Reads a binary PLY file with a property `label` of faces. Returns vertices float32 [V, 3] in the file's "
+             "axes, triangles uint32 [T, 3], labels int64 [T] and colours uint8 [V, 4] or None.");
   module.attr("IMPORTER_VERSION") = wiw::scene::importer_version();
   module.def("write_cache", &wiw::scene::write_scene_cache, py::arg("scene"), py::arg("path"),
              py::call_guard<py::gil_scoped_release>(),

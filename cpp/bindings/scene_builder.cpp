@@ -8,10 +8,14 @@
 #include <cstring>
 #include <initializer_list>
 #include <map>
+#include <tuple>
 #include <vector>
 
 #include "arrays.hpp"
+#include "wiw/scene/assemble.hpp"
 #include "wiw/scene/import/category.hpp"
+#include "wiw/scene/relabel.hpp"
+#include "wiw/scene/text.hpp"
 
 namespace wiw::bindings {
 namespace {
@@ -119,6 +123,50 @@ scene::Sun sun_from(const py::dict& dict) {
   return sun;
 }
 
+/// Name, category and attributes of a dict; the category goes into `categories`.
+scene::Instance instance_from(const py::dict& dict, scene::Scene& categories) {
+  check_keys(dict, {"name", "category", "attributes"}, "instance");
+  scene::Instance instance;
+  instance.name = value_or<std::string>(dict, "name", "");
+  instance.category = scene::category_index(categories, value_or<std::string>(dict, "category", ""));
+  instance.attributes = value_or<std::map<std::string, std::string>>(dict, "attributes", {});
+  return instance;
+}
+
+scene::Room room_from(const py::dict& dict) {
+  check_keys(dict, {"name", "type", "bounds"}, "room");
+  const auto bounds = dict["bounds"].cast<Array<float>>();
+  expect_shape(bounds, {2, 3}, "a room's bounds [2, 3]");
+  return {dict["name"].cast<std::string>(),
+          dict["type"].cast<std::string>(),
+          {Eigen::Vector3f(bounds.at(0, 0), bounds.at(0, 1), bounds.at(0, 2)),
+           Eigen::Vector3f(bounds.at(1, 0), bounds.at(1, 1), bounds.at(1, 2))}};
+}
+
+std::vector<scene::LabelledPiece> pieces_from(const py::array& labels, const py::object& triangles,
+                                              const py::object& corners) {
+  const auto instances = labels.cast<Array<std::uint32_t>>();
+  expect_shape(instances, {-1}, "labels uint32 [P]");
+  std::vector<scene::LabelledPiece> pieces(static_cast<std::size_t>(instances.size()));
+  for (std::size_t i = 0; i < pieces.size(); ++i) {
+    pieces[i].triangle = static_cast<std::uint32_t>(i);
+    pieces[i].instance = instances.data()[i];
+  }
+  if (!triangles.is_none()) {
+    const auto numbers = triangles.cast<Array<std::uint32_t>>();
+    expect_shape(numbers, {instances.size()}, "triangles uint32 [P], one for each label");
+    for (std::size_t i = 0; i < pieces.size(); ++i) pieces[i].triangle = numbers.data()[i];
+  }
+  if (!corners.is_none()) {
+    const auto weights = corners.cast<Array<float>>();
+    expect_shape(weights, {instances.size(), 3, 3}, "corners float32 [P, 3, 3], for each label");
+    for (std::size_t i = 0; i < pieces.size(); ++i) {
+      pieces[i].corners = Eigen::Map<const Eigen::Matrix<float, 3, 3, Eigen::RowMajor>>(weights.data() + 9 * i);
+    }
+  }
+  return pieces;
+}
+
 }  // namespace
 
 std::shared_ptr<scene::Scene> scene_from_arrays(const py::list& meshes, const std::string& name,
@@ -137,6 +185,63 @@ std::shared_ptr<scene::Scene> scene_from_arrays(const py::list& meshes, const st
   if (sun) scene->sun = sun_from(*sun);
   scene->validate();
   return scene;
+}
+
+namespace {
+
+scene::SceneLabels labels_from(const py::list& instances, const py::list& rooms) {
+  scene::SceneLabels labels;
+  scene::Scene categories;
+  for (const py::handle& entry : instances) {
+    labels.instances.push_back(instance_from(entry.cast<py::dict>(), categories));
+  }
+  labels.categories = std::move(categories.categories);
+  for (const py::handle& room : rooms) labels.rooms.push_back(room_from(room.cast<py::dict>()));
+  return labels;
+}
+
+/// Fills in what is said of the scene as a whole: "name", "attributes", "warnings" and "flat".
+void describe_scene(const py::dict& about, scene::Scene& scene) {
+  check_keys(about, {"name", "attributes", "warnings", "flat"}, "scene");
+  if (value_or(about, "flat", false)) {
+    for (scene::Material& material : scene.materials) material.emissive = true;
+  }
+  scene.name = value_or(about, "name", scene.name);
+  for (const auto& [key, value] : value_or<std::map<std::string, std::string>>(about, "attributes", {})) {
+    scene.attributes[key] = value;
+  }
+  const auto warnings = value_or<std::vector<std::string>>(about, "warnings", {});
+  scene.warnings.insert(scene.warnings.end(), warnings.begin(), warnings.end());
+  scene::make_text_utf8(scene);
+}
+
+}  // namespace
+
+std::shared_ptr<scene::Scene> relabelled_scene(const scene::Scene& scene, const py::list& instances,
+                                               const py::array& labels, const py::object& triangles,
+                                               const py::object& corners, const py::list& rooms,
+                                               const py::kwargs& about) {
+  const auto pieces = pieces_from(labels, triangles, corners);
+  auto result = std::const_pointer_cast<scene::Scene>(relabel(scene, pieces, labels_from(instances, rooms)));
+  describe_scene(about, *result);
+  return result;
+}
+
+std::shared_ptr<scene::Scene> assembled_scene(const std::vector<std::shared_ptr<scene::Scene>>& parts,
+                                              const py::list& placements, const py::list& instances,
+                                              const py::list& rooms, const py::kwargs& about) {
+  std::vector<scene::Placement> placed;
+  for (const py::handle& entry : placements) {
+    const auto [part, instance, matrix] = entry.cast<std::tuple<std::uint32_t, std::uint32_t, Array<double>>>();
+    expect_shape(matrix, {4, 4}, "a placement's transform [4, 4]");
+    const Eigen::Map<const Eigen::Matrix<double, 4, 4, Eigen::RowMajor>> map(matrix.data());
+    if (!map.allFinite()) throw ArgumentError("a placement's transform is not finite");
+    placed.push_back({part, instance, Eigen::Affine3f(map.cast<float>())});
+  }
+  const std::vector<scene::ScenePtr> models(parts.begin(), parts.end());
+  auto result = std::const_pointer_cast<scene::Scene>(assemble(models, placed, labels_from(instances, rooms)));
+  describe_scene(about, *result);
+  return result;
 }
 
 }  // namespace wiw::bindings

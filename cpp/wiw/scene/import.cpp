@@ -24,7 +24,7 @@
 namespace wiw::scene {
 namespace {
 
-constexpr int kImporterVersion = 3;  // raise it whenever the same file and options give another scene
+constexpr int kImporterVersion = 4;  // raise it whenever the same file and options give another scene
 
 /// What comes after indexes arrays by what the file says.
 void check_indices(const aiScene& file, const std::filesystem::path& path) {
@@ -63,8 +63,8 @@ const aiScene& parse(Assimp::Importer& importer, const std::filesystem::path& pa
 }
 
 /// Refuses damage that assimp does not survive, and warns of what it drops in silence. Returns what assimp is to read
-/// in place of the files.
-FileContents check_content(const FileContext& context, Scene& scene) {
+/// in place of the files, and what it will not find.
+GltfRewrite check_content(const FileContext& context, Scene& scene) {
   check_signature(context.path, context.format);
   if (context.format == MeshFormat::kPly) check_ply(context.path);
   if (context.format == MeshFormat::kDae) check_collada(context.path);
@@ -72,7 +72,7 @@ FileContents check_content(const FileContext& context, Scene& scene) {
   if (context.format != MeshFormat::kGlb && context.format != MeshFormat::kGltf) return {};
   GltfRewrite rewrite = check_gltf(context.path, context.format, context.options);
   for (std::string& warning : rewrite.warnings) scene.warnings.push_back(std::move(warning));
-  return std::move(rewrite.files);
+  return rewrite;
 }
 
 ScenePtr import_mesh(const std::filesystem::path& path, const ImportOptions& options) {
@@ -80,14 +80,15 @@ ScenePtr import_mesh(const std::filesystem::path& path, const ImportOptions& opt
   check_limit(path.string(), "bytes", size_of_file(path), options.limits.file_bytes, "file_bytes");
   const FileContext context{path, format, options};
   auto scene = std::make_shared<Scene>();
-  FileContents contents = check_content(context, *scene);
+  GltfRewrite rewrite = check_content(context, *scene);
 
   const auto importer = make_importer();
-  const aiScene& file = parse(*importer, path, options, std::move(contents));
+  const aiScene& file = parse(*importer, path, options, std::move(rewrite.files));
   const UpAxis up = up_axis_of(path, format, options.up);
   scene->name = path.stem().string();
   scene->attributes["up"] = up.text();
   convert_materials(file, context, *scene);
+  mark_untextured(rewrite.untextured, *scene);
   convert_nodes(file, context, up, *scene);
   if (scene->instances.empty()) throw FileError(path.string(), "holds no triangles");
   check_imported(*scene, path);

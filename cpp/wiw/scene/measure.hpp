@@ -14,4 +14,7 @@ Eigen::AlignedBox3f instance_bounds(const Scene& scene, const Instance& instance
 std::size_t texture_bytes(const Scene& scene);
 std::size_t mesh_bytes(const Scene& scene);
 
+/// Share of the surface, over placements, whose texture could not be had: 0 to 1.
+double missing_texture_share(const Scene& scene);
+
 }  // namespace wiw::scene

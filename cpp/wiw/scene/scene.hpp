@@ -36,6 +36,7 @@ struct Material {
   std::int32_t texture = kNone;
   float alpha_cutoff = -1.f;  // a texel with alpha below this is a hole; negative: opaque, alpha ignored
   bool emissive = false;
+  bool texture_missing = false;  // the file names a texture that could not be had; a neutral colour is drawn
 };
 
 /// Indexed triangles of one material in instance coordinates. Optional arrays are empty or as long as `positions`.

@@ -32,7 +32,7 @@ from wiw.cli.quality import quality
 from wiw.cli.report import report
 from wiw.cli.run import resume, run
 from wiw.cli.scale import scale
-from wiw.cli.scenes import scenes
+from wiw.cli.scenes import draw_scenes, verify_scans
 from wiw.cli.serve import serve
 from wiw.cli.serve_vlm import serve_vlm
 from wiw.cli.status import status
@@ -87,7 +87,6 @@ COMMANDS: tuple[tuple[Callable[..., int], str, str], ...] = (
     (check_model, "check-model", "Check a world model against its contract."),
     (serve, "serve", "Serve a world model to other processes or machines."),
     (doctor, "doctor", "Check this machine, with a remedy for what is missing."),
-    (scenes, "scenes", "Draw scenes and print their sizes."),
     (serve_vlm, "serve-vlm", "Serve a small vision-language model on this machine, for tests."),
     (episodes, "episodes", "Write episodes to a file, so that anyone can run them."),
     (train, "train", "Train a network: recogniser, warpnet, pocket, perception, armnet, diffuser or a video model."),
@@ -104,9 +103,25 @@ class Group:
     commands: tuple[tuple[Callable[..., int], str, str], ...]
     default: str | None = None
     """The second word where none is given."""
+    default_takes_words: bool = False
+    """Whether that is also where the second word is no command, but a word of the default command."""
 
 
 GROUPS: Mapping[str, Group] = {
+    "scenes": Group(
+        "Draw scenes and print their sizes, or check the scans of a dataset.",
+        """Draw scenes and print their sizes, or check the scans of a dataset.
+
+  $ wiw scenes apartments:val:4
+  $ wiw scenes house.glb --out house.png
+  $ wiw scenes verify hm3d:scene_datasets/hm3d:val""",
+        (
+            (draw_scenes, "draw", "Print sizes of scenes and draw a contact sheet; what `wiw scenes SPEC` does."),
+            (verify_scans, "verify", "Open every scan of a dataset, and print what is wrong."),
+        ),
+        default="draw",
+        default_takes_words=True,
+    ),
     "collect": Group(
         "Collect data: navigation in scenes, demonstrations of manipulation tasks, or decisions.",
         """Collect data for training, and decisions to validate on. Repeat an interrupted command to resume it.
@@ -225,8 +240,10 @@ def _dispatch(arguments: Sequence[str]) -> Any:
 def _dispatch_group(name: str, arguments: Sequence[str]) -> Any:
     group = GROUPS[name]
     known = [each for _, each, _ in group.commands]
-    given = list(arguments) or ["--help"]
-    if group.default and given[0] not in (*known, "-h", "--help") and given[0].startswith("-"):
+    given = list(arguments) or ([] if group.default_takes_words else ["--help"])
+    first = next(iter(given), "")
+    is_own = group.default_takes_words or first.startswith("-")
+    if group.default and is_own and first not in (*known, "-h", "--help"):
         given = [group.default, *given]
     app = tyro.extras.SubcommandApp()
     for function, each, line in group.commands:

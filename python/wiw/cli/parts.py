@@ -37,8 +37,8 @@ class TaskFlags:
     tasks: Annotated[str | None, arg(metavar="all|A,B,...")] = None
     """For manipulation: which of its tasks, taken in turn; all of them if not given."""
     scenes: Annotated[str | None, arg(metavar="SPEC")] = None
-    """apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world; apartments:val if
-    not given."""
+    """apartments:train|val|test[[:FIRST]:END], a mesh (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans
+    (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR, replicacad:DIR, procthor:DIR); apartments:val if not given."""
     per_scene: Annotated[int | None, arg(metavar="N")] = None
     """Episodes generated in a scene before the next one's turn; the task's own number if not given."""
     episode_file: Annotated[Path | None, arg(metavar="FILE")] = None
@@ -57,6 +57,8 @@ class TaskFlags:
     given again."""
     backend: Literal["auto", "cpu", "gpu"] | None = None
     """Renderer; auto if not given."""
+    allow_missing_textures: bool = False
+    """Run on scans even where more than 5 % of the surface lacks its texture and is drawn grey."""
 
     def make_recipe(self, task: str, seed: int) -> TaskRecipe:
         """Return the recipe of a task.
@@ -65,8 +67,12 @@ class TaskFlags:
             ArgumentError: a task option that has a flag of its own, or that cannot be read.
         """
         from wiw.runs.recipes import TaskRecipe
+        from wiw.scenes import allow_missing_textures
 
-        flags = {name: value for name, value in vars(self).items() if name != "task_option"}
+        if self.allow_missing_textures:
+            allow_missing_textures()
+        here = ("task_option", "allow_missing_textures")
+        flags = {name: value for name, value in vars(self).items() if name not in here}
         return TaskRecipe(task, task_options(task, self.task_option, {**flags, "seed": seed}))
 
 

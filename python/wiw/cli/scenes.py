@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`wiw scenes`."""
+"""`wiw scenes`: draw scenes, check scans."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 
-def scenes(
+def draw_scenes(
     spec: Positional[Annotated[str, arg(metavar="SPEC")]] = "apartments:val:4",
     /,
     *,
@@ -24,7 +24,7 @@ def scenes(
 
     Args:
         spec: apartments:train|val|test[[:FIRST]:END], one with edits (apartments:val/3?state:floor_lamp_1=off), a mesh
-            (GLB, glTF, OBJ, PLY, DAE), or a Gazebo world.
+            (GLB, glTF, OBJ, PLY, DAE), a Gazebo world, or scans (hm3d:DIR:val, mp3d:DIR, replica:DIR, hssd:DIR).
         out: Where to write the sheet, a PNG.
         views: Panoramas per scene.
         backend: Renderer.
@@ -58,6 +58,58 @@ def scenes(
         contact_sheet(rows, views, backend).save(draft, format=kind)
     print(f"\nsheet  {out}")
     return 0
+
+
+def verify_scans(
+    folder: Positional[Annotated[str, arg(metavar="DIR|SPEC")]],
+    /,
+) -> int:
+    """Open every scan of a dataset, and print what is wrong; exit code 1 if anything is.
+
+    $ wiw scenes verify scene_datasets/mp3d
+    $ wiw scenes verify hm3d:scene_datasets/hm3d:val
+
+    Textures, objects, categories, rooms and walkable area are counted and compared with the dataset's own files. Scans
+    are kept in the cache as they are read, so that runs open them fast.
+
+    Args:
+        folder: A dataset's folder, that of one scan, or a spec such as hm3d:DIR:val.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from wiw.cli.terminal import printable
+    from wiw.datasets.scan_check import check_scan
+    from wiw.datasets.scene_splits import name_scene
+    from wiw.scenes.scans import find_all, find_scans, parse_spec
+
+    spec = parse_spec(folder)
+    files = find_scans(*spec) if spec else find_all(Path(folder))
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column in ("scan", "triangles", "textures", "grey %", "objects", "kinds", "rooms", "walk m2", "islands", "s"):
+        table.add_column(column, justify="left" if column == "scan" else "right", no_wrap=column != "scan")
+    checks = []
+    for file in files:
+        check = check_scan(file)
+        checks.append(check)
+        table.add_row(
+            name_scene(file),
+            *(f"{number:,}" for number in (check.triangles, check.textures)),
+            f"{100 * check.missing:.1f}",
+            *map(str, (check.objects, check.categories, check.rooms)),
+            f"{check.area:.0f}{'' if check.navmesh == 'file' else '*'}",
+            *map(str, (check.islands, f"{check.seconds:.0f}")),
+        )
+    Console().print(table)
+    if any(check.navmesh == "built" for check in checks):
+        print("* by a navigation mesh that was built: none came with the scan")
+    for check in checks:
+        lines = [f"  wrong: {line}" for line in check.problems] + [f"  note: {line}" for line in check.remarks]
+        if lines:
+            print(printable("\n".join([f"\n{check.file}", *lines])))
+    wrong = sum(bool(check.problems) for check in checks)
+    print(f"\n{len(checks)} scan{'s' * (len(checks) > 1)}, {wrong} with something wrong")
+    return 1 if wrong else 0
 
 
 LIMIT = 8

@@ -101,6 +101,7 @@ ALIASES = {
 }
 """Other scenes' words for the apartments' categories."""
 
+LABELS_NEEDED = "put the files with its labels beside its mesh (docs/real-scans.md)"
 HIDDEN = (0.4, 0.2)
 """Visible shares at the start below which an episode is of difficulty 1 and 2."""
 
@@ -164,6 +165,12 @@ def centre_of(world: World, instance: int, where: str) -> NDArray[np.float64]:
     things = world.scene.instances
     if not 1 <= instance <= len(things):
         raise ArgumentError(f"{where}: target {instance} is no instance of {world.name}, which has 1 to {len(things)}")
+    if world.scene.attributes.get("labels") == "none":
+        raise ArgumentError(
+            f"{where}: {world.name} has no labels, so that target {instance} is unknown; {LABELS_NEEDED}"
+        )
+    if not things[instance - 1]["triangle_count"]:
+        raise ArgumentError(f"{where}: target {instance} has no surface in {world.name}")
     return np.asarray(things[instance - 1]["bounds"], np.float64).mean(axis=0)
 
 

@@ -7,6 +7,7 @@ from os import PathLike, fspath
 from pathlib import Path
 
 from wiw.scenes import is_generated, strip_edits
+from wiw.scenes.scans import replica
 
 FOLDERS = ("val", "test", "minival", "validation")
 """Names of folders that hold scenes of evaluation, as in HM3D's "hm3d/val/00800-TEEsavR23oF"."""
@@ -25,9 +26,14 @@ MATTERPORT = {
 
 
 def name_scene(spec: str | PathLike[str]) -> str:
-    """Return the name of a single scene in a dataset: a generated one's spec, else the file's name up to a dot."""
+    """Return the name of a single scene in a dataset: a generated one's spec, else the file's name up to a dot.
+
+    Rooms of Replica, whose files all have one name, are called as their folders are.
+    """
     spec = fspath(spec)
-    return spec if is_generated(spec) else Path(spec).name.partition(".")[0]
+    if is_generated(spec):
+        return spec
+    return replica.room_name(Path(spec)) if replica.is_scan(Path(spec)) else Path(spec).name.partition(".")[0]
 
 
 def find_evaluation_split(spec: str | PathLike[str]) -> str | None:

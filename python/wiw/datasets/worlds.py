@@ -12,6 +12,7 @@ from wiw.errors import FileError
 from wiw.nav import Ground, NavMesh
 from wiw.render import Renderer
 from wiw.scenes import Scene, is_generated, open_scene
+from wiw.scenes.scans import scene_dataset
 
 CAPACITY = 4
 """Worlds kept: enough for the live episodes of a run that goes scene by scene (an apartment takes about 100 MB)."""
@@ -45,7 +46,7 @@ def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
         _worlds.move_to_end(key)
         return _worlds[key]
     loaded = open_scene(scene)
-    made = World(scene, loaded, Renderer(loaded, backend=backend), _navmesh(path, loaded), Ground(loaded), backend)
+    made = World(scene, loaded, Renderer(loaded, backend=backend), open_navmesh(path, loaded), Ground(loaded), backend)
     _worlds[key] = made
     while len(_worlds) > CAPACITY:
         _worlds.popitem(last=False)
@@ -53,14 +54,19 @@ def world(scene: str, backend: Literal["auto", "cpu", "gpu"] = "auto") -> World:
 
 
 def navmesh_file(scene: str) -> Path | None:
-    """Return Habitat's navigation mesh beside a scene's file, "house.navmesh" for "house.glb", if there is one."""
+    """Return Habitat's navigation mesh beside a scene's file, "house.navmesh" for "house.glb", if there is one.
+
+    A scene of a scene dataset names its own.
+    """
     if is_generated(scene):
         return None
+    if scene.endswith(scene_dataset.ENDING):
+        return scene_dataset.find_navmesh(Path(scene).expanduser())
     path = Path(scene).expanduser().with_suffix(".navmesh")
     return path if path.is_file() else None
 
 
-def _navmesh(path: Path | None, scene: Scene) -> NavMesh:
+def open_navmesh(path: Path | None, scene: Scene) -> NavMesh:
     """Return the mesh that came with the scene, else one built from it.
 
     Raises:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenes: meshes and Gazebo worlds from files.
+"""Scenes: meshes, Gazebo worlds and real scans from files.
 
 World frame: metres, Y up, right-handed. See `Scene` for what a scene tells about itself.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import logging
+import os
 import re
 import time
 from collections.abc import Sequence
@@ -17,19 +18,23 @@ from typing import Any
 
 from wiw import _core
 from wiw.errors import ArgumentError, FileError
-from wiw.scenes import isolated, store
+from wiw.scenes import isolated, scans, store
 from wiw.suggestions import did_you_mean
 
 Scene = _core.scene.Scene
 
 __all__ = [
+    "ALLOW_VARIABLE",
     "COLORS",
+    "MOST_MISSING",
     "Scene",
     "absolute",
+    "allow_missing_textures",
     "apartment",
     "apartment_table",
     "is_generated",
     "load",
+    "missing_textures_allowed",
     "open_outline",
     "open_scene",
     "possible_edits",
@@ -42,6 +47,11 @@ COLORS = (
     "pink",
 )  # fmt: skip
 """Colour words of apartments. Weights count classes by their order."""
+
+MOST_MISSING = 0.05
+"""Share of a scan's surface whose texture may be missing."""
+ALLOW_VARIABLE = "WIW_ALLOW_MISSING_TEXTURES"
+"""Environment variable that allows more, also in the processes that a run starts."""
 
 _log = logging.getLogger("wiw.scenes")
 
@@ -57,12 +67,14 @@ def load(
     texture_folders: Sequence[str | PathLike[str]] = (),
     model_folders: Sequence[str | PathLike[str]] = (),
 ) -> Scene:
-    """Reads a GLB, glTF, OBJ, PLY or DAE mesh, or a Gazebo `.world` or `.sdf` file.
+    """Reads a GLB, glTF, OBJ, PLY or DAE mesh, a Gazebo `.world` or `.sdf` file, or a real scan.
+
+    A scan is opened by its mesh, and known by the files beside it (`docs/real-scans.md`).
 
     Args:
         path: the file; `~` is understood.
-        up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for names in HM3D's layout). The
-            rule that was used is `scene.attributes["up"]`.
+        up: "y", "z" or None: by the file (COLLADA header; Y for glTF, OBJ and PLY; Z for scans and for names in HM3D's
+            layout). The rule that was used is `scene.attributes["up"]`.
         ceiling: closes a scene that is open above, in metres above its floor.
         cache: keep the imported scene on disk (`$WIW_CACHE` or `~/.cache/wiw`) and map it the next time.
         isolate: import in a process of its own, so that a file that crashes the reader raises FileError here.
@@ -75,6 +87,7 @@ def load(
     Raises:
         FileError: naming file and cause: missing, damaged, unsupported or above the limits.
         ArgumentError: an option is out of its range.
+        DependencyError: a scan's textures need a decoder that is not installed.
     """
     file = Path(path).expanduser().absolute()  # the cache is shared by processes with other working folders
     if not file.is_file():
@@ -86,6 +99,9 @@ def load(
         "texture_folders": [str(Path(folder).expanduser().absolute()) for folder in texture_folders],
         "model_folders": [str(Path(folder).expanduser().absolute()) for folder in model_folders],
     }
+    reader = scans.find_reader(file)
+    if reader is not None:
+        options |= {"scan": reader, "allow_missing_textures": missing_textures_allowed()}
     scene = _load(file, options, cache, isolate)
     for warning in scene.warnings:
         _log.warning("%s: %s", scene.name, warning)
@@ -96,14 +112,14 @@ def _load(file: Path, options: dict[str, Any], cache: bool, isolate: bool) -> Sc
     def build(out: Path) -> store.Sources:
         if isolate:
             return isolated.import_to(file, options, out)
-        scene, read, absent = _core.scene.import_scene(file, **options)
-        _core.scene.write_cache(scene, out)
-        return store.Sources(tuple(read), tuple(absent))
+        imported = scans.read_scene(file, options)
+        _core.scene.write_cache(imported.scene, out)
+        return store.Sources(tuple(imported.read), tuple(imported.absent))
 
     if cache:
         return store.load_imported(file, options, build)
     if not isolate:
-        return _core.scene.import_scene(file, **options)[0]
+        return scans.read_scene(file, options).scene
     return store.temporary(build)
 
 
@@ -172,6 +188,10 @@ def strip_edits(spec: str) -> str:
 def absolute(spec: str | PathLike[str]) -> str:
     """Return the spec with its path, if it is one, made absolute, so that it means the same in any folder."""
     spec = fspath(spec)
+    scan = scans.parse_spec(spec)
+    if scan is not None:
+        kind, folder, split = scan
+        return ":".join(filter(None, [kind, str(folder.expanduser().absolute()), split]))
     return spec if is_generated(spec) or _resembles_generated(spec) else str(Path(spec).expanduser().absolute())
 
 
@@ -179,20 +199,24 @@ def resolve(spec: str | PathLike[str]) -> list[str]:
     """Return the single scenes that a scene spec names, in order, none of them loaded.
 
     "apartments:val" and "apartments:val:40" are the first 1000 or 40 apartments of a split, "apartments:val:40:60" are
-    numbers 40 to 59, each named "apartments:val/7"; anything else is the path of a mesh or a Gazebo world. The edits of
+    numbers 40 to 59, each named "apartments:val/7"; "hm3d:DIR:val" is each scan of a dataset's split, by its file (see
+    `wiw.scenes.scans.KINDS`); anything else is the path of a mesh or a Gazebo world. The edits of
     "apartments:val/7?state:floor_lamp_1=off&color:sofa_1=blue" come in one order and spelling, so that equal scenes
     have equal names; whether the apartment can have them is found when it is opened.
 
     Raises:
         ArgumentError: the split or the count is not one, or an edit is not one.
-        FileError: there is no such file.
+        FileError: there is no such file, or no scan in the folder.
     """
     spec = fspath(spec)
+    scan = scans.parse_spec(spec)
+    if scan is not None:
+        return [str(file) for file in scans.find_scans(*scan)]
     if not is_generated(spec):
         if not Path(spec).expanduser().is_file():
             raise FileError(
-                f"{spec}: no such file; expected a mesh, a Gazebo world, or apartments:{{train,val,test}}[:N]."
-                f"{_did_you_mean(spec)}"
+                f"{spec}: no such file; expected a mesh, a Gazebo world, apartments:{{train,val,test}}[:N], or scans "
+                f"such as hm3d:DIR:val ({', '.join(scans.KINDS)}).{_did_you_mean(spec)}"
             )
         return [spec]
     base, mark, edits = spec.partition("?")
@@ -245,11 +269,35 @@ def _did_you_mean(spec: str) -> str:
 
 
 def open_scene(name: str) -> Scene:
-    """Load one scene of `resolve`."""
+    """Load one scene of `resolve`.
+
+    Raises:
+        FileError: it cannot be read; or it is a scan, more than `MOST_MISSING` of its surface lacks its texture, and
+            `$WIW_ALLOW_MISSING_TEXTURES` is not set.
+    """
     if is_generated(name):
         seed, split, edits = _parse_single(name)
         return apartment(seed, split, edits=edits)
-    return load(name)
+    scene = load(name)
+    is_grey = "dataset" in scene.attributes and scene.missing_texture_share > MOST_MISSING
+    if is_grey and not missing_textures_allowed():
+        cause = next((warning for warning in scene.warnings if "texture" in warning or "image" in warning), "")
+        raise FileError(
+            f"{name}: {scene.missing_texture_share:.0%} of its surface lacks its texture and would be drawn grey "
+            f"({cause}); at most {MOST_MISSING:.0%} may. Put the textures where the file names them, or allow it with "
+            f"--allow-missing-textures ({ALLOW_VARIABLE}=1)"
+        )
+    return scene
+
+
+def allow_missing_textures() -> None:
+    """Allow this process and those that it starts to use scans that lack more than `MOST_MISSING` of their textures."""
+    os.environ[ALLOW_VARIABLE] = "1"
+
+
+def missing_textures_allowed() -> bool:
+    """Return whether scans may be used that lack more than `MOST_MISSING` of their textures."""
+    return os.environ.get(ALLOW_VARIABLE, "") not in ("", "0")
 
 
 def open_outline(name: str) -> Scene:
@@ -257,4 +305,4 @@ def open_outline(name: str) -> Scene:
     if is_generated(name):
         seed, split, edits = _parse_single(name)
         return apartment_table(seed, split, edits=edits)
-    return load(name)
+    return open_scene(name)

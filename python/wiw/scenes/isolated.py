@@ -18,13 +18,13 @@ from typing import Any
 
 import wiw
 from wiw import errors
-from wiw.errors import ArgumentError, FileError
+from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.scenes.store import Sources
 
 TIMEOUT = 600.0
 """Seconds after which an import is given up; a file of two million triangles takes a few."""
 
-_ERRORS = {error.__name__: error for error in (ArgumentError, FileError)}
+_ERRORS = {error.__name__: error for error in (ArgumentError, DependencyError, FileError)}
 
 
 def import_to(path: Path, options: dict[str, Any], out: Path) -> Sources:
@@ -33,6 +33,7 @@ def import_to(path: Path, options: dict[str, Any], out: Path) -> Sources:
     Raises:
         FileError: the file is damaged, also where that ends the child: a crash, a time-out, no memory left.
         ArgumentError: an option is none.
+        DependencyError: a decoder of its textures is not installed.
     """
     reply = read_in_child("wiw.scenes.worker", {"path": str(path), "out": str(out), "options": options})
     return Sources(tuple(map(Path, reply["read"])), tuple(map(Path, reply["absent"])))

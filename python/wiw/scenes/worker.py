@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from wiw import _core
 from wiw.scenes.child import answer_job
+from wiw.scenes.scans import read_scene
 
 
 def import_scene(job: dict[str, Any]) -> dict[str, Any]:
     """Import a scene, write its cache file, name the files read and looked for."""
-    scene, read, absent = _core.scene.import_scene(job["path"], **job["options"])
-    _core.scene.write_cache(scene, job["out"])
-    return {"read": [str(path) for path in read], "absent": [str(path) for path in absent]}
+    imported = read_scene(Path(job["path"]), job["options"])
+    _core.scene.write_cache(imported.scene, job["out"])
+    return {"read": [str(path) for path in imported.read], "absent": [str(path) for path in imported.absent]}
 
 
 if __name__ == "__main__":

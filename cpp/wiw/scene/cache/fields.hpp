@@ -28,6 +28,7 @@ void fields_of(Archive& archive, T& material)
   archive.value(material.texture);
   archive.value(material.alpha_cutoff);
   archive.value(material.emissive);
+  archive.value(material.texture_missing);
 }
 
 template <class Archive, class T>

@@ -78,7 +78,8 @@ Material convert_material(const aiMaterial& source, MeshFormat format, const Tex
   const std::string reference = texture_reference(source, format);
   material.emissive = is_emissive(emitted_color(source, format));
   material.texture = textures.find(reference);
-  if (!reference.empty() && material.texture == kNone) {
+  material.texture_missing = !reference.empty() && material.texture == kNone;
+  if (material.texture_missing) {
     material.base_color = {kNeutral, kNeutral, kNeutral, 1.f};
   } else if (is_gltf(format)) {
     material.base_color = gltf_color(source);
@@ -90,6 +91,14 @@ Material convert_material(const aiMaterial& source, MeshFormat format, const Tex
 }
 
 }  // namespace
+
+void mark_untextured(std::span<const std::size_t> materials, Scene& scene) {
+  for (const std::size_t index : materials) {
+    Material& material = scene.materials.at(index);
+    material.texture_missing = true;
+    material.base_color = {kNeutral, kNeutral, kNeutral, 1.f};
+  }
+}
 
 void convert_materials(const aiScene& file, const FileContext& context, Scene& scene) {
   std::vector<std::string> references;

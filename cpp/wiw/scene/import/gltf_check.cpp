@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <array>
+#include <map>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -58,27 +59,35 @@ void warn_of_extensions(const Json& root, const std::filesystem::path& path, std
   }
 }
 
-/// Textures without an image that can be decoded.
+/// How a texture without an image that can be decoded is stored; empty for any other.
+std::string_view undecodable_encoding(const Json& texture) {
+  const auto has = [&](const char* name) { return !texture["extensions"][name].is_null(); };
+  if (!texture["source"].is_null()) return {};
+  if (has("KHR_texture_basisu") || has("GOOGLE_texture_basis")) return "Basis Universal";
+  return has("EXT_texture_webp") ? "WebP" : std::string_view();
+}
+
 void warn_of_textures(const Json& root, const std::filesystem::path& path, std::vector<std::string>& warnings) {
-  struct Encoding {
-    std::array<const char*, 2> extensions;
-    const char* name;
-  };
-  constexpr std::array<Encoding, 2> kEncodings{
-      {{{"KHR_texture_basisu", "GOOGLE_texture_basis"}, "Basis Universal"}, {{"EXT_texture_webp", ""}, "WebP"}}};
-  for (const Encoding& encoding : kEncodings) {
-    std::size_t textures = 0;
-    for (const Json& texture : root["textures"].items()) {
-      const bool is_encoded = std::ranges::any_of(
-          encoding.extensions, [&](const char* name) { return !texture["extensions"][name].is_null(); });
-      textures += is_encoded && texture["source"].is_null() ? 1 : 0;
-    }
-    if (textures == 0) continue;
-    warnings.push_back(std::to_string(textures) + " textures of " + path.filename().string() + " are stored as " +
-                       encoding.name +
+  std::map<std::string_view, std::size_t> counts;
+  for (const Json& texture : root["textures"].items()) ++counts[undecodable_encoding(texture)];
+  for (const auto& [encoding, count] : counts) {
+    if (encoding.empty()) continue;
+    warnings.push_back(std::to_string(count) + " textures of " + path.filename().string() + " are stored as " +
+                       std::string(encoding) +
                        " alone, which cannot be decoded here; drawn without texture (export them as "
                        "PNG or JPEG, or with one of these beside it)");
   }
+}
+
+std::vector<std::size_t> untextured_materials(const Json& root) {
+  std::vector<std::size_t> untextured;
+  const auto& materials = root["materials"].items();
+  const auto& textures = root["textures"].items();
+  for (std::size_t i = 0; i < materials.size(); ++i) {
+    const auto index = texture_to_draw(materials[i])["index"].whole();
+    if (index && *index < textures.size() && !undecodable_encoding(textures[*index]).empty()) untextured.push_back(i);
+  }
+  return untextured;
 }
 
 void check_images(const Json& root, const std::string& path) {
@@ -102,6 +111,7 @@ GltfRewrite check_gltf(const std::filesystem::path& path, MeshFormat format, con
   GltfRewrite rewrite = rewrite_gltf(document, path, format, options);
   warn_of_extensions(root, path, rewrite.warnings);
   warn_of_textures(root, path, rewrite.warnings);
+  rewrite.untextured = untextured_materials(root);
   return rewrite;
 }
 

@@ -296,12 +296,6 @@ class Rewriter {
 
   // ---- texture coordinates
 
-  /// The texture that is drawn of a material: its base colour, its emission where there is no other.
-  static const Json& texture_to_draw(const Json& material) {
-    const Json& base = material["pbrMetallicRoughness"]["baseColorTexture"];
-    return base.is_null() || is_emissive_only(material) ? material["emissiveTexture"] : base;
-  }
-
   void choose_texture_coordinates(Json& primitive) {
     const auto index = index_of(primitive, "material", items("materials").size());
     if (!index) return;
@@ -456,6 +450,11 @@ class Rewriter {
 };
 
 }  // namespace
+
+const Json& texture_to_draw(const Json& material) {
+  const Json& base = material["pbrMetallicRoughness"]["baseColorTexture"];
+  return base.is_null() || is_emissive_only(material) ? material["emissiveTexture"] : base;
+}
 
 bool is_emissive_only(const Json& material) {
   const auto is_black = [](const Json& color, double otherwise) {

@@ -18,23 +18,6 @@
 namespace wiw::scene {
 namespace {
 
-struct Property {
-  std::size_t bytes = 0;        // of a value, or of a list's entries
-  std::size_t count_bytes = 0;  // of a list's length; 0: no list
-};
-
-struct Element {
-  std::string name;
-  std::size_t count = 0;
-  std::vector<Property> properties;
-};
-
-struct PlyHeader {
-  std::string format;
-  std::vector<Element> elements;
-  std::size_t bytes = 0;
-};
-
 constexpr std::size_t kMostEntries = 1 << 16;  // of one face; more is damage
 
 std::size_t bytes_of(const std::string& type) {
@@ -62,56 +45,11 @@ std::size_t bytes_of(const std::string& type) {
   return row == kTypes.end() ? 0 : row->bytes;
 }
 
-/// Text of the header's lines and the offset behind `end_header`.
-PlyHeader read_header(std::string_view file, const std::string& path) {
-  PlyHeader header;
-  std::size_t at = 0;
-  while (at < file.size()) {
-    const std::size_t end = std::min(file.find('\n', at), file.size());
-    std::istringstream line{std::string(file.substr(at, end - at))};
-    at = end + 1;
-    std::string word;
-    line >> word;
-    constexpr std::array<std::string_view, 7> kWords{"ply",     "format",   "comment",   "obj_info",
-                                                     "element", "property", "end_header"};
-    if (!word.empty() && std::ranges::find(kWords, word) == kWords.end()) {
-      throw FileError(path, "has a header line that begins with '" + word + "' (damaged file)");
-    }
-    if (word == "end_header") {
-      header.bytes = at;
-      return header;
-    }
-    if (word == "format") line >> header.format;
-    if (word == "element") {
-      Element element;
-      if (!(line >> element.name >> element.count))
-        throw FileError(path, "has an <element> line without name and count (damaged file)");
-      header.elements.push_back(std::move(element));
-    }
-    if (word == "property") {
-      std::string type;
-      std::string count_type;
-      line >> type;
-      Property property;
-      if (type == "list") {
-        line >> count_type >> type;
-        property.count_bytes = bytes_of(count_type);
-      }
-      property.bytes = bytes_of(type);
-      if (property.bytes == 0 || (!count_type.empty() && property.count_bytes == 0) || header.elements.empty()) {
-        throw FileError(path, "has a property of unknown type '" + type + "' (damaged file)");
-      }
-      header.elements.back().properties.push_back(property);
-    }
-  }
-  throw FileError(path, "ends within its header (truncated file)");
-}
-
 /// assimp gives each vertex and face its place by the element's count, so it must meet each element once, and faces
 /// after the vertices that they name.
 void check_elements(const PlyHeader& header, const std::string& path) {
   std::set<std::string_view> names;
-  for (const Element& element : header.elements) {
+  for (const PlyElement& element : header.elements) {
     if (!names.insert(element.name).second) {
       throw FileError(path, "declares the element '" + element.name + "' twice (damaged file)");
     }
@@ -137,8 +75,8 @@ std::size_t list_length(std::string_view file, std::size_t at, std::size_t bytes
 }
 
 /// Offset behind one row of `element`; npos if the file ends before.
-std::size_t row_end(const Element& element, std::string_view file, std::size_t at, bool big_endian) {
-  for (const Property& property : element.properties) {
+std::size_t row_end(const PlyElement& element, std::string_view file, std::size_t at, bool big_endian) {
+  for (const PlyProperty& property : element.properties) {
     std::size_t entries = 1;
     if (property.count_bytes > 0) {
       if (at + property.count_bytes > file.size()) return std::string_view::npos;
@@ -154,7 +92,7 @@ std::size_t row_end(const Element& element, std::string_view file, std::size_t a
 
 void check_binary(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t at = header.bytes;
-  for (const Element& element : header.elements) {
+  for (const PlyElement& element : header.elements) {
     for (std::size_t row = 0; row < element.count; ++row) {
       at = row_end(element, file, at, header.format == "binary_big_endian");
       if (at == std::string_view::npos) {
@@ -167,7 +105,7 @@ void check_binary(const PlyHeader& header, std::string_view file, const std::str
 
 void check_ascii(const PlyHeader& header, std::string_view file, const std::string& path) {
   std::size_t rows = 0;
-  for (const Element& element : header.elements) rows += element.count;
+  for (const PlyElement& element : header.elements) rows += element.count;
   const auto body = file.substr(header.bytes);
   const auto lines =
       static_cast<std::size_t>(std::ranges::count(body, '\n')) + (body.empty() || body.back() == '\n' ? 0 : 1);
@@ -179,10 +117,56 @@ void check_ascii(const PlyHeader& header, std::string_view file, const std::stri
 
 }  // namespace
 
+PlyHeader read_ply_header(std::string_view file, const std::string& path) {
+  PlyHeader header;
+  std::size_t at = 0;
+  while (at < file.size()) {
+    const std::size_t end = std::min(file.find('\n', at), file.size());
+    std::istringstream line{std::string(file.substr(at, end - at))};
+    at = end + 1;
+    std::string word;
+    line >> word;
+    constexpr std::array<std::string_view, 7> kWords{"ply",     "format",   "comment",   "obj_info",
+                                                     "element", "property", "end_header"};
+    if (!word.empty() && std::ranges::find(kWords, word) == kWords.end()) {
+      throw FileError(path, "has a header line that begins with '" + word + "' (damaged file)");
+    }
+    if (word == "end_header") {
+      header.bytes = at;
+      return header;
+    }
+    if (word == "format") line >> header.format;
+    if (word == "element") {
+      PlyElement element;
+      if (!(line >> element.name >> element.count))
+        throw FileError(path, "has an <element> line without name and count (damaged file)");
+      header.elements.push_back(std::move(element));
+    }
+    if (word == "property") {
+      std::string type;
+      std::string count_type;
+      line >> type;
+      PlyProperty property;
+      if (type == "list") {
+        line >> count_type >> type;
+        property.count_bytes = bytes_of(count_type);
+      }
+      line >> property.name;
+      property.type = type;
+      property.bytes = bytes_of(type);
+      if (property.bytes == 0 || (!count_type.empty() && property.count_bytes == 0) || header.elements.empty()) {
+        throw FileError(path, "has a property of unknown type '" + type + "' (damaged file)");
+      }
+      header.elements.back().properties.push_back(property);
+    }
+  }
+  throw FileError(path, "ends within its header (truncated file)");
+}
+
 void check_ply(const std::filesystem::path& path) {
   const auto bytes = read_file(path);
   const std::string_view file(reinterpret_cast<const char*>(bytes.data()), bytes.size());
-  const PlyHeader header = read_header(file, path.string());
+  const PlyHeader header = read_ply_header(file, path.string());
   check_elements(header, path.string());
   if (header.format == "ascii") {
     check_ascii(header, file, path.string());

@@ -224,12 +224,16 @@ class SceneTable:
 
 
 def make_table(scene: Scene, name: str = "") -> SceneTable:
-    """Return the table of a scene, which is empty of rooms where the scene does not tell them."""
+    """Return the table of a scene, which is empty of rooms where the scene does not tell them.
+
+    Instances of a scan that have no surface are left out.
+    """
     rooms = tuple(
         Room(room["name"], PASSAGES.get(room["type"], room["type"]), *np.asarray(room["bounds"], np.float64))
         for room in scene.rooms
     )
-    return SceneTable(name or scene.name, tuple(_thing(instance) for instance in scene.instances), rooms)
+    things = tuple(_thing(instance) for instance in scene.instances if instance["triangle_count"])
+    return SceneTable(name or scene.name, things, rooms)
 
 
 def _thing(instance: dict[str, object]) -> Thing:
