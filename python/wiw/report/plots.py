@@ -202,13 +202,13 @@ def _draw_scaling_measure(axes: Axes, found: ScalingTable, model: str, measure: 
             fitted = curve.fit.a.value + curve.fit.b.value * (fine / clips[0]) ** -curve.fit.c.value
             axes.plot(fine, fitted, color=color, lw=1.4, ls=(0, (4, 3)))
     few = found.find_curve(model, FEWER_SCENES, measure)
-    for scenes, each in list(zip(few.arm.amounts, few.values, strict=True))[:-1]:
+    for scenes, each, color in zip(few.arm.amounts[:-1], few.values, PALETTE[2:], strict=False):
         axes.errorbar(
             few.arm.clips,
             each.value,
             [[max(0, each.value - each.low)], [max(0, each.high - each.value)]],
             fmt="D",
-            color=PALETTE[2],
+            color=color,
             ms=6,
             elinewidth=2,
             label=f"from {scenes} scenes",
