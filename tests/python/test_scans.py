@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import random
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,11 +25,30 @@ from wiw.datasets.worlds import navmesh_file, world
 from wiw.errors import ArgumentError, DependencyError, FileError
 from wiw.nav import NavMesh
 from wiw.render import Renderer
-from wiw.scenes.scans import basis, hm3d
+from wiw.scenes.scans import basis, hm3d, labels
 from wiw.scenes.scans.scene_dataset import words_of
+from wiw.tasks.ar import AR
 
 EYES = ((2.6, 2.6, 1.2), (4.6, 3.2, 1.5), (6.5, 0.6, 1.0))
 """Places in both rooms, Z up."""
+
+
+@pytest.fixture(autouse=True)
+def coarse(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sample labels every 20 cm, which is quick, but where a test asks for `fine` ones."""
+    if "fine" not in request.fixturenames:
+        monkeypatch.setattr(labels, "SPACING", 0.2)
+
+
+@pytest.fixture
+def fine() -> None:
+    """Samples labels as a user's scans are sampled."""
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reads scenes without a child, which takes a second to start, and without the cache."""
+    monkeypatch.setattr(scenes, "load", partial(scenes.load, cache=False, isolate=False))
 
 
 def load(path: Path, **options: Any) -> scenes.Scene:
@@ -90,14 +111,14 @@ def assert_labels_fit(scene: scenes.Scene, truth: NDArray[np.int64]) -> None:
 
 
 class TestMatterport:
-    def test_every_object_is_where_the_labels_say(self, tmp_path: Path) -> None:
+    def test_every_object_is_where_the_labels_say(self, tmp_path: Path, fine: None) -> None:
         path = files.write_matterport(tmp_path)
         scene = load(path)
         assert_labels_fit(scene, cast(path.with_name(f"{path.stem}_semantic.ply"), (64, 128)))
         assert scene.attributes["up"] == "Z (Matterport3D)" and scene.texture_count == 2
         assert scene.missing_texture_share == 0
 
-    def test_instance_ids_are_habitats(self, tmp_path: Path) -> None:
+    def test_instance_ids_are_habitats(self, tmp_path: Path, fine: None) -> None:
         scene = load(files.write_matterport(tmp_path))
         for label in (files.WALL, files.BED, files.TABLE, files.PICTURE, files.CLOSET):
             thing = scene.instances[label - 1]
@@ -144,10 +165,10 @@ class TestMatterport:
 
     def test_a_scan_is_read_again_once_its_labels_are_there(self, tmp_path: Path) -> None:
         path = files.write_matterport(tmp_path)
-        labels = path.with_name(f"{path.stem}_semantic.ply")
-        aside = labels.rename(tmp_path / "aside.ply")
+        semantic = path.with_name(f"{path.stem}_semantic.ply")
+        aside = semantic.rename(tmp_path / "aside.ply")
         assert len(scenes.load(path).instances) == 1
-        aside.rename(labels)
+        aside.rename(semantic)
         first = scenes.load(path)
         assert len(first.instances) == len(files.NAMES) + 1
         assert scenes.load(path).instances[2]["name"] == first.instances[2]["name"]
@@ -179,11 +200,11 @@ class TestMatterport:
 
     def test_labels_of_another_format_are_refused(self, tmp_path: Path) -> None:
         path = files.write_matterport(tmp_path)
-        labels = path.with_name(f"{path.stem}_semantic.ply")
-        labels.write_bytes(labels.read_bytes().replace(b"int object_id", b"int something"))
+        semantic = path.with_name(f"{path.stem}_semantic.ply")
+        semantic.write_bytes(semantic.read_bytes().replace(b"int object_id", b"int something"))
         with pytest.raises(FileError, match="faces without the property 'object_id'"):
             load(path)
-        labels.write_bytes(labels.read_bytes()[:-5])
+        semantic.write_bytes(semantic.read_bytes()[:-5])
         with pytest.raises(FileError, match="truncated"):
             load(path)
 
@@ -194,7 +215,7 @@ needs_decoder = pytest.mark.skipif(not basis.has_decoder(), reason="opengl_basis
 @needs_decoder
 class TestHm3d:
     @pytest.mark.parametrize("how", ["texture", "vertex colours"])
-    def test_every_object_is_where_the_labels_say(self, tmp_path: Path, how: str) -> None:
+    def test_every_object_is_where_the_labels_say(self, tmp_path: Path, how: str, fine: None) -> None:
         scene = load(files.write_hm3d(tmp_path, how=how))
         files.write_ply(tmp_path / "labels.ply", 0.9, colors=False)
         truth = cast(tmp_path / "labels.ply", (64, 128))
@@ -358,7 +379,7 @@ def test_specs_name_the_scans_of_a_folder(tmp_path: Path) -> None:
 
 @needs_decoder
 def test_a_scan_without_its_textures_stops_a_run_unless_allowed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: None
 ) -> None:
     path = files.write_hm3d(tmp_path)
     path.write_bytes(files.basis_glb([(files.DATA / "wall_etc1s.basis").read_bytes(), b"none"]).bytes())
@@ -500,15 +521,36 @@ def test_verify_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["scenes", "verify", f"mp3d:{tmp_path / 'all' / 'whole'}"]) == 0
 
 
-def test_active_recognition_refuses_a_scan_without_labels(tmp_path: Path) -> None:
+def test_targets_of_published_episodes_are_objects_of_the_scan(tmp_path: Path, in_process: None) -> None:
     path = files.write_matterport(tmp_path)
-    labels = path.with_name(f"{path.stem}_semantic.ply")
+    item = {
+        "scene_id": f"/home/authors/scene_datasets/mp3d/{path.stem}/{path.name}",
+        "episode_id": 0,
+        "start_position": [4.6, 0.0, -3.2],
+        "start_rotation": [1.0, 0.0, 0.0, 0.0],
+        "target_id": files.TABLE,
+        "target_categrory": "table",
+        "difficulty": 1,
+    }
+    episodes = tmp_path / "episodes_AR.json.gz"
+    episodes.write_bytes(gzip.compress(json.dumps({"episodes": [item]}).encode()))
+    task = AR(episode_file=episodes, scene_folder=tmp_path)
+    episode = task.episode(0)
+    assert np.allclose(episode.goal_position, [5.6, 0.375, -1.9], atol=0.05)
+    mask = task.environment().begin(episode).target.mask
+    columns = (np.flatnonzero(mask.any(axis=0)) + 0.5) / mask.shape[1]  # of a panorama; its middle is ahead, -Z
+    assert np.allclose(columns.mean(), 0.5 + np.arctan2(1.0, -1.3) / (2 * np.pi), atol=0.02)
+
+
+def test_active_recognition_refuses_a_scan_without_labels(tmp_path: Path, in_process: None) -> None:
+    path = files.write_matterport(tmp_path)
+    semantic = path.with_name(f"{path.stem}_semantic.ply")
     assert np.allclose(centre_of(world(str(path)), files.BED, "here")[[0, 2]], [1.2, -0.95], atol=0.1)
     with pytest.raises(ArgumentError, match="here: target 6 has no surface"):
         centre_of(world(str(path)), files.LAMP, "here")
     bare = path.rename(path.with_name("bare.glb"))
     path.with_suffix(".house").rename(bare.with_suffix(".house"))
-    labels.unlink()
+    semantic.unlink()
     with pytest.raises(ArgumentError, match=r"here: .*bare\.glb has no labels"):
         centre_of(world(str(bare)), 1, "here")
 

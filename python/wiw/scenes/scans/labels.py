@@ -85,11 +85,11 @@ def _parts(count: int) -> NDArray[np.float32]:
     return np.concatenate([1 - corners.sum(axis=-1, keepdims=True), corners], axis=-1).astype(np.float32)
 
 
-def _count_parts(corners: NDArray[np.float32], spacing: float, path: object) -> NDArray[np.int64]:
+def _count_parts(corners: NDArray[np.float32], path: object) -> NDArray[np.int64]:
     """Return into how many parts, int64 [T], the edges of triangles [T, 3, 3] are cut."""
     edges = (corners - np.roll(corners, 1, axis=1)).astype(np.float64)
     longest = np.linalg.norm(edges, axis=-1).max(axis=1)
-    counts = np.ceil(longest / spacing).clip(1, _MOST_PARTS).astype(np.int64)
+    counts = np.ceil(longest / SPACING).clip(1, _MOST_PARTS).astype(np.int64)
     if (counts**2).sum() > MOST_SAMPLES:
         raise FileError(
             f"{path}: its surface is too large to be labelled: {longest.max():.0f} m along an edge (damaged?)"
@@ -106,8 +106,8 @@ def _groups(counts: NDArray[np.int64]) -> Iterator[tuple[int, NDArray[np.int64]]
             yield int(count), members[start : start + size]
 
 
-def sample(surface: Surface, path: object, spacing: float = SPACING) -> Samples:
-    """Return points on a surface: centres of parts of its triangles, none longer than `spacing`.
+def sample(surface: Surface, path: object) -> Samples:
+    """Return points on a surface: centres of parts of its triangles, none longer than `SPACING`.
 
     Raises:
         FileError: the surface is too large; names `path`.
@@ -115,7 +115,7 @@ def sample(surface: Surface, path: object, spacing: float = SPACING) -> Samples:
     if not (np.abs(surface.vertices) <= FARTHEST).all():
         raise FileError(f"{path}: a vertex lies more than {FARTHEST:.0f} m from the origin (damaged file?)")
     triangles, weights = [], []
-    for count, members in _groups(_count_parts(surface.corners(), spacing, path)):
+    for count, members in _groups(_count_parts(surface.corners(), path)):
         triangles.append(np.repeat(members, count**2))
         weights.append(np.tile(_parts(count).mean(axis=1), (len(members), 1)))
     return Samples(np.concatenate(triangles), np.concatenate(weights))
@@ -162,7 +162,7 @@ def transfer_labels(surface: Surface, labelled: LabelledSurface, path: object) -
     while len(triangles):
         places = np.einsum("pij,pjx->pix", corners, surface.corners()[triangles])
         labels, agreed = np.empty(len(triangles), np.int64), np.empty(len(triangles), bool)
-        for count, members in _groups(_count_parts(places, SPACING, path)):
+        for count, members in _groups(_count_parts(places, path)):
             points = np.einsum("pc,tcx->tpx", _parts(count).mean(axis=1), places[members])
             facing = np.repeat(normals[triangles[members]], count**2, axis=0)
             found = labelled.find(points.reshape(-1, 3), facing).reshape(len(members), -1)
