@@ -28,7 +28,7 @@ FARTHEST = 1e7
 """Metres from the origin; beyond, a file is damaged."""
 MOST_SAMPLES = 50_000_000
 _MOST_PARTS = 400
-"""Along the edge of one triangle; those longer than 20 m, which no room has, are sampled more coarsely."""
+"""Along the edge of one triangle: 20 m. Longer ones, which no room has, are sampled once and never cut."""
 _CHUNK = 1 << 20
 
 
@@ -89,7 +89,8 @@ def _count_parts(corners: NDArray[np.float32], path: object) -> NDArray[np.int64
     """Return into how many parts, int64 [T], the edges of triangles [T, 3, 3] are cut."""
     edges = (corners - np.roll(corners, 1, axis=1)).astype(np.float64)
     longest = np.linalg.norm(edges, axis=-1).max(axis=1)
-    counts = np.ceil(longest / SPACING).clip(1, _MOST_PARTS).astype(np.int64)
+    parts = np.ceil(longest / SPACING)
+    counts = np.where(parts > _MOST_PARTS, 1, parts.clip(1, _MOST_PARTS)).astype(np.int64)
     if (counts**2).sum() > MOST_SAMPLES:
         raise FileError(
             f"{path}: its surface is too large to be labelled: {longest.max():.0f} m along an edge (damaged?)"
