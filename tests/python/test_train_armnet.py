@@ -231,6 +231,6 @@ def test_the_command_refuses_what_it_has_no_use_for(tmp_path: Path, capsys: pyte
     for count in ("0", "-5"):
         assert main(["train", "armnet", *out, "--plays", count]) == 2
         assert f"--plays: expected 1 or more, got {count}" in capsys.readouterr().err
-    for flag in ("--scenes", "--val"):
+    for flag, said in (("--scenes", "does not train on scenes"), ("--val", "is not measured on scenes")):
         assert main(["train", "armnet", *out, flag, "apartments:train:1"]) == 2
-        assert f"{flag}: armnet does not train on scenes" in capsys.readouterr().err
+        assert f"{flag}: armnet {said}" in capsys.readouterr().err

@@ -118,11 +118,11 @@ def train(
     $ wiw train nwm-action --data data --out runs/nwm
     $ wiw train svd-action --data demos --out runs/svd-arm
 
-    First the training data is prepared from scenes or plays and cached, so that an interrupted command does not prepare
-    it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours, pocket two to
-    three hours, diffuser a night; less with --minutes, or with --option clips=N for pocket. An interrupted training of
-    perception, pocket, armnet, diffuser or a video model resumes from its checkpoint beside FILE; repeat the command.
-    pocket and video models also write it at SIGUSR1.
+    First the training data is prepared from scenes or plays and cached, so that an interrupted command does not
+    prepare it again. Training then takes 15 to 30 minutes on two idle cores; perception takes one to two hours,
+    pocket takes two to three hours, diffuser takes a night; less with --minutes, or with --option clips=N for
+    pocket. An interrupted training of perception, pocket, armnet, diffuser or a video model resumes from its
+    checkpoint beside FILE; repeat the command. pocket and video models also write it at SIGUSR1.
 
     The file also holds the recipe and the figures on held-out data: for recogniser, accuracy and calibration error on
     one half of the val scenes, after calibration on the other half; for warpnet, PSNR and SSIM on the val scenes,
