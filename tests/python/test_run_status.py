@@ -58,6 +58,17 @@ def test_shards_episodes_errors_and_shards_without_a_store(tmp_path, capsys):
         wiw.status(tmp_path / "nothing")
 
 
+def test_runs_that_share_a_folder_are_added_up(tmp_path, capsys):
+    begin(tmp_path / "runs/a")
+    begin(tmp_path / "runs/b", shard="1/2")
+    begin(tmp_path / "runs/c", shard="1/2")  # the same shard again
+    for folder, ended in (("runs", 12), ("runs/a", 6), ("runs/b", 3)):
+        assert wiw.status(tmp_path / folder).ended == ended
+    assert wiw.status(tmp_path / "runs").total == 12 and wiw.status(tmp_path / "runs/b").total == 6
+    assert wiw.status(tmp_path / "runs").missing == ()
+    assert main(["status"]) == 2 and "expected at least one run" in capsys.readouterr().err
+
+
 def test_time_left_follows_from_the_present_process(tmp_path):
     begin(tmp_path / "run")
     with RunStore.resume(tmp_path / "run") as store:

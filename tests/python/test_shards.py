@@ -162,6 +162,20 @@ def test_stores_of_unlike_runs_are_refused_and_the_difference_is_named(tmp_path,
     assert not (tmp_path / "merged").exists()
 
 
+def test_unlike_agents_are_refused_though_the_first_store_has_not_begun_that_arm(tmp_path):
+    parts = run_shards(tmp_path, 3)
+    edit(parts[0], "UPDATE run SET info = json_remove(info, '$.built.none')")
+    assert wiw.merge(parts, tmp_path / "merged").complete
+    edit(parts[2], "UPDATE run SET info = json_set(info, '$.built.none.weights', 'others')")
+    with pytest.raises(StoreError, match=r"2 and .*3 had unlike agents: agent none.weights: \"absent\" and \"others\""):
+        wiw.merge(parts, tmp_path / "again")
+
+
+def test_a_merge_of_nothing_is_refused(tmp_path, capsys):
+    assert main(["merge", "--out", str(tmp_path / "merged")]) == 2
+    assert "expected at least one run" in capsys.readouterr().err and not (tmp_path / "merged").exists()
+
+
 def edit(run, statement):
     with closing(sqlite3.connect(store_path(run))) as store, store:
         assert store.execute(statement).rowcount == 1

@@ -10,9 +10,10 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from wiw.cli.terminal import printable
+from wiw.errors import ArgumentError
 
 
-def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN")]], /) -> int:
+def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN [RUN ...]")]], /) -> int:
     """Show how far runs are: shards, ended episodes, errors, time left. Only reads, also while runs are going on.
 
     $ wiw status runs/first
@@ -24,6 +25,8 @@ def status(runs: Positional[Annotated[tuple[Path, ...], arg(metavar="RUN")]], /)
     Args:
         runs: Folders of runs, or folders that hold the folders of shards.
     """
+    if not runs:
+        raise ArgumentError("status: expected at least one run, as in `wiw status runs/first`; got none")
     print("\n\n".join(printable(_describe(run)) for run in runs))
     return 0
 

@@ -126,11 +126,13 @@ def require_equal_manifests(stores: Sequence[RunStore]) -> None:
                 f"{first.path.parent} and {other.path.parent} are not of the same run: {place}: "
                 f"{_show(here)} and {_show(there)}; expected stores of one command that differ in --shard alone"
             )
-        built, built_there = first.info.get("built", {}), other.info.get("built", {})
-        for arm in built.keys() & built_there.keys():
-            for place, here, there in _compare(built[arm], built_there[arm], f"agent {arm}"):
+    known: dict[str, tuple[Path, Any]] = {}  # by arm: a store has built the agents of those that it has begun
+    for store in stores:
+        for arm, agent in store.info.get("built", {}).items():
+            folder, own = known.setdefault(arm, (store.path.parent, agent))
+            for place, here, there in _compare(own, agent, f"agent {arm}"):
                 raise StoreError(
-                    f"{first.path.parent} and {other.path.parent} had unlike agents: {place}: {_show(here)} and "
+                    f"{folder} and {store.path.parent} had unlike agents: {place}: {_show(here)} and "
                     f"{_show(there)}; expected the same weights and options everywhere"
                 )
 

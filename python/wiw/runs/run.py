@@ -87,8 +87,11 @@ def find_stores(runs: Sequence[str | Path]) -> list[Path]:
     """Return the folders with a store, each once: those given, and of folders without one those right inside.
 
     Raises:
+        ArgumentError: no folder is given.
         StoreError: neither a folder nor those inside have a store.
     """
+    if not runs:
+        raise ArgumentError("expected at least one run: a folder with a store, or with folders of shards; got none")
     found = [store for run in runs for store in _stores_of(Path(run).expanduser())]
     return list({store.resolve(): store for store in reversed(found)}.values())[::-1]
 

@@ -59,18 +59,27 @@ class RunStatus:
 
     @property
     def total(self) -> int:
-        """Episodes of all arms of the whole run, those included whose shards have no store yet."""
-        return max(store.of_run for store in self.stores)
+        """Episodes of all arms of the whole run, those included whose shards have no store yet; of several runs in
+        one folder, of all of them."""
+        if self._are_shards:
+            return max(store.of_run for store in self.stores)
+        return sum(store.total for store in self.stores)
 
     @property
     def missing(self) -> tuple[Shard, ...]:
         """Shards that have no store yet."""
-        shards = [store.shard for store in self.stores if store.shard is not None]
-        counts = {shard.count for shard in shards}
-        if len(shards) < len(self.stores) or len(counts) != 1:
+        if not self._are_shards:
             return ()
-        (count,) = counts
+        shards = {store.shard for store in self.stores}
+        (count,) = {shard.count for shard in shards if shard is not None}
         return tuple(shard for number in range(1, count + 1) if (shard := Shard(number, count)) not in shards)
+
+    @property
+    def _are_shards(self) -> bool:
+        """Whether the stores are different shards of one run, rather than runs that share a folder."""
+        shards = {store.shard for store in self.stores}
+        runs = {(store.of_run, store.shard and store.shard.count) for store in self.stores}
+        return None not in shards and len(shards) == len(self.stores) and len(runs) == 1
 
     @property
     def seconds_left(self) -> float | None:
