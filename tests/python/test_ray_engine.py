@@ -8,7 +8,9 @@ import signal
 import subprocess
 import sys
 import time
+from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from fakes import LineAgent, LineTask
@@ -16,11 +18,14 @@ from fakes import LineAgent, LineTask
 from wiw.cli import main
 from wiw.errors import ArgumentError, ContractError, DependencyError, InfrastructureError
 from wiw.runs import ray_engine
-from wiw.runs.config import RunConfig
+from wiw.runs.config import EngineConfig, RunConfig
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
+from wiw.runs.rows import OutcomeRow
 from wiw.runs.store import store_path
+from wiw.runs.workers import Job
 from wiw.studies.evaluate import evaluate, resume_run, run_arms
 from wiw.studies.run_log import load_run
+from wiw.types import EpisodeResult
 
 TASK = f"{Path(__file__).with_name('fakes.py')}:line_task"
 
@@ -67,6 +72,46 @@ def test_a_lost_actor_costs_the_episodes_in_flight_and_nothing_else(ray, referen
     """Its process is killed at decision 1 of episode 6, once."""
     run_line(tmp_path / "run", kill=(6,), marker=str(tmp_path / "marker")).close()
     assert facts(tmp_path / "run") == reference
+
+
+class ActorInThisProcess:
+    """An actor that is lost after the first row of a job of three episodes."""
+
+    def __init__(self, spec, threads):
+        self.jobs = []
+        self.prepare = SimpleNamespace(remote=lambda: "started")
+        self.run = SimpleNamespace(options=lambda **options: SimpleNamespace(remote=self.start))
+
+    def start(self, job):
+        self.jobs.append(job)
+        for index, episode in job.episodes:
+            yield OutcomeRow(job.arm, EpisodeResult(index, episode.episode_id, episode.scene, "done"))
+            if len(job.episodes) == 3:
+                yield RuntimeError("lost")
+
+
+def test_actors_without_work_take_that_of_a_lost_one(monkeypatch):
+    def get(row):
+        if isinstance(row, RuntimeError):
+            raise row
+        return row
+
+    made, rows = [], []
+    played = SimpleNamespace(
+        remote=lambda **options: (
+            lambda kind: SimpleNamespace(remote=lambda *given: made.append(kind(*given)) or made[-1])
+        ),
+        wait=lambda waiting, timeout: (waiting, []),
+        get=get,
+        exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
+    )
+    monkeypatch.setattr(ray_engine, "EpisodeActor", ActorInThisProcess)
+    episodes = list(enumerate(LineTask().episodes(4)))
+    jobs = deque([Job("none", tuple(episodes[:1])), Job("none", tuple(episodes[1:]))])
+    receiver = SimpleNamespace(write=rows.append, discard=lambda arm, lost: None)
+    ray_engine._ActorPool(played, b"", jobs, receiver, 2, EngineConfig(engine="ray")).run()
+    assert sorted(row.result.episode for row in rows) == [0, 1, 2, 3]
+    assert [len(actor.jobs) for actor in made] == [2, 1, 1]  # the first, the lost one, and the one in its place
 
 
 def test_an_episode_that_kills_every_actor_is_an_error_after_three_tries(ray, tmp_path):
@@ -146,6 +191,9 @@ def count_ended(out):
 def test_without_ray_or_a_cluster_it_is_said(tmp_path, monkeypatch):
     with pytest.raises(ArgumentError, match="give --engine ray"):
         RunConfig(address="auto")
+    evaluate(TaskRecipe(TASK), AgentRecipe("heuristic"), 1, out=tmp_path / "here", progress=False).close()
+    with pytest.raises(ArgumentError, match="resume: address is for engine ray"):
+        resume_run(tmp_path / "here", engine={"address": "auto"})
     with pytest.raises(ArgumentError, match="worker_gpus of at least 0"):
         RunConfig(engine="ray", worker_gpus=-1)
     monkeypatch.setitem(sys.modules, "ray", None)

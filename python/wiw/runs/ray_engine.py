@@ -114,6 +114,9 @@ class _ActorPool:
 
     def run(self) -> None:
         while self._jobs or any(lease.job for lease in self._leases):
+            for lease in self._leases:
+                if lease.rows is None and self._jobs:  # had nothing to do until another one was lost
+                    self._assign(lease)
             while len(self._leases) < self._size and self._jobs:
                 self._leases.append(self._start())
             ready, _ = self._ray.wait([lease.rows for lease in self._leases if lease.rows], timeout=START_SECONDS)

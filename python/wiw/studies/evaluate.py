@@ -11,7 +11,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from wiw.errors import Error, StoreError
+from wiw.errors import ArgumentError, Error, StoreError
 from wiw.loop.limits import Limits
 from wiw.metrics import Lpips
 from wiw.runs.config import EngineConfig, ResumeConfig, RunConfig, read_resume_settings, take_settings
@@ -117,9 +117,13 @@ def resume_run(
     """
     if workers is not None:
         RunConfig(workers=workers)  # its numbers are checked there
+    given = {} if engine is None else engine
     changes = read_resume_settings(settings).to_json()
     store = RunStore.resume(run, scratch=scratch)
     try:
+        place = EngineConfig(**{**store.info.get("engine", {}), **given})
+        if place.engine != "ray" and given.get("address") is not None:
+            raise ArgumentError("resume: address is for engine ray: give --engine ray (engine=) as well")
         if "attributes" in store.config:
             own, whole = store.path.parent, store.path.parent.parent
             raise StoreError(f"{own} holds the reruns of `wiw blame {whole}`; resume them by that command")
@@ -132,7 +136,6 @@ def resume_run(
         raise
     require_left(built, store, agents, retry_errors)
     store.change_settings(changes)
-    place = EngineConfig(**{**store.info.get("engine", {}), **({} if engine is None else engine)})
     workers = workers or store.info["workers"]
     return _finish(store, task, agents, workers, progress, place, retry_errors=retry_errors)
 
