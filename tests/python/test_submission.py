@@ -98,8 +98,9 @@ def test_jobs_run_are_shown_and_merged(tmp_path, capsys):
     assert "6/6" in shown and f"job {read_jobs(out)[0].id}  ENDED" in shown and "1/2" in shown
     assert main(["merge", str(out), "--out", str(out)]) == 0
     assert load_run(out).complete and wiw.verify(out).same
-    assert submit(out) == 0  # nothing is left
-    assert len(read_jobs(out)) == 2 and "wiw run" not in capsys.readouterr().out.partition("2 stores")[2]
+    assert submit(out) == 0
+    shown = capsys.readouterr().out.partition("2 stores")[2]
+    assert len(read_jobs(out)) == 2 and "wiw run" not in shown and "there is nothing to submit" in shown
     with pytest.raises(ArgumentError, match="was submitted with other flags"):
         raise_from_main(out, "--seed", 4)
 
@@ -276,3 +277,14 @@ def test_an_array_of_slurm_jobs(tmp_path, slurm, capsys):
     assert wiw.merge([out], out).complete and wiw.verify(out).same
     assert main(["cancel", str(out)]) == 0 and (slurm / "cancelled").read_text() == "70"
     assert "job 70_0" in json.dumps(main(["status", str(out)]) or capsys.readouterr().out)
+
+
+def test_shards_of_which_slurm_says_nothing_are_not_submitted_twice(tmp_path, slurm):
+    (slurm / "sacct").write_text("#!/bin/sh\necho 'JobID|State|NodeList'\n")  # as for a new job
+    submitit.SlurmJob.watcher.clear()
+    out = tmp_path / "run"
+    assert submit(out, cluster="slurm", scenes="slow") == 0
+    with pytest.raises(ArgumentError, match=r"job 70_0 of .* is UNKNOWN, and 2 in all; .* remove .*jobs.json"):
+        submit(out, "--debug", cluster="slurm", scenes="slow")
+    wait_for(lambda: len(list(out.glob("*/run.sqlite"))) == 2 and wiw.status(out).ended == 6)
+    submitit.SlurmJob.watcher.clear()

@@ -17,7 +17,7 @@ from wiw.errors import ArgumentError
 from wiw.loop.config import AgentConfig
 from wiw.runs.config import RunConfig
 from wiw.runs.shards import Shard
-from wiw.runs.submission import ClusterConfig
+from wiw.runs.submission import FILE_NAME, ClusterConfig, SubmittedJob
 
 CLUSTER = ClusterConfig()
 SERVERS = "servers"
@@ -95,6 +95,8 @@ def submit(
         begun = submit_commands(folder, absent, own, f"{name}-server") if absent else []
         submitted = submit_commands(folder, left, jobs, name, begun)
         print(f"\njobs    {submitted[0].id} to {submitted[-1].id}, output in {folder / 'jobs'}")
+    if not left:
+        print("all shards have ended: there is nothing to submit")
     print(f"then    wiw status {folder}\n        wiw merge {folder} --out {folder}")
     return 0
 
@@ -148,9 +150,16 @@ def _require_alone(folder: Path, commands: list[list[str]]) -> set[tuple[str, ..
     if shards := [job for job in active if job.arguments[0] == "run"]:
         raise ArgumentError(
             f"submit: job {shards[0].id} of {folder} is {shards[0].state}, and {len(shards)} in all; wait for them, or "
-            f"`wiw cancel {folder}` first"
+            f"`wiw cancel {folder}` first{_explain_unknown(shards[0], folder)}"
         )
     return {job.arguments for job in active}
+
+
+def _explain_unknown(job: SubmittedJob, folder: Path) -> str:
+    """Return the way out where the cluster no longer says, or never did, what became of a job."""
+    if not job.state.startswith("UNKNOWN"):
+        return ""
+    return f"; if it says so for good and they have ended (see squeue), remove {folder / FILE_NAME}"
 
 
 def _write_servers(folder: Path, parts: AgentFlags, count: int, cluster: str) -> list[list[str]]:

@@ -35,8 +35,10 @@ PATIENCE = 45.0
 FILE_NAME = "jobs.json"
 LOGS = "jobs"
 """Folder in that of the run with submitit's files and the output of jobs."""
-ACTIVE = frozenset({"PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY"})
-"""States of jobs that wait or run."""
+ACTIVE = frozenset(
+    {"PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY", "UNKNOWN"}
+)
+"""States of jobs that wait or run, or may: of a new job `sacct` knows nothing for some seconds."""
 FINISHED = (0, 1)
 """Exit codes of a command that is not to be run again: done, or done with an invalid run."""
 
@@ -236,12 +238,12 @@ def find_states(run: str | Path) -> list[SubmittedJob]:
 
 
 def find_active(run: str | Path) -> list[SubmittedJob]:
-    """Return the jobs of a run that wait or run, as the cluster says.
+    """Return the jobs of a run that wait or run, as the cluster says, and those of which it says nothing.
 
     Raises:
         StoreError: the list of jobs is damaged.
     """
-    return [job for job in find_states(run) if job.state in ACTIVE]
+    return [job for job in find_states(run) if job.state.partition(" ")[0] in ACTIVE]
 
 
 def cancel(run: str | Path) -> list[SubmittedJob]:
@@ -292,7 +294,7 @@ def _find_state(folder: Path, job: SubmittedJob) -> str:
     try:
         return str(_import_submitit().SlurmJob(folder / LOGS, job.id).state)
     except (DependencyError, OSError) as error:
-        return f"unknown ({error})"
+        return f"UNKNOWN ({error})"
 
 
 def _end_controller(process: str) -> bool:
