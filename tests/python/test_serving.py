@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import os
 import pickle
 import resource
 import shutil
@@ -457,6 +458,17 @@ def test_servers_are_found_where_they_announce_themselves_and_the_next_when_one_
         assert np.array_equal(ask(model), expected)
         assert pickle.loads(pickle.dumps(model)).accepts == model.accepts
     model.close()
+
+
+def test_an_announcement_left_behind_is_passed_over_though_another_server_listens_there(tmp_path, monkeypatch):
+    """It was killed, and a server with another token has its port."""
+    with serve_in_background(Plain(), token="own") as server:
+        (tmp_path / "0.json").write_text(f'{{"address": "{server.address}", "token": "of the killed one"}}')
+        monkeypatch.setattr(os, "getpid", lambda: 0)  # begins with the first
+        with pytest.raises(RemoteError, match="401"):
+            wiw.world_model(f"remote:{tmp_path}", patience=0.5)
+        (tmp_path / "1.json").write_text(f'{{"address": "{server.address}", "token": "own"}}')
+        wiw.world_model(f"remote:{tmp_path}").close()
 
 
 def test_a_client_that_was_closed_says_so_at_once():

@@ -194,9 +194,9 @@ class Link:
             except RemoteError as error:
                 self._fail_all(error)
             except InvalidStatus as error:
-                if error.response.status_code in (401, 403):
+                if error.response.status_code in (401, 403) and self._given.address == self.address:
                     self._fail_all(RemoteError(f"{self.address} wants another token: set WIW_TOKEN to it", "token"))
-                self.last_error = str(error)
+                self.last_error = f"{self.address}: {error}"
             except Exception as error:  # whatever it is, those who ask wait no longer than their deadlines
                 self.last_error = f"{type(error).__name__}: {error}"
             if not self._open and self._welcome.done():
