@@ -90,22 +90,23 @@ class ActorInThisProcess:
                 yield RuntimeError("lost")
 
 
-def test_actors_without_work_take_that_of_a_lost_one(monkeypatch):
+def test_actors_without_work_take_that_of_a_lost_one():
     def get(row):
         if isinstance(row, RuntimeError):
             raise row
         return row
 
+    def start(*given):
+        made.append(ActorInThisProcess(*given))
+        return made[-1]
+
     made, rows = [], []
     played = SimpleNamespace(
-        remote=lambda **options: (
-            lambda kind: SimpleNamespace(remote=lambda *given: made.append(kind(*given)) or made[-1])
-        ),
+        remote=lambda **options: lambda kind: SimpleNamespace(remote=start),
         wait=lambda waiting, timeout: (waiting, []),
         get=get,
         exceptions=SimpleNamespace(RayActorError=RuntimeError, RayTaskError=KeyError),
     )
-    monkeypatch.setattr(ray_engine, "EpisodeActor", ActorInThisProcess)
     episodes = list(enumerate(LineTask().episodes(4)))
     jobs = deque([Job("none", tuple(episodes[:1])), Job("none", tuple(episodes[1:]))])
     receiver = SimpleNamespace(write=rows.append, discard=lambda arm, lost: None)

@@ -54,7 +54,8 @@ def submit(
 
     Prints the command of each job, which a person can run by hand. A job writes its store on the node's own disk and
     copies it to a folder in --out, which all nodes must see. Before the time limit, or when it is preempted, a job
-    stops, everything recorded, and is requeued. After a failure the same command submits what is left.
+    stops, everything recorded, and is requeued. After a failure the same command, with the same --out, submits what is
+    left.
 
     Args:
         task: See `wiw list`.

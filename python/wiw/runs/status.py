@@ -60,7 +60,8 @@ class RunStatus:
     @property
     def total(self) -> int:
         """Episodes of all arms of the whole run, those included whose shards have no store yet; of several runs in
-        one folder, of all of them."""
+        one folder, of all of them.
+        """
         if self._are_shards:
             return max(store.of_run for store in self.stores)
         return sum(store.total for store in self.stores)

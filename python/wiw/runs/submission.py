@@ -36,7 +36,10 @@ FILE_NAME = "jobs.json"
 LOGS = "jobs"
 """Folder in that of the run with submitit's files and the output of jobs."""
 ACTIVE = frozenset(
-    {"PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY", "UNKNOWN"}
+    (
+        *("PENDING", "CONFIGURING", "RUNNING", "SUSPENDED", "REQUEUED", "RESIZING", "COMPLETING", "READY"),
+        "UNKNOWN",
+    )
 )
 """States of jobs that wait or run, or may: of a new job `sacct` knows nothing for some seconds."""
 FINISHED = (0, 1)
