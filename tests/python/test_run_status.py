@@ -69,6 +69,20 @@ def test_runs_that_share_a_folder_are_added_up(tmp_path, capsys):
     assert main(["status"]) == 2 and "expected at least one run" in capsys.readouterr().err
 
 
+def test_a_shard_that_is_being_created_has_no_store_yet(tmp_path):
+    begin(tmp_path / "run/1", shard="1/3")
+    for number, statement in ((2, ""), (3, "PRAGMA journal_mode = WAL")):
+        (tmp_path / f"run/{number}").mkdir()
+        with closing(sqlite3.connect(store_path(tmp_path / f"run/{number}"))) as file:
+            file.execute(statement)
+        store_path(tmp_path / f"run/{number}").touch()
+    assert [str(shard) for shard in wiw.status(tmp_path / "run").missing] == ["2/3", "3/3"]
+    assert wiw.merge([tmp_path / "run"], tmp_path / "merged").pending == {"none": 4}
+    store_path(tmp_path / "run/3").write_bytes(b"no store at all " * 300)
+    with pytest.raises(StoreError, match="run/3"):
+        wiw.status(tmp_path / "run")
+
+
 def test_time_left_follows_from_the_present_process(tmp_path):
     begin(tmp_path / "run")
     with RunStore.resume(tmp_path / "run") as store:

@@ -86,6 +86,8 @@ class Run:
 def find_stores(runs: Sequence[str | Path]) -> list[Path]:
     """Return the folders with a store, each once: those given, and of folders without one those right inside.
 
+    Stores inside that are being created, or whose creation was cut off, are left out.
+
     Raises:
         ArgumentError: no folder is given.
         StoreError: neither a folder nor those inside have a store.
@@ -100,7 +102,7 @@ def _stores_of(run: Path) -> Iterator[Path]:
     if store_path(run).is_file():
         yield run
         return
-    inside = sorted(path.parent for path in run.glob(f"*/{FILE_NAME}"))
+    inside = sorted(path.parent for path in run.glob(f"*/{FILE_NAME}") if RunStore.can_be_read(path.parent))
     if not inside:
         raise StoreError(f"no run at {run}: expected a folder with {FILE_NAME} in it, or with folders of shards")
     yield from inside

@@ -134,6 +134,16 @@ class RunStore:
         path = store_path(run)
         return path.exists() and (find_network(path) is not None or not _blank(path))
 
+    @staticmethod
+    def can_be_read(run: str | Path) -> bool:
+        """Return whether a run is there, rather than nothing or a creation that goes on or was cut off; only reads.
+
+        Raises:
+            StoreError: the file is damaged.
+        """
+        path = store_path(run)
+        return path.is_file() and not _blank(path, writing=False)
+
     @classmethod
     def resume(
         cls, run: str | Path, config: dict[str, Any] | None = None, scratch: str | Path | None = None
@@ -769,10 +779,13 @@ def _has_log(path: Path) -> bool:
     return log.exists() and log.stat().st_size > 0
 
 
-def _blank(path: Path) -> bool:
-    """Return whether a creation was cut off before anything was written: the schema and the run are one transaction."""
+def _blank(path: Path, writing: bool = True) -> bool:
+    """Return whether a creation was cut off before anything was written: the schema and the run are one transaction.
+
+    One that was cut off with a log may need a writer, who takes that in.
+    """
     with explain_faults(path):
-        connection = _open_file(path, writing=True)  # also where it was cut off with a log that only a writer takes in
+        connection = _open_file(path, writing)
         (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
         connection.close()
     return bool(tables == 0)
