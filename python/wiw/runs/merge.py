@@ -85,6 +85,7 @@ def merge(stores: Sequence[str | Path], out: str | Path, scratch: str | Path | N
         scratch: folder on a local disk in which it is written; the system's for temporary files if not given.
 
     Raises:
+        ArgumentError: no folder is given.
         StoreError: no store; manifests that differ, naming the difference; unlike records of an episode for which equal
             ones are promised; `out` holds a run already.
         FileError: `out` cannot be written.

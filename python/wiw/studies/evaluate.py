@@ -109,7 +109,7 @@ def resume_run(
         settings: any of `ResumeConfig`'s (live, deadline, cache, cache_gb), from now on in place of the run's own.
 
     Raises:
-        ArgumentError: a number out of range, or a setting that is fixed once a run is begun.
+        ArgumentError: a number out of range, a setting that is fixed once a run is begun, or an address without Ray.
         StoreError: see `RunStore.resume`; also when the run was begun with objects that exist only in memory, or when
             its preset's file or the source file of a model, policy or task of the user's own has changed, or the
             navigation mesh beside a scene has come or gone.
