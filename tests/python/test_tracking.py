@@ -285,6 +285,15 @@ def test_front_views_are_led_up_to_from_one_that_faces_the_target(two_rooms: str
     assert (shift > 1).all(), "each view is a turn further"
 
 
+def test_a_target_that_no_front_view_shows_is_lost(two_rooms: str) -> None:
+    observation, _, _ = look(world(two_rooms), (-1.2, 0, -0.2), np.pi / 2, "table")
+    below = np.zeros((576, 1024), bool)
+    below[560:570] = True  # at the agent's feet, under all that a view 90 degrees high shows
+    observation, tracker = replace(observation, target=Target(below, find_box(below, wraps=True), None)), Recorder()
+    track = track_one(tracker, observation, *imagine_nothing(observation, [TURN_LEFT, FORWARD], front=True))
+    assert not tracker.asked and not track.visible.any()
+
+
 def test_the_tracker_of_frames_is_sam2_only_where_its_weights_are(
     tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,8 +91,11 @@ class FrameTracker(Tracker):
         if not len(imagined):
             return known[1:]
         lead = [yaws[-1]] if known[-1].any() else _turn_from(_find_yaw(mask > 0), yaws[-1])
+        masks = np.stack([cut(yaw) for yaw in lead])
+        if not masks[0].any():  # too high, too low or too small for any front view
+            return np.concatenate([known[1:], np.zeros(imagined.shape[:3], bool)])
         views = np.stack([plan(observation.panorama, yaw) for yaw in lead])
-        return np.concatenate([known[1:], self.follow(views, np.stack([cut(yaw) for yaw in lead]), imagined)])
+        return np.concatenate([known[1:], self.follow(views, masks, imagined)])
 
 
 def _get_yaw(pose: NDArray[np.float64]) -> float:
