@@ -156,6 +156,13 @@ def test_recognition_asks_for_category_and_primitive(recognition: Any) -> None:
     assert decision.chosen == 0 and decision.actions[0] == FORWARD and decision.execute == 1
 
 
+@pytest.mark.parametrize("side", [384, 512])
+def test_both_questions_of_recognition_show_the_front_view_in_the_asked_size(recognition: Any, side: int) -> None:
+    client = MockClient(script)
+    decide_in(recognition, VLM(client, view_size=side))
+    assert [[image.shape[:2] for image in images(call)] for call in client.calls] == [[(side, side), (576, 1024)]] * 2
+
+
 def test_recognition_without_a_world_model_is_two_questions(recognition: Any) -> None:
     client = MockClient(
         lambda call: {letter_of(call, "turn right by 22.5 degrees"): 1.0} if len(call.labels) == 3 else script(call)

@@ -435,7 +435,7 @@ class VLM(Policy):
         target = get_target(observation)
         if target.panorama_box is None and target.front_box is None:
             return []
-        front, panorama = prompt_images.render_observation(observation)
+        front, panorama = prompt_images.render_observation(observation, self.view_size)
         return ["Front view:", front, "Panorama:", panorama]
 
     def _build_answer(self, situation: Situation, reply: Reply | None = None) -> Answer:
