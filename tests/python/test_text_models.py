@@ -14,6 +14,7 @@ import pytest
 import wiw
 from wiw import action
 from wiw.action import FORWARD, TURN_LEFT, TURN_RIGHT
+from wiw.cli import main
 from wiw.errors import ArgumentError, FileError, WeightsError
 from wiw.types import Conditioning, Control
 from wiw.world_models.clips import Alignment, frames_after_actions
@@ -371,6 +372,13 @@ def test_the_blind_placebo_is_for_text_models() -> None:
 
     with pytest.raises(ArgumentError, match="expected one with control 'text', got 'trajectory'"):
         BlindPlacebo(wiw.world_model("warp"))
+
+
+def test_a_run_with_a_blind_placebo_of_another_model_is_refused_before_it_begins(tmp_path: Path, capsys) -> None:
+    arguments = ["run", "imagenav", "--arms", "none,placebo-blind", "--episodes", "1", "--out", str(tmp_path / "run")]
+    assert main(arguments) == 2
+    assert "expected one with control 'text', got 'trajectory'" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("words", [True, False])

@@ -113,15 +113,24 @@ class BlindPlacebo(Placebo):
 
     def __init__(self, model: Any) -> None:
         super().__init__(model)
-        if self.accepts.control != "text":
-            raise ArgumentError(
-                "placebo-blind asks a world model with an empty prompt: expected one with control 'text', got "
-                f"'{self.accepts.control}'; placebo-shuffled and placebo-swapped take any"
-            )
+        require_words(self.accepts.control)
 
     def imagine(self, request: Request) -> Imagination:
         """Imagine the plans without their words."""
         return super().imagine(replace(request, wordless=True))
+
+
+def require_words(control: str) -> None:
+    """Require that a world model is told plans in words, which a blind placebo leaves out.
+
+    Raises:
+        ArgumentError: it is not.
+    """
+    if control != "text":
+        raise ArgumentError(
+            "placebo-blind asks a world model with an empty prompt: expected one with control 'text', got "
+            f"'{control}'; placebo-shuffled and placebo-swapped take any"
+        )
 
 
 NO_POSES = "placebo='shuffled' deals primitives anew, and these plans are made of none; use 'swapped'"

@@ -12,7 +12,7 @@ from typing import Any, cast
 from wiw.envs.base import Env
 from wiw.errors import ArgumentError
 from wiw.experiments.counterparts import is_counterpart
-from wiw.experiments.placebos import PLACEBOS
+from wiw.experiments.placebos import PLACEBOS, require_words
 from wiw.loop.agent import Agent
 from wiw.loop.agent_spec import AgentSpec, space_option
 from wiw.loop.base import BaseAgent
@@ -209,6 +209,8 @@ class AgentRecipe(AgentConfig):
             )
         if self.placebo is not None:
             require_placebo(self.placebo, self._find_space(task), episodes)
+        if self.placebo == "blind" and (control := find_control(self.model)):
+            require_words(control)
         parts = ((WORLD_MODELS, self.model), (POLICIES, self.policy), (POLICIES, self.reviser))
         for registry, part in parts:
             found = registry.find(part) if isinstance(part, str) else part
@@ -284,6 +286,12 @@ def _unwrap(part: Any) -> Any:
     """Return the model or policy behind everything that wraps it."""
     model = part.model if isinstance(part, Imaginer) else part
     return model.unwrapped if isinstance(model, Policy | WorldModel) else model
+
+
+def find_control(model: Any) -> str:
+    """Return how a world model, or one of that name, is told plans; empty where only the model itself can say."""
+    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
+    return str(getattr(getattr(found, "accepts", None), "control", ""))
 
 
 def _describe(part: Any) -> Any:
