@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 import wiw
 from wiw.cli import main
 from wiw.errors import ArgumentError
 from wiw.policies.vlm.prompt_images import resize_view
-from wiw.policies.vlm.prompt_import import CARD
+from wiw.policies.vlm.prompt_import import CARD, write_templates
+from wiw.policies.vlm.prompts import Prompts
 from wiw.registry import POLICIES, WORLD_MODELS, task_class
 from wiw.runs.compose import RunContext
 from wiw.runs.departures import EPISODES, find_departures
@@ -41,10 +43,12 @@ def find_topics(task: Any, **agent: Any) -> dict[str, str]:
 
 @pytest.fixture
 def imported(tmp_path: Path) -> dict[str, dict[str, str]]:
-    """Options of policy `vlm` with prompts that were imported."""
-    (tmp_path / "prompts").mkdir()
-    (tmp_path / "prompts" / CARD).touch()
-    return {"vlm": {"prompts": str(tmp_path / "prompts")}}
+    """Options of policy `vlm` with prompts that were imported, of which none is for ImageNav."""
+    folder = tmp_path / "prompts"
+    write_templates(folder, {"ar/planner": "Go on."})
+    card = {"digest": Prompts(folder).digest, "imported": {"ar/planner": "main.tex:1"}}
+    (folder / CARD).write_text(yaml.safe_dump(card))
+    return {"vlm": {"prompts": str(folder)}}
 
 
 # -- what presets set --------------------------------------------------------------------------------------------------
@@ -168,10 +172,31 @@ def test_every_difference_of_a_run_is_found(imported) -> None:
     task = AR("apartments:val", decisions=4)
     found = find_topics(task, model="svd", candidates=7, reviser="matcher", policy_options=vlm)
     assert found["decisions"] == "4 (paper: 10)" and found["candidates"] == "7 (paper: 2)"
-    assert found["tries"] == "9 (paper: 3)" and found["tracker"] == "frames (paper: sam2)"
+    assert found["tries"] == "9 (paper: open)" and found["tracker"] == "frames (paper: sam2)"
     assert found["revision"] == "matcher (paper: vlm)" and "view_size" not in found
     assert find_topics(task, policy="matcher")["policy"] == "matcher (paper: vlm, heuristic)"
     assert find_topics(task, policy_options={"vlm": {"prompts": "minimal"}})["prompts"] == "minimal (paper: its own)"
+
+
+def test_prompts_are_the_papers_only_as_they_were_imported_for_the_task(imported) -> None:
+    folder = Path(imported["vlm"]["prompts"])
+    assert "prompts" not in find_topics(AR("apartments:val"), policy_options=imported)
+    other = find_topics(ImageNav("apartments:val"), policy_options=imported)["prompts"]
+    assert other == f"{folder}, of whose source none is for imagenav (paper: its own)"
+    write_templates(folder, {"ar/planner": "Go on, and look behind doors."})
+    changed = find_topics(AR("apartments:val"), policy_options=imported)["prompts"]
+    assert changed == f"{folder}, changed since they were imported (paper: its own)"
+
+
+def test_fewer_episodes_than_the_papers_are_a_departure(tmp_path: Path, two_rooms: str) -> None:
+    file = tmp_path / "val.json.gz"
+    assert main(["episodes", "imagenav", "--scenes", two_rooms, "--episodes", "2", "--out", str(file)]) == 0
+    tasks, agents = (ImageNav(episode_file=file), Manipulation()), {"arm": AgentRecipe("vlm")}
+    found = [{str(each) for each in find_departures(tasks[0], agents, count)} for count in (1, 144)]
+    assert "episodes 1 of val.json.gz (paper: 144 of HM3D)" in found[0]
+    assert not any(each.startswith("episodes") for each in found[1])
+    assert "episodes 8 (paper: 200 of RLBench)" in {each.short for each in find_departures(tasks[1], agents, 8)}
+    assert "episodes" not in find_topics(tasks[1])
 
 
 def test_the_published_code_departs_by_its_rules_with_reasons() -> None:

@@ -44,8 +44,8 @@ def announce(task: Task, arms: Mapping[str, Any], config: RunConfig) -> None:
     print(file=sys.stderr, flush=True)
 
 
-def announce_protocol(task: Task, arms: Mapping[str, Any]) -> None:
-    """Print what a task's preset sets, and where a run of these arms departs from the paper, with reasons."""
+def announce_protocol(task: Task, arms: Mapping[str, Any], episodes: int) -> None:
+    """Print what a task's preset sets, and where a run of so many episodes departs from the paper, with reasons."""
     from wiw.cli.presets import list_settings
     from wiw.runs.departures import find_departures
     from wiw.tasks.presets import find_owner
@@ -54,7 +54,7 @@ def announce_protocol(task: Task, arms: Mapping[str, Any]) -> None:
         print(f"preset {task.preset}")
         for line in list_settings(find_owner(type(task)), task.preset):
             print(f"  sets {line}")
-    found = find_departures(task, arms)
+    found = find_departures(task, arms, episodes)
     print("departs from the paper" if found else "nothing departs from the paper")
     for departure in found:
         print(f"  {printable(departure)}")

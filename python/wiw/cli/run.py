@@ -61,8 +61,8 @@ def run(
         arms: World models to run on the same episodes, or POLICY+MODEL for one with another policy; --world-model joins
             them if it is not among them. placebo-shuffled and placebo-swapped let it (or warp) imagine as much, but
             other plans, or from elsewhere; placebo-blind asks a text model with an empty prompt; placebo-shuffled:MODEL
-            names another. NAME=MODEL?KEY=VALUE names an arm and
-            gives its model options, several with & between them (in quotes), besides those of --world-model-option.
+            names another. NAME=MODEL?KEY=VALUE names an arm and gives its model options, several with & between them
+            (in quotes), besides those of --world-model-option.
         rules: What it is run on.
         report: Whether to write report.html at the end; none of a shard.
         dry_run: Whether to run nothing, and print what the preset sets and where the run would depart from the paper.
@@ -73,7 +73,7 @@ def run(
 
     made = prepare_run(task, parts, arms, rules, search, config)
     if dry_run:
-        announce_protocol(made.built, made.recipes)
+        announce_protocol(made.built, made.recipes, made.count)
         return 0
     from wiw.studies.evaluate import evaluate  # after the announcement: it takes seconds to load
 

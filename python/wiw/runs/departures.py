@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from wiw.loop.config import AgentConfig
+from wiw.mapping_files import read_yaml_mapping
 from wiw.policies.vlm.prompt_import import CARD
-from wiw.registry import POLICIES, WORLD_MODELS
-from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe
+from wiw.policies.vlm.prompts import DEFAULT, SETS, Prompts
+from wiw.registry import POLICIES
+from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control
 from wiw.tasks import presets
 from wiw.tasks.base import Task
 from wiw.tasks.presets import PAPER, Preset
@@ -33,6 +35,8 @@ POLICY_NAMES = {
 """The paper's base policies."""
 REVISER = "vlm"
 """The paper's revision policy."""
+SILENT = ("temperature", "revision_temperature", "tries")
+"""Options of it that the paper does not name."""
 UNCOUNTED = (*ELSEWHERE, "model", "prompts", "task", "space")
 """Options of policy `vlm` that are no part of the protocol, or are looked at by themselves."""
 
@@ -55,18 +59,23 @@ class Departure:
         return f"{self.short}: {self.reason}" if self.reason else self.short
 
 
-def find_departures(task: Task, agents: Mapping[str, Any]) -> tuple[Departure, ...]:
+def find_departures(task: Task, agents: Mapping[str, Any], episodes: int | None = None) -> tuple[Departure, ...]:
     """Return where a run of these agents departs from the paper; nothing for a task that is none of the paper's.
 
     Args:
         task: as built.
         agents: recipes by arm.
+        episodes: of the run; None means as many as the task has by default.
+
+    Raises:
+        PromptError: a prompt folder that cannot be used.
     """
     if task.name not in EPISODES:
         return ()
     recipes = [recipe for recipe in agents.values() if isinstance(recipe, AgentRecipe)]
     paper = _load_protocol(task, recipes)
-    found = [*_compare_rules(task, paper), *_compare_episodes(task)]
+    count = task.default_episodes if episodes is None else episodes
+    found = [*_compare_rules(task, paper), *_compare_episodes(task, count)]
     found += [Departure("agent", "of another method")] if len(recipes) < len(agents) else []
     for recipe in recipes:
         found += [*_compare_agent(task, recipe), *_compare_vlm(task, recipe, paper)]
@@ -77,9 +86,9 @@ def find_departures(task: Task, agents: Mapping[str, Any]) -> tuple[Departure, .
     return tuple(dict.fromkeys(found))
 
 
-def describe_departures(task: Task, agents: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return the departures for a run's manifest."""
-    return [asdict(departure) for departure in find_departures(task, agents)]
+def describe_departures(task: Task, agents: Mapping[str, Any], episodes: int) -> list[dict[str, str]]:
+    """Return the departures of a run of so many episodes for its manifest."""
+    return [asdict(departure) for departure in find_departures(task, agents, episodes)]
 
 
 def read_departures(manifest: Mapping[str, Any]) -> tuple[Departure, ...]:
@@ -106,13 +115,8 @@ def _list_concerned(recipes: list[AgentRecipe]) -> Iterator[str]:
     models = [recipe.model for recipe in recipes if recipe.model is not None and recipe.model not in REFERENCES]
     if models:
         yield "models"
-    if any(_is_told_words(model) for model in models):
+    if any(find_control(model) == "text" for model in models):
         yield "text models"
-
-
-def _is_told_words(model: Any) -> bool:
-    found = WORLD_MODELS.find(model) if isinstance(model, str) else model
-    return bool(getattr(getattr(found, "accepts", None), "control", "") == "text")
 
 
 def _asks_vlm(recipe: AgentRecipe) -> bool:
@@ -126,15 +130,14 @@ def _compare_rules(task: Task, paper: Preset) -> Iterator[Departure]:
             yield _differ(name, said.get(name), value, reasons)
 
 
-def _compare_episodes(task: Task) -> Iterator[Departure]:
-    count, place = EPISODES[task.name]
+def _compare_episodes(task: Task, count: int) -> Iterator[Departure]:
+    wanted, place = EPISODES[task.name]
     file, scenes = task.describe().get("episode_file"), task.describe().get("scenes")
-    if task.name == "manipulation":
-        return
-    if file is None:
-        yield Departure("episodes", f"generated in {scenes} (paper: {count} of {place})")
-    elif task.default_episodes != count:
-        yield Departure("episodes", f"{task.default_episodes} of {Path(file).name} (paper: {count} of {place})")
+    if file is None and task.name != "manipulation":
+        yield Departure("episodes", f"generated in {scenes} (paper: {wanted} of {place})")
+    elif count != wanted:
+        found = count if file is None else f"{count} of {Path(file).name}"
+        yield Departure("episodes", f"{found} (paper: {wanted} of {place})")
 
 
 def _compare_agent(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
@@ -157,19 +160,28 @@ def _compare_vlm(task: Task, recipe: AgentRecipe, paper: Preset) -> Iterator[Dep
     ours, reasons = recipe.resolve_policy_options("vlm", task), task.departures.get("vlm", {})
     ours |= {"tracker": recipe.tracker} if recipe.tracker else {}
     defaults = _get_vlm_defaults()
-    theirs = {**defaults, **paper.policies.get("vlm", {})}
+    theirs = {**defaults, **dict.fromkeys(SILENT), **paper.policies.get("vlm", {})}
     for name in dict.fromkeys([*paper.policies.get("vlm", {}), *ours]):
-        if name not in UNCOUNTED and (value := ours.get(name, defaults.get(name))) != theirs.get(name):
+        usual = defaults.get(name) if theirs.get(name) is None else theirs[name]
+        if name not in UNCOUNTED and (value := ours.get(name, defaults.get(name))) != usual:
             yield _differ(name, value, theirs.get(name), reasons)
-    yield from _compare_prompts(ours.get("prompts"), reasons.get("prompts", ""))
+    yield from _compare_prompts(ours.get("prompts"), task.name, reasons.get("prompts", ""))
 
 
-def _compare_prompts(prompts: Any, reason: str) -> Iterator[Departure]:
-    if prompts is not None and (Path(prompts) / CARD).is_file():
-        return
-    yield Departure("prompts", f"{prompts or 'default'} (paper: its own)", reason)
+def _compare_prompts(prompts: Any, task: str, reason: str) -> Iterator[Departure]:
+    """Yield prompts other than those that were imported for a task, and are as they were then."""
+    own, remark = str(prompts or DEFAULT), ""
+    if own not in SETS and (Path(own) / CARD).is_file():
+        card = read_yaml_mapping(Path(own) / CARD, "where each prompt came from")
+        if not any(str(name).startswith(f"{task}/") for name in card.get("imported", ())):
+            remark = f", of whose source none is for {task}"
+        elif card.get("digest") != Prompts(own).digest:
+            remark = ", changed since they were imported"
+        else:
+            return
+    yield Departure("prompts", f"{own}{remark} (paper: its own)", reason)
 
 
 def _differ(topic: str, ours: Any, theirs: Any, reasons: Mapping[str, str]) -> Departure:
-    found = "open" if ours is None else ours
-    return Departure(topic, f"{found} (paper: {theirs})", reasons.get(topic, ""))
+    found, wanted = ("open" if value is None else value for value in (ours, theirs))
+    return Departure(topic, f"{found} (paper: {wanted})", reasons.get(topic, ""))

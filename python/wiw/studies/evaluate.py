@@ -171,7 +171,7 @@ def _run(task: Any, agents: Mapping[str, Any], settings: RunConfig) -> RunLog:
             "task": task.to_json(),
             "agents": {arm: recipe.to_json() for arm, recipe in agents.items()},
             "sources": sources_of(task, agents),
-            "departures": describe_departures(built, agents),
+            "departures": describe_departures(built, agents, count),
             "pictures": pool_episodes(episodes, settings.count_pictured(count)),
             "keep_images": settings.count_pictured(count),
             "scenes": used,
