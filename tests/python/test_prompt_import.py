@@ -15,7 +15,7 @@ import wiw
 from wiw.cli import main
 from wiw.errors import FileError, PromptError
 from wiw.policies.vlm.prompt_import.latex import convert_latex
-from wiw.policies.vlm.prompt_import.sources import name_template
+from wiw.policies.vlm.prompt_import.sources import name_template, read_source
 from wiw.policies.vlm.prompts import FOLDER, SETS, Prompts, get_slots, list_tasks
 from wiw.vlm.template_worker import ENVIRONMENT
 
@@ -139,6 +139,14 @@ def test_what_cannot_be_imported_is_named_and_nothing_is_written(
     with pytest.raises(PromptError, match=said):
         wiw.import_prompts(write_paper(tmp_path, (title, body)), tmp_path / "own")
     assert not (tmp_path / "own").exists()
+
+
+def test_a_box_in_a_comment_is_passed_over(tmp_path: Path) -> None:
+    source = write_paper(tmp_path, ("AR Answerer Prompt", r"What is it, to 100\%?"))
+    old = "\n".join(f"% {line}" for line in source.read_text().replace("What is it", "And this").splitlines())
+    source.write_text(f"{old}\n{source.read_text()}")
+    found, _ = read_source(source)
+    assert [prompt.text for prompt in found.values()] == ["What is it, to 100%?"]
 
 
 def test_folders_that_will_not_do_are_refused(tmp_path: Path) -> None:

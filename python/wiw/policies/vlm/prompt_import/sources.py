@@ -38,6 +38,7 @@ ROLES = {"answerer": "answerer", "low-level planner": "low_level_planner", "plan
 _BOX = re.compile(
     r"\\begin\{tcolorbox\}(?P<options>\[.*?^\s*\]|\[[^\]]*\])(?P<body>.*?)\\end\{tcolorbox\}", re.S | re.M
 )
+_COMMENT = re.compile(r"(?<!\\)%.*")
 _TITLE = re.compile(r"(?<![a-z])title\s*=\s*(?:\{(?P<braced>[^}]*)\}|(?P<bare>[^,\]\n]*))")
 _ANSWER_FORM = re.compile(
     r"^[#* ]*Output Format:?[*\s]*\n.*?(?=^(?:#+ |\*\*)[^\n]*:[*\s]*$)", re.DOTALL | re.MULTILINE | re.IGNORECASE
@@ -87,7 +88,7 @@ def _drop_answer_form(prompt: FoundPrompt) -> FoundPrompt:
 
 
 def _read_latex(file: Path) -> tuple[dict[str, FoundPrompt], list[str]]:
-    text = _read_text(file)
+    text = _COMMENT.sub(lambda match: match[0].replace("{tcolorbox}", "{commented}"), _read_text(file))
     found: dict[str, FoundPrompt] = {}
     unused = []
     for box in _BOX.finditer(text):
