@@ -146,7 +146,8 @@ class AgentFlags:
         if "vlm" not in policies:
             if options:
                 raise ArgumentError(
-                    "--vlm, --vlm-model, --vlm-prices and --prompts are for policy vlm: give --policy vlm"
+                    "--vlm, --vlm-model, --vlm-prices and --prompts are for policy vlm: give --policy vlm or "
+                    "--revision vlm"
                 )
             return {}
         return {"vlm": {"vlm": "http://localhost:8000/v1", **options}}
