@@ -15,7 +15,7 @@ import yaml
 
 import wiw
 from wiw.cli import main
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm.prompt_images import resize_view
 from wiw.policies.vlm.prompt_import import CARD, write_templates
 from wiw.policies.vlm.prompts import Prompts
@@ -186,6 +186,19 @@ def test_prompts_are_the_papers_only_as_they_were_imported_for_the_task(imported
     write_templates(folder, {"ar/planner": "Go on, and look behind doors."})
     changed = find_topics(AR("apartments:val"), policy_options=imported)["prompts"]
     assert changed == f"{folder}, changed since they were imported (paper: its own)"
+
+
+def test_prompts_that_are_not_there_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(PromptError, match="expected one of the sets default, minimal, or a folder with templates"):
+        find_topics(AR("apartments:val"), policy_options={"vlm": {"prompts": str(tmp_path / "minimall")}})
+
+
+def test_settings_of_models_that_a_preset_names_count() -> None:
+    task, own = ImageNav("apartments:val", preset="official"), {"steps": 5, "size": (704, 704), "guidance": 5.0}
+    found = find_topics(task, model="wan2.2-5b", model_options=own, imagine_fraction=0.5)
+    assert found["wan2.2-5b steps"] == "5 (preset: 50)"
+    assert not {"wan2.2-5b size", "wan2.2-5b guidance"} & found.keys(), "as the preset has them"
+    assert found["decisions with a world model"] == "a share of 0.5 (paper: all)"
 
 
 def test_fewer_episodes_than_the_papers_are_a_departure(tmp_path: Path, two_rooms: str) -> None:

@@ -15,6 +15,7 @@ from wiw.policies.vlm.prompt_import import CARD
 from wiw.policies.vlm.prompts import DEFAULT, SETS, Prompts
 from wiw.registry import POLICIES
 from wiw.runs.recipes import ELSEWHERE, REFERENCES, AgentRecipe, find_control
+from wiw.runs.rows import to_json
 from wiw.tasks import presets
 from wiw.tasks.base import Task
 from wiw.tasks.presets import PAPER, Preset
@@ -78,7 +79,7 @@ def find_departures(task: Task, agents: Mapping[str, Any], episodes: int | None 
     found = [*_compare_rules(task, paper), *_compare_episodes(task, count)]
     found += [Departure("agent", "of another method")] if len(recipes) < len(agents) else []
     for recipe in recipes:
-        found += [*_compare_agent(task, recipe), *_compare_vlm(task, recipe, paper)]
+        found += [*_compare_agent(task, recipe), *_compare_vlm(task, recipe, paper), *_compare_model(task, recipe)]
     settings = {*paper.rules, *_get_vlm_defaults()}  # a reason for one counts where its value is another
     for who in _list_concerned(recipes):
         own = task.departures.get(who, {})
@@ -168,14 +169,25 @@ def _compare_vlm(task: Task, recipe: AgentRecipe, paper: Preset) -> Iterator[Dep
     yield from _compare_prompts(ours.get("prompts"), task.name, reasons.get("prompts", ""))
 
 
+def _compare_model(task: Task, recipe: AgentRecipe) -> Iterator[Departure]:
+    """Yield options of the world model that a preset sets and the run has otherwise, and how often it is asked."""
+    theirs = task.model_options.get(str(recipe.model), {})
+    for name, value in recipe.model_options.items():
+        if name in theirs and name != "weights" and to_json(value) != to_json(theirs[name]):
+            yield Departure(f"{recipe.model} {name}", f"{value} (preset: {theirs[name]})")
+    if recipe.imagine_fraction not in (None, 1):
+        yield Departure("decisions with a world model", f"a share of {recipe.imagine_fraction} (paper: all)")
+
+
 def _compare_prompts(prompts: Any, task: str, reason: str) -> Iterator[Departure]:
     """Yield prompts other than those that were imported for a task, and are as they were then."""
     own, remark = str(prompts or DEFAULT), ""
+    digest = Prompts(own).digest
     if own not in SETS and (Path(own) / CARD).is_file():
         card = read_yaml_mapping(Path(own) / CARD, "where each prompt came from")
         if not any(str(name).startswith(f"{task}/") for name in card.get("imported", ())):
             remark = f", of whose source none is for {task}"
-        elif card.get("digest") != Prompts(own).digest:
+        elif card.get("digest") != digest:
             remark = ", changed since they were imported"
         else:
             return
