@@ -188,6 +188,13 @@ def test_prompts_are_the_papers_only_as_they_were_imported_for_the_task(imported
     assert changed == f"{folder}, changed since they were imported (paper: its own)"
 
 
+def test_a_presets_reasons_are_for_its_own_values() -> None:
+    agents = {"arm": AgentRecipe("vlm", policy_options={"vlm": {"tries": 7}})}
+    found = {each.topic: each for each in find_departures(AR("apartments:val", preset="official", decisions=4), agents)}
+    assert (found["decisions"].reason, found["tries"].reason) == ("", "")
+    assert found["prediction"].reason and found["revision_temperature"].reason
+
+
 def test_prompts_that_are_not_there_are_refused(tmp_path: Path) -> None:
     with pytest.raises(PromptError, match="expected one of the sets default, minimal, or a folder with templates"):
         find_topics(AR("apartments:val"), policy_options={"vlm": {"prompts": str(tmp_path / "minimall")}})

@@ -127,8 +127,10 @@ def _asks_vlm(recipe: AgentRecipe) -> bool:
 def _compare_rules(task: Task, paper: Preset) -> Iterator[Departure]:
     said, reasons = task.describe(), task.departures.get("rules", {})
     for name, value in paper.rules.items():
-        if said.get(name) != value:
-            yield _differ(name, said.get(name), value, reasons)
+        if said.get(name) != value:  # the preset's reason is for its own value
+            yield _differ(
+                name, said.get(name), value, reasons if said.get(name) == task.preset_settings.rules.get(name) else {}
+            )
 
 
 def _compare_episodes(task: Task, count: int) -> Iterator[Departure]:
@@ -165,7 +167,8 @@ def _compare_vlm(task: Task, recipe: AgentRecipe, paper: Preset) -> Iterator[Dep
     for name in dict.fromkeys([*paper.policies.get("vlm", {}), *ours]):
         usual = defaults.get(name) if theirs.get(name) is None else theirs[name]
         if name not in UNCOUNTED and (value := ours.get(name, defaults.get(name))) != usual:
-            yield _differ(name, value, theirs.get(name), reasons)
+            is_presets = value == task.policy_options.get("vlm", {}).get(name, defaults.get(name))
+            yield _differ(name, value, theirs.get(name), reasons if is_presets else {})
     yield from _compare_prompts(ours.get("prompts"), task.name, reasons.get("prompts", ""))
 
 
