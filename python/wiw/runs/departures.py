@@ -125,12 +125,11 @@ def _asks_vlm(recipe: AgentRecipe) -> bool:
 
 
 def _compare_rules(task: Task, paper: Preset) -> Iterator[Departure]:
-    said, reasons = task.describe(), task.departures.get("rules", {})
+    said, reasons, preset = task.describe(), task.departures.get("rules", {}), task.preset_settings.rules
     for name, value in paper.rules.items():
-        if said.get(name) != value:  # the preset's reason is for its own value
-            yield _differ(
-                name, said.get(name), value, reasons if said.get(name) == task.preset_settings.rules.get(name) else {}
-            )
+        ours = said.get(name)
+        if ours != value:  # the preset's reason is for its own value
+            yield _differ(name, ours, value, reasons if ours == preset.get(name) else {})
 
 
 def _compare_episodes(task: Task, count: int) -> Iterator[Departure]:
