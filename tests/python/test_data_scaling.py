@@ -364,6 +364,13 @@ def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
         wiw.data_scaling(None)
 
 
+def test_torchruns_processes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    with pytest.raises(ArgumentError, match="expected a single process, got 4 from torchrun; start one"):
+        wiw.data_scaling(None, tmp_path / "study", SMALL)
+    assert not (tmp_path / "study").exists()
+
+
 def test_a_dataset_without_depth_is_refused(dataset: Path, tmp_path: Path) -> None:
     shutil.copytree(dataset, tmp_path / "data")
     meta = json.loads((dataset / "meta.json").read_text())

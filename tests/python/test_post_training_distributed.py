@@ -318,6 +318,24 @@ def test_what_cannot_be_shared_is_refused(arguments: list[str], said: str, capsy
     assert said in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.parametrize("option", ["--gpus=2", "--dry-run", "--partition=gpu"])
+def test_processes_of_torchrun_start_no_others(
+    option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main(["train", "ltx-action", "--data", "data", option]) == 2
+    assert "expected a single process, got 2 from torchrun; leave these options out" in " ".join(
+        capsys.readouterr().err.split()
+    )
+
+
+@pytest.mark.parametrize("what", ["ltx-action", "pocket"])
+def test_options_of_a_job_are_refused_where_there_is_none(what: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", what, "--data", "data", "--hours", "3", "--account", "lab"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "--hours, --account: of a SLURM job; name its --partition" in said
+
+
 def test_passes_are_shared_out_evenly_or_not_at_all() -> None:
     require_equal_shares(16, 4, 2)
     with pytest.raises(ArgumentError, match="16 clips has 4 passes of 4, which 8 processes cannot share out"):

@@ -44,6 +44,7 @@ from wiw.studies.data_scaling_training import (
     measure_references,
 )
 from wiw.training.jobs import run_jobs
+from wiw.training.launcher import require_single_process
 from wiw.training.learners import make_learner
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 
@@ -111,12 +112,14 @@ def data_scaling(
         watch: called with progress.
 
     Raises:
-        ArgumentError: a number out of range, a dataset with too few clips or scenes, or a folder with another study.
+        ArgumentError: a number out of range, a dataset with too few clips or scenes, a folder with another study, or
+            several processes of torchrun.
         DependencyError: torch or pyarrow is not installed.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         InfrastructureError: a worker process has died.
         TrainingError: a loss is not finite.
     """
+    require_single_process("data-scaling", "start one, which has --workers")
     if workers < 1 or episodes < 0:
         raise ArgumentError(
             f"data-scaling: expected 1 worker or more and 0 episodes or more, got {workers} and {episodes}"
