@@ -18,6 +18,7 @@ from wiw.training.collect_navigation import collect_navigation
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
+from wiw.networks import single_thread  # noqa: E402
 from wiw.training.held_out_clips import imagine_with, select_clips  # noqa: E402
 from wiw.training.pocket.batches import compute_displacements, draw_batch, draw_places  # noqa: E402
 from wiw.training.pocket.held_out import BASELINES, draw_windows, measure, shuffle_places  # noqa: E402
@@ -33,6 +34,12 @@ from wiw.world_models.warpnet.network import warp  # noqa: E402
 
 RULES = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5}
 SIZE = (16, 32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    with single_thread():
+        yield
 
 
 @pytest.fixture(scope="module")
