@@ -30,6 +30,8 @@ from wiw.training.post_training.families import FAMILIES, VideoFamily, find_fami
 from wiw.training.post_training.train import post_train
 from wiw.types import GRIPPER_POSES
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 NAMES = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 SHAPES: dict[str, Any] = {name: {"size": SIZES.get(name, (32, 32))} for name in NAMES}
 

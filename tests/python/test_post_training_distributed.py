@@ -41,6 +41,8 @@ from wiw.training.post_training.clip_trainer import require_equal_shares
 from wiw.training.post_training.train import post_train
 from wiw.training.post_training.trainer import PostTrainer
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 CASES = (("ltx-action", False), ("ltx-action", True), ("wan2.1-action", True))
 """One trained whole, with and without shards, and one by LoRA on frozen weights of another precision."""
 CHANGES: dict[str, Any] = {"rows": 1, "epochs": 3, "ema": 0.9}
@@ -131,14 +133,6 @@ def find_error(work: Any) -> BaseException:
     except BaseException as error:
         return error
     raise AssertionError("expected an error")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")

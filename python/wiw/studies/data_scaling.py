@@ -22,6 +22,7 @@ from wiw.datasets.decisions import save_decisions
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
+from wiw.scenes import resolve
 from wiw.studies.data_scaling_plan import (
     FULL,
     PRIMARY,
@@ -39,6 +40,7 @@ from wiw.studies.data_scaling_training import (
     FRAMES,
     Measures,
     TrainingJob,
+    create_recipe,
     list_scenes,
     load_material,
     measure_references,
@@ -129,8 +131,9 @@ def data_scaling(
             f"data-scaling: expected a dataset for {settings.clips:,} clips (--data DIR, of `wiw collect navigation`); "
             "only the small version collects its own (--small)"
         )
-    for name in settings.models:
-        make_learner(name)  # fails before anything takes time
+    for name in settings.models:  # fails before anything takes time
+        create_recipe(make_learner(name), settings, settings.clips, 0)
+    resolve(settings.decision_scenes)
     folder = Path(out)
     source = Path(data) if data is not None else _collect(folder, workers, watch)
     plan = make_plan(source, settings)
