@@ -23,13 +23,12 @@ from wiw.analysis.data_scaling import (
     split_gain,
 )
 from wiw.cli import main
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
 torch = pytest.importorskip("torch", reason="needs wiw[torch]")
 
 from wiw.datasets.navigation import NavigationData, SelectedClips, part_of  # noqa: E402
-from wiw.networks import single_thread  # noqa: E402
 from wiw.runs.recipes import arm_recipes  # noqa: E402
 from wiw.studies import data_scaling_plan as planning  # noqa: E402
 from wiw.studies.data_scaling import DataScaling, make_plan, name_arms  # noqa: E402
@@ -50,6 +49,8 @@ from wiw.training.warpnet_clips import WarpNetClipRecipe, WarpNetClipTrainer, dr
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
 from wiw.world_models.warpnet.network import Network, warp  # noqa: E402
 from wiw.world_models.warpnet.weights import load  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 SCENES = 10
 SETTINGS = ScalingSettings(
@@ -226,8 +227,7 @@ def test_warpnet_learns_clips_by_heart(dataset: Path, tmp_path: Path) -> None:
     data = NavigationData(dataset)
     recipe = WarpNetClipRecipe(frames=8, size=(32, 64), batch=4, clips=4, widths=(8, 16, 16), precision="float32")
     trainer = WarpNetClipTrainer(data.clips(8), reduce_frames(data, (32, 64), tmp_path), recipe)
-    with single_thread():
-        losses = [trainer.train_step(5e-3) for _ in range(30)]
+    losses = [trainer.train_step(5e-3) for _ in range(30)]
     assert np.mean(losses[-10:]) < 0.9 * np.mean(losses[:10])
 
 
@@ -362,6 +362,28 @@ def test_a_dataset_that_is_too_small_says_so(dataset: Path) -> None:
         make_plan(dataset, replace(SETTINGS, held_out=0.0))
     with pytest.raises(ArgumentError, match="expected a dataset for 12,800 clips"):
         wiw.data_scaling(None)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"size": (24, 48)}, "size: expected a height of a multiple of 16"),
+        ({"decision_scenes": "nowhere.obj"}, "nowhere.obj: no such file"),
+    ],
+)
+def test_what_cannot_be_trained_or_measured_is_refused_before_anything_is_collected(
+    changes: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    with pytest.raises((ArgumentError, FileError), match=said):
+        wiw.data_scaling(None, tmp_path / "study", replace(SMALL, **changes))
+    assert not (tmp_path / "study").exists()
+
+
+def test_torchruns_processes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    with pytest.raises(ArgumentError, match="expected a single process, got 4 from torchrun; start one"):
+        wiw.data_scaling(None, tmp_path / "study", SMALL)
+    assert not (tmp_path / "study").exists()
 
 
 def test_a_dataset_without_depth_is_refused(dataset: Path, tmp_path: Path) -> None:

@@ -25,6 +25,8 @@ from wiw.world_models.pocket.sampler import draw_noise, sample_views  # noqa: E4
 from wiw.world_models.pocket.weights import load, save  # noqa: E402
 from wiw.world_models.warpnet.network import plain_room, warp  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 SIZE = (16, 32)
 WIDTHS = (8, 8, 8, 8)
 

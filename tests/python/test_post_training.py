@@ -44,17 +44,11 @@ from wiw.training.post_training.recipe import load_recipe
 from wiw.training.post_training.train import post_train
 from wiw.training.post_training.trainer import PostTrainer
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 NAMES = sorted(FAMILIES)
 GENERATORS = sorted(name for name, family in FAMILIES.items() if isinstance(family, VideoFamily))
 STEPS = {name: 6 if name in ("svd-action", "wan2.2-a14b-action") else 12 for name in NAMES}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +67,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory):
 @pytest.mark.parametrize("name", NAMES)
 def test_the_loss_falls_on_four_clips_learnt_by_heart(name: str, data: Path, weights: Any) -> None:
     """Measured on the same noise before and after."""
-    trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0)
+    trainer = make_trainer(name, data, weights(name), epochs=STEPS[name], drop=0.0, checkpointing=False)
 
     def measure(place: str) -> float:
         clips = np.tile(trainer.order.select(0), 4)

@@ -28,6 +28,8 @@ from wiw.training.post_training.nwm import VariationalDiffusion, measure_likelih
 from wiw.world_models.nwm.diffusion import sample
 from wiw.world_models.nwm.model import NWM
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -26,6 +26,8 @@ from wiw.training.post_training.latent_cache import LatentCache
 from wiw.training.post_training.train import list_remedies, post_train
 from wiw.training.post_training.trainer import PostTrainer
 
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
+
 NAMES = ("svd-action", "ltx-action", "wan2.1-action", "cosmos-predict2-action", "nwm-action")
 """One of each way of encoding clips."""
 

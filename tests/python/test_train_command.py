@@ -46,6 +46,18 @@ def test_numbers_out_of_range_are_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("what", NETWORKS)
+def test_torchruns_processes_are_refused_where_each_would_train_alike(
+    what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They would overwrite each other's weights and state."""
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    assert main(["train", what, "--out", str(tmp_path / "x")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{what}: expected a single process, got 2 from torchrun; run the command without torchrun" in said
+    assert not list(tmp_path.iterdir())
+
+
 class _Counter:
     def __init__(self) -> None:
         self.steps = 0

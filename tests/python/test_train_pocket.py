@@ -12,7 +12,7 @@ import pytest
 
 from wiw.cli import main
 from wiw.datasets.navigation import NavigationData
-from wiw.errors import ArgumentError, TrainingError
+from wiw.errors import ArgumentError, FileError, TrainingError
 from wiw.training.collect_navigation import collect_navigation
 
 pytest.importorskip("pyarrow", reason="needs wiw[export]")
@@ -30,6 +30,8 @@ from wiw.training.reduced_frames import ReducedFrames, reduce_frames  # noqa: E4
 from wiw.world_models.pocket.model import Pocket  # noqa: E402
 from wiw.world_models.pocket.weights import load  # noqa: E402
 from wiw.world_models.warpnet.network import warp  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("one_torch_thread")
 
 RULES = {"min_samples": 60, "spacing": 1.5, "leaf_ratio": 0.5}
 SIZE = (16, 32)
@@ -209,13 +211,21 @@ def test_the_command_trains_measures_and_is_run(
 
     from wiw.training.pocket.held_out import evaluate
 
-    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=1))
+    def fail(*_: Any, **__: Any) -> None:
+        raise FileError("the disk is full")
+
     out = tmp_path / "pocket.safetensors"
     options = [
         f"--option={pair}" for pair in ("frames=8", "places=2", "clips=8", "size=[16,32]", "widths=[8,32,32,32]")
     ]
     command = ["train", "pocket", "--data", str(dataset), "--out", str(out), "--cache", str(tmp_path / "cache")]
-    assert main([*command, "--val", two_rooms, "--part", "all", *options]) == 0
+    command += ["--part", "all", *options]
+    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", fail)
+    assert main([*command, "--val", two_rooms]) == 2 and "held_out" not in Pocket(out).card
+    monkeypatch.setattr("wiw.training.pocket.held_out.evaluate", partial(evaluate, count=1))
+    with monkeypatch.context() as patch:
+        patch.setattr(PocketTrainer, "train_step", None)  # what is trained is not trained again, but measured
+        assert main([*command, "--val", two_rooms]) == 0
     said = capsys.readouterr().out
     assert "2 steps of 4 clips" in said and "control gap" in said
     card = Pocket(out).card
@@ -229,6 +239,7 @@ def test_the_command_trains_measures_and_is_run(
     [
         ([], "pocket trains on a dataset; give a folder of `wiw collect navigation` by --data"),
         (["--data", "nowhere"], "nowhere"),
+        (["--data", "d", "--val", "castle:1"], "castle:1"),
         (["--data", "d", "--device", "cuda"], "--device: pocket trains on the CPU"),
         (["--data", "d", "--option", "lr=1"], "no recipe has 'lr'"),
     ],

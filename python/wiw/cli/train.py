@@ -16,7 +16,7 @@ from wiw.cli.options import Options
 from wiw.cli.stop import announce_resume
 from wiw.cli.train_pocket import train_pocket
 from wiw.cli.train_video import RUN_AS, VIDEO, TrackerName, VideoName, train_video
-from wiw.training.launcher import ProcessLayout
+from wiw.training.launcher import ProcessLayout, require_single_process
 
 ONE_PROCESS = ProcessLayout()
 DEFAULT_SCENES, DEFAULT_VAL, DEFAULT_PLAYS, DEFAULT_WORKERS = "apartments:train:80", "apartments:val:20", 2000, 2
@@ -194,6 +194,7 @@ def train(
         given: dict[str, Any] = {"weights": weights, "device": device, "part": part or "train", "cache": cache}
         given |= {"validation": validation, "decisions": decisions, "tracker": tracker}
         return train_video(what, out or Path(what), data, recipe, option, numbers, given, layout, dry_run)
+    require_single_process(what, "run the command without torchrun")  # each would train alike and write the same file
     out = out or Path(f"{what}.safetensors")
     _require_torch(what)
     _check_out(out)

@@ -35,9 +35,10 @@ def train_pocket(
         bar: wraps an iterable in a progress bar.
 
     Raises:
-        ArgumentError: no data; see also `wiw.training.pocket.train.train_pocket`.
+        ArgumentError: no data, or scenes that are not there; see also `wiw.training.pocket.train.train_pocket`.
     """
     from wiw.runs.part_options import parse_options
+    from wiw.scenes import resolve
     from wiw.training.pocket import train as training
     from wiw.training.pocket.held_out import evaluate
     from wiw.training.pocket.recipe import PocketRecipe
@@ -48,6 +49,7 @@ def train_pocket(
     options = {**numbers, **parse_options(pairs, PocketRecipe, "--option")}
     chosen = load_recipe("pocket", recipe, options, kind=PocketRecipe)
     folder = require_data("pocket", data)
+    resolve(val)  # names that are wrong are better known before hours of training
     with TrainingProgress(chosen.batch) as progress:
         card = training.train_pocket(
             folder, out, cache, chosen, on_step=progress, on_validation=progress.show_validation, bar=bar, **given

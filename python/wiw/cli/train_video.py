@@ -100,9 +100,10 @@ def _launch(
     arguments: Sequence[str], recipe: PostTrainingRecipe, layout: ProcessLayout, out: Path, dry_run: bool
 ) -> int:
     """Run a command in several processes, submit it, or print it; return the exit code."""
-    from wiw.training.launcher import run_processes, submit_job, write_command
+    from wiw.training.launcher import require_single_process, run_processes, submit_job, write_command
     from wiw.training.post_training.clip_trainer import require_equal_shares
 
+    require_single_process("--gpus, --nodes, --partition and --dry-run", "leave these options out")
     require_equal_shares(recipe.batch, recipe.rows, layout.count)
     if dry_run:
         print(write_command(arguments, layout))

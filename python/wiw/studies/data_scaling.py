@@ -22,6 +22,7 @@ from wiw.datasets.decisions import save_decisions
 from wiw.datasets.navigation import NavigationData
 from wiw.errors import ArgumentError, FileError
 from wiw.files import atomic_file
+from wiw.scenes import resolve
 from wiw.studies.data_scaling_plan import (
     FULL,
     PRIMARY,
@@ -39,11 +40,13 @@ from wiw.studies.data_scaling_training import (
     FRAMES,
     Measures,
     TrainingJob,
+    create_recipe,
     list_scenes,
     load_material,
     measure_references,
 )
 from wiw.training.jobs import run_jobs
+from wiw.training.launcher import require_single_process
 from wiw.training.learners import make_learner
 from wiw.training.post_training.corpora import NavigationCorpus, require_panoramas
 
@@ -111,12 +114,14 @@ def data_scaling(
         watch: called with progress.
 
     Raises:
-        ArgumentError: a number out of range, a dataset with too few clips or scenes, or a folder with another study.
+        ArgumentError: a number out of range, a dataset with too few clips or scenes, a folder with another study, or
+            several processes of torchrun.
         DependencyError: torch or pyarrow is not installed.
         FileError: the dataset is missing or damaged, or a file cannot be written.
         InfrastructureError: a worker process has died.
         TrainingError: a loss is not finite.
     """
+    require_single_process("data-scaling", "start one, which has --workers")
     if workers < 1 or episodes < 0:
         raise ArgumentError(
             f"data-scaling: expected 1 worker or more and 0 episodes or more, got {workers} and {episodes}"
@@ -126,8 +131,9 @@ def data_scaling(
             f"data-scaling: expected a dataset for {settings.clips:,} clips (--data DIR, of `wiw collect navigation`); "
             "only the small version collects its own (--small)"
         )
-    for name in settings.models:
-        make_learner(name)  # fails before anything takes time
+    for name in settings.models:  # fails before anything takes time
+        create_recipe(make_learner(name), settings, settings.clips, 0)
+    resolve(settings.decision_scenes)
     folder = Path(out)
     source = Path(data) if data is not None else _collect(folder, workers, watch)
     plan = make_plan(source, settings)

@@ -31,9 +31,10 @@ from wiw.training.held_out_clips import (
     select_clips,
     turn_panoramas,
 )
-from wiw.training.learners import make_learner
+from wiw.training.learners import Learner, make_learner
 
 if TYPE_CHECKING:
+    from wiw.training.post_training.recipe import ClipRecipe
     from wiw.training.reduced_frames import ReducedFrames
 
 FRAMES, DECISIONS = "frames", "decisions.parquet"
@@ -143,9 +144,7 @@ class TrainingJob:
         from wiw.training.trainer import run_training
 
         learner, settings, own = make_learner(self.training.model), self.plan.settings, self.training
-        recipe = learner.create_recipe(
-            frames=settings.length, size=settings.size, batch=settings.batch, clips=own.clips, seed=own.seed
-        )
+        recipe = create_recipe(learner, settings, own.clips, own.seed)
         rows = material.select_rows(own).tolist()
         checkpoint = Checkpoint(self.weights.with_suffix(".checkpoint"), self._card, SAVED_EVERY)
         trainer, _ = run_training(
@@ -167,6 +166,17 @@ class TrainingJob:
     @property
     def _measures(self) -> Path:
         return self.folder / "measures" / f"{self.training.name}.json"
+
+
+def create_recipe(learner: Learner, settings: ScalingSettings, clips: int, seed: int) -> ClipRecipe:
+    """Return the recipe of a training.
+
+    Raises:
+        ArgumentError: the learner cannot be trained so, such as on panoramas of that size.
+    """
+    return learner.create_recipe(
+        frames=settings.length, size=settings.size, batch=settings.batch, clips=clips, seed=seed
+    )
 
 
 def measure(imagine: Imagine, clips: HeldOutClips, decisions: Decisions) -> Measures:

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -63,6 +63,12 @@ class ProcessLayout:
             value = getattr(self, name)
             if value is not None and not value >= least:
                 raise ArgumentError(f"expected --{name} of at least {least}, got {value}")
+        of_jobs = (each for each in fields(self) if each.name not in ("gpus", "nodes", "partition"))
+        given = [f"--{each.name}" for each in of_jobs if getattr(self, each.name) != each.default]
+        if given and not self.submitted:
+            raise ArgumentError(
+                f"{', '.join(given)}: of a SLURM job; name its --partition, or leave this out to train on this machine"
+            )
 
     @property
     def count(self) -> int:
@@ -92,6 +98,25 @@ class ProcessLayout:
             "slurm_additional_parameters": {"requeue": True},
         }
         return {key: value for key, value in found.items() if value is not None}
+
+
+def count_started() -> int:
+    """Return how many processes torchrun has started of this program, with this one; 1 where it was not torchrun."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def require_single_process(what: str, instead: str) -> None:
+    """Check that torchrun has not started what runs, or starts processes, by itself.
+
+    Args:
+        what: for the message.
+        instead: for the message, a clause that says what to do.
+
+    Raises:
+        ArgumentError: torchrun has started several processes of this program.
+    """
+    if count_started() > 1:
+        raise ArgumentError(f"{what}: expected a single process, got {count_started()} from torchrun; {instead}")
 
 
 def write_command(arguments: Sequence[str], layout: ProcessLayout) -> str:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import wiw
 from wiw.datasets.navigation import NavigationData, Part
+from wiw.errors import WeightsError
 from wiw.files import atomic_file
 from wiw.training.held_out_clips import Frames, Imagine, imagine_with
 from wiw.training.pocket.recipe import PocketRecipe
@@ -49,6 +50,7 @@ def train_pocket(
 
     A state is kept beside `out`, in `OUT.checkpoint`, every so often, at SIGUSR1, and before the process stops at
     SIGTERM or Ctrl-C. The same call resumes from it; with the same number of threads it ends with the same bytes.
+    Once it has written `out`, it returns that file's card, until the weights are measured (`held_out` in the card).
     `OUT.log` has the loss of each step and what validations found.
 
     Args:
@@ -83,6 +85,8 @@ def train_pocket(
     checked = None if split is None else choose_validation_set(*split, decisions, recipe)
     card: dict[str, Any] = {"wiw": wiw.__version__, "data": corpus.describe(), "recipe": recipe.describe()}
     card |= {"validated_on": checked.identity if checked else None}
+    if (finished := _read_finished(out, card)) is not None:
+        return finished
     trainer = PocketTrainer(clips, reduce_frames(dataset, recipe.size, cache, bar), recipe)
     state = SignalledCheckpoint(out.with_name(f"{out.name}.checkpoint"), {"model": "pocket", **card}, seconds)
     if not state.path.exists():
@@ -119,6 +123,16 @@ def create_sampler(trainer: PocketTrainer) -> Imagine:
                 trainer.network.train()
 
     return imagine_now
+
+
+def _read_finished(out: Path, identity: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the card of weights that the same training has written and nobody has measured; None if there are none."""
+    try:
+        card = load(out)[1]
+    except WeightsError:
+        return None
+    same = all(card.get(name) == value for name, value in json.loads(json.dumps(identity)).items())
+    return card if same and "held_out" not in card else None
 
 
 def _save_best(folder: Path, trainer: PocketTrainer, found: Mapping[str, Any]) -> None:

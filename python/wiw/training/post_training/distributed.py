@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, distributed, nn
 
 from wiw.errors import ArgumentError
+from wiw.training.launcher import count_started
 
 PATIENCE = timedelta(hours=1)
 """How long a process waits for the others, such as for the first one to write the state."""
@@ -29,7 +30,7 @@ T = TypeVar("T")
 @contextmanager
 def join_processes() -> Iterator[None]:
     """Join the processes that torchrun has started, as its environment variables say, as long as the context lasts."""
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1 or distributed.is_initialized():
+    if count_started() == 1 or distributed.is_initialized():
         yield
         return
     if _find_local_rank() < torch.cuda.device_count():
