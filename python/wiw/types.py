@@ -448,7 +448,8 @@ class Episode:
     geodesic: float
     """Shortest path from start to goal in metres; NaN where an episode file does not give it."""
     info: Mapping[str, Any] = field(default_factory=dict)
-    """ImageNav reads "ideal_primitives", the least number of primitives, and "radius", the goal's own in metres.
+    """ImageNav reads "ideal_primitives", the least number of primitives, "radius", the goal's own in metres, and
+    "goal_image", the file of a panorama at the goal.
     AR reads "target", an instance's id, and "category", what it is. Manipulation reads "task", "seed" and
     "variation", and tells reports the "instruction"."""
 

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,6 +14,8 @@ from hypothesis import strategies as st
 
 from wiw.datasets import episodes as files
 from wiw.datasets.habitat import heading_of, yaw_of
+from wiw.datasets.imagenav import camera_pose
+from wiw.datasets.worlds import world
 from wiw.errors import FileError
 from wiw.runs.recipes import AgentRecipe, TaskRecipe
 from wiw.studies.evaluate import evaluate, resume_run
@@ -120,6 +123,37 @@ def test_world_in_world_episodes_are_read(tmp_path: Path) -> None:
     files.save(tmp_path / "own.json.gz", [episode], "imagenav")
     again = files.load(tmp_path / "own.json.gz")[0]
     assert np.isnan(again.geodesic) and again.info == episode.info
+
+
+def test_the_picture_of_a_published_goal_is_its_front_view(tmp_path: Path, two_rooms: str) -> None:
+    file = world_in_world_file(tmp_path / "e.json", two_rooms)
+    drawn = ImageNav(episode_file=file)
+    assert "goal_image" not in drawn.episode(0).info
+    place = drawn.environment()
+    place.begin(drawn.episode(0))
+    episode = drawn.episode(0)
+    here = world(two_rooms)
+    pose = camera_pose(here.ground.put_down(episode.goal_position).astype(float), episode.goal_yaw)
+    image = here.renderer.panorama(pose[None], outputs=("color",))["color"][0]
+    cv2.imwrite(str(tmp_path / "i.png"), image[..., ::-1])
+    told = ImageNav(episode_file=file)
+    env = told.environment()
+    env.begin(told.episode(0))
+    assert told.episode(0).info["goal_image"] == str(tmp_path / "i.png")
+    assert np.abs(env.goal.image.astype(float) - place.goal.image).mean() < 3  # but for sharpness
+    (tmp_path / "i.png").write_bytes(b"no picture")
+    with pytest.raises(FileError, match="expected the picture of a goal"):
+        told.environment().begin(told.episode(0))
+    cv2.imwrite(str(tmp_path / "i.png"), image[:, :100])
+    with pytest.raises(FileError, match="about twice as wide as high, got 576x100"):
+        told.environment().begin(told.episode(0))
+
+
+def test_a_picture_outside_the_files_folder_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "secret.png").write_bytes(b"")
+    (tmp_path / "own").mkdir()
+    file = world_in_world_file(tmp_path / "own/e.json", goal_image_relpath="../secret.png")
+    assert "goal_image" not in files.load(file, "/scenes")[0].info
 
 
 FORMATS = {

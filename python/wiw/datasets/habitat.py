@@ -7,6 +7,7 @@ Positions are metres, Y up, in all of them; the order of a quaternion is part of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -90,14 +91,17 @@ def is_world_in_world(body: Any) -> bool:
 def read_world_in_world(body: Mapping[str, Any], path: str) -> list[Episode]:
     """Episodes of the published ImageNav file (quaternions in order wxyz); scenes are relative to its scene folder.
 
-    Each brings the radius of its goal and the number of primitives that its SPL is measured against.
+    Each brings the radius of its goal and the number of primitives that its SPL is measured against, and the picture of
+    its goal where that lies beside the file.
     """
-    return [_world_in_world(item, f"{path}: item {i}") for i, item in enumerate(body["data"])]
+    folder = Path(path).parent
+    return [_world_in_world(item, f"{path}: item {i}", folder) for i, item in enumerate(body["data"])]
 
 
-def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
+def _world_in_world(item: Mapping[str, Any], where: str, folder: Path) -> Episode:
     try:
         steps = item.get("step_to_goal")
+        picture = _find_picture(folder, text(item["goal_image_relpath"], "goal_image_relpath"))
         return Episode(
             episode_id=name_of(item["episode_id"], "episode_id"),
             scene=text(item["scene_relpath"], "scene_relpath"),
@@ -110,10 +114,17 @@ def _world_in_world(item: Mapping[str, Any], where: str) -> Episode:
                 "source": PUBLISHED,
                 "radius": number(item["goal_radius"], "goal_radius"),
                 **({} if steps is None else {"ideal_primitives": int(steps)}),
+                **({} if picture is None else {"goal_image": picture}),
             },
         )
     except _UNREADABLE as error:
         raise FileError(f"{where}: not a World-in-World ImageNav item ({type(error).__name__}: {error})") from error
+
+
+def _find_picture(folder: Path, relative: str) -> str | None:
+    """Return the whole path of a picture within a folder; None where it is not there."""
+    path = (folder / relative).resolve()
+    return str(path) if path.is_relative_to(folder.resolve()) and path.is_file() else None
 
 
 def is_active_recognition(body: Any) -> bool:

@@ -4,18 +4,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from wiw import panorama
 from wiw.datasets.imagenav import EpisodeRules, camera_pose, generate, ideal_primitives
 from wiw.datasets.worlds import World
 from wiw.envs.episode_state import EpisodeState
-from wiw.errors import ArgumentError
+from wiw.errors import ArgumentError, FileError
 from wiw.metrics import path_efficiency
 from wiw.tasks.navigation import NavigationTask
 from wiw.types import Episode, Goal, Wording
+
+GOAL_SIZE, GOAL_HFOV = (480, 480), 90.0
+"""Pixels and degrees of goal images."""
 
 
 @dataclass(frozen=True)
@@ -61,9 +67,15 @@ class ImageNav(NavigationTask):
     )
 
     def make_goal(self, place: World, episode: Episode) -> Goal:
-        """Return the goal image: front view at the goal's pose."""
+        """Return the goal image: front view at the goal's pose, in the picture that the episode brings, if it does.
+
+        Raises:
+            FileError: there is a picture, and it cannot be read.
+        """
+        if "goal_image" in episode.info:
+            return Goal(self.name, image=read_goal_image(Path(episode.info["goal_image"])))
         pose = camera_pose(np.asarray(place.ground.put_down(episode.goal_position), float), episode.goal_yaw)
-        image = place.renderer.perspective(pose[None], (480, 480), 90.0, outputs=("color",))["color"][0]
+        image = place.renderer.perspective(pose[None], GOAL_SIZE, GOAL_HFOV, outputs=("color",))["color"][0]
         return Goal(self.name, image=image)
 
     def find_goal_position(self, place: World, episode: Episode) -> NDArray[np.float64]:
@@ -125,3 +137,18 @@ def _find_shortest(state: EpisodeState) -> tuple[float, int]:
     path, length = state.world.navmesh.shortest_path(episode.start_position, episode.goal_position, return_length=True)
     primitives = ideal_primitives(np.asarray(path, float), episode.start_yaw) if ideal is None else int(ideal)
     return geodesic if np.isfinite(geodesic) else length, primitives
+
+
+def read_goal_image(path: Path) -> NDArray[np.uint8]:
+    """Return the front view, uint8 [480, 480, 3], in the middle of a panorama of a goal.
+
+    Raises:
+        FileError: no picture, or no panorama, which is about twice as wide as high.
+    """
+    found = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if found is None:
+        raise FileError(f"{path}: expected the picture of a goal, got none that can be read")
+    height, width = found.shape[:2]
+    if not 1.5 <= width / height <= 2.5:  # those of the loop have 576 x 1024 pixels
+        raise FileError(f"{path}: expected a panorama, about twice as wide as high, got {height}x{width}")
+    return np.asarray(panorama.to_perspective(np.ascontiguousarray(found[..., ::-1]), GOAL_HFOV, GOAL_SIZE))
