@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 import wiw
+from recognition_file import a_file
 from wiw.cli import main
 from wiw.errors import ArgumentError, PromptError
 from wiw.policies.vlm.prompt_images import resize_view
@@ -150,6 +151,26 @@ def test_what_is_asked_in_an_image_goal_episode(preset: str, side: int, revised_
     assert goal == (side, side, 3) and 1 <= len(strips) <= 3
     assert all(height > 384 and (width + 4) % 388 == 0 for height, width, _ in strips), "frames of 384, 4 apart"
     assert revision.temperature == revised_at
+    assert model.asked and all(shape == (480, 480, 3) and text for shape, text in model.asked)
+
+
+@pytest.mark.parametrize(("preset", "side"), [("default", 480), ("paper", 384), ("official", 512)])
+def test_what_is_asked_in_a_recognition_episode(preset: str, side: int, two_rooms: str, tmp_path: Path) -> None:
+    """Two plans from boxed front view and panorama, a primitive with their strips, a question with all categories."""
+    client, model = MockClient(lambda call: {"A": 0.6, "B": 0.4} if call.labels else answer_plans(call)), Listening()
+    task = AR(episode_file=a_file(tmp_path, two_rooms), preset=preset)
+    env = task.environment(depth=True)
+    observation = env.begin(task.episode(0))
+    recipe = AgentRecipe("vlm", model, policy_options={"vlm": {"vlm": client, "tracker": "flow"}})
+    recipe.build(RunContext(task)).decide(observation, env.goal, key=Key(0, 0, 0))
+    *plans, move, category = client.calls
+    assert len(plans) == 2 and {call.temperature for call in plans} == {1.0}
+    assert len(move.labels) == 3 and len(category.labels) == len(env.goal.choices)
+    for call in client.calls:
+        assert list_shapes(call)[:2] == [(side, side, 3), (576, 1024, 3)]
+    assert [len(list_shapes(call)) for call in plans] == [2, 2] and len(list_shapes(move)) == 4
+    for height, width, _ in [*list_shapes(move)[2:], *list_shapes(category)[2:]]:
+        assert height > 384 and (width + 4) % 388 == 0, "frames of 384, 4 apart"
     assert model.asked and all(shape == (480, 480, 3) and text for shape, text in model.asked)
 
 
