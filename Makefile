@@ -16,7 +16,7 @@ demo:       ## the main job: four tasks with two to five world models each, tabl
 	@scripts/setup torch
 	$(BIN)/wiw demo
 
-test:       ## all tests: ctest, then pytest
+test:       ## all tests: ctest, then pytest (but for those of nightly)
 	@scripts/setup test
 	$(BIN)/cmake -S . -B $(TESTS) -G Ninja -DCMAKE_MAKE_PROGRAM=$(CURDIR)/$(BIN)/ninja -DWIW_BUILD_TESTS=ON -DWIW_BUILD_PYTHON=OFF >/dev/null
 	$(BIN)/cmake --build $(TESTS)
@@ -27,8 +27,9 @@ bench:      ## every speed claim, side by side with what a user would pick inste
 	@scripts/setup test
 	$(BIN)/python tests/benchmark/run_all.py
 
-nightly:    ## what takes too long for every change: the small data-scaling study, from collecting to its page
-	@scripts/setup torch export
+nightly:    ## what takes too long for every change: the dearest tests, and the small data-scaling study
+	@scripts/setup test
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder -m nightly
 	$(BIN)/wiw study data-scaling --small --workers $(JOBS) --out build/nightly/data-scaling
 
 lint:       ## ruff, mypy, clang-format, clang-tidy

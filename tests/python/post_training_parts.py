@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 import tiny_pipelines
 from tiny_nwm import TinyNWM
@@ -122,3 +123,8 @@ def make_trainer(name: str, data: Path, weights: Path, **changes: Any) -> PostTr
     corpus, recipe = family.fit(open_corpus(data, "all"), tiny_recipe(name, **changes))
     loaded = family.load(corpus, recipe, PretrainedWeights(str(weights), device="cpu"))
     return PostTrainer(loaded.model, corpus.clips(loaded.recipe.frames), loaded.recipe)
+
+
+def with_nightly(names: Sequence[str], always: Sequence[str]) -> list[Any]:
+    """Names as parameters of a test; those that are not in `always` are run nightly."""
+    return [pytest.param(name, marks=[] if name in always else [pytest.mark.nightly]) for name in names]

@@ -84,6 +84,7 @@ def blamed(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     return wiw.blame(folder, "none", progress=False)
 
 
+@pytest.mark.nightly
 def test_each_wrong_answer_is_blamed_on_what_causes_it(blamed: Any) -> None:
     line = blamed["none"]
     assert [one.verdict for one in line.episodes] == CAUSES and not line.rerun_errors
@@ -92,6 +93,7 @@ def test_each_wrong_answer_is_blamed_on_what_causes_it(blamed: Any) -> None:
     assert recovery == {"imagination": 0, "perception": 25, "exploration": 25, "both": 75}
 
 
+@pytest.mark.nightly
 def test_reruns_differ_from_the_run_by_their_ground_truth_alone(blamed: Any) -> None:
     with RunStore.read(blamed.run) as store, RunStore.read(blamed.run / "blame") as reruns:
         own, built, recipes = store.info["built"]["none"], reruns.info["built"], reruns.info["agents"]
@@ -106,6 +108,7 @@ def test_reruns_differ_from_the_run_by_their_ground_truth_alone(blamed: Any) -> 
     assert wiw.verify(blamed.run / "blame", episodes=1).same
 
 
+@pytest.mark.nightly
 def test_an_explorer_that_has_changed_is_refused(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "run")
     change_info(tmp_path / "run", lambda info: info["built"]["none"]["policy"].update(affinity=99.0))
@@ -113,6 +116,7 @@ def test_an_explorer_that_has_changed_is_refused(run: Path, tmp_path: Path) -> N
         wiw.blame(tmp_path / "run", "none", episodes=1, progress=False)
 
 
+@pytest.mark.nightly
 def test_what_is_shown_names_the_stages_of_question_answering(blamed: Any, capsys: Any, tmp_path: Path) -> None:
     assert main(["blame", str(blamed.run), "--arm", "none"]) == 0
     shown = capsys.readouterr().out
@@ -135,6 +139,7 @@ def test_what_is_shown_names_the_stages_of_question_answering(blamed: Any, capsy
     assert all(f"to blame: {cause}" in pages for cause in CAUSES)
 
 
+@pytest.mark.nightly
 def test_an_arm_of_another_policy_is_refused_before_anything_runs(run: Path, capsys: Any) -> None:
     for arms in (None, "explorer-oracle"):
         with pytest.raises(ArgumentError, match=r"'explorer-oracle'.*only policy 'explorer'.*imagination, "):
@@ -151,6 +156,7 @@ def test_only_explorers_that_answer_themselves_can_be_blamed(policy: str, revise
     assert not QUESTIONS.allows(agent) and LOOP.allows(agent)
 
 
+@pytest.mark.nightly
 def test_a_run_without_an_explorer_says_how_to_make_one(run: Path, tmp_path: Path) -> None:
     shutil.copytree(run, tmp_path / "run")
     change_info(tmp_path / "run", lambda info: [agent.update(policy="vlm") for agent in info["agents"].values()])
@@ -203,6 +209,7 @@ def test_the_four_arms_of_the_table_have_the_same_options() -> None:
     assert "heuristic" not in AgentRecipe("explorer", policy_options=OPTIONS).with_policy("heuristic").policy_options
 
 
+@pytest.mark.nightly
 def test_the_table_of_perception_and_exploration_is_one_command(
     task: TaskRecipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

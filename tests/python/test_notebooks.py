@@ -17,6 +17,9 @@ SIZES = {  # names of the cell that is tagged "parameters", and what is enough t
     "04_answer_questions": {"apartments": 4, "questions": 2, "actions": 15},
 }
 
+DEAR = ("02_compare_world_models", "04_answer_questions")
+"""Run nightly: what they call is tested elsewhere, and each takes most of a minute."""
+
 
 def set_parameters(notebook: Any, values: dict[str, Any]) -> None:
     """Add a cell with other values behind the one that is tagged "parameters", as papermill does."""
@@ -33,7 +36,9 @@ def test_every_notebook_is_run() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.nightly] if name in DEAR else []) for name in SIZES]
+)
 def test_notebook_runs_from_top_to_bottom(name: str, tmp_path: Path) -> None:
     nbclient = pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")

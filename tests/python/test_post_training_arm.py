@@ -21,7 +21,7 @@ pytest.importorskip("peft", reason="no peft: pip install 'wiw[diffusers]'")
 pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
-from post_training_parts import SIZES, make_trainer, save_dataset, save_stock, tiny_recipe
+from post_training_parts import SIZES, make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 
 from wiw.action import PoseGrid
 from wiw.datasets.demonstrations import Demonstrations
@@ -84,7 +84,7 @@ def test_parts_share_no_demonstration(demos: Path) -> None:
         open_corpus(demos, "train", held_out=1.0).clips(13)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, ("svd-action", "ltx-action")))
 def test_the_loss_falls_on_clips_learnt_by_heart_and_the_encoder_learns(name: str, demos: Path, weights: Any) -> None:
     steps = 6 if name in ("svd-action", "wan2.2-a14b-action") else 12
     trainer = make_trainer(name, demos, weights(name), epochs=steps, drop=0.0, checkpointing=False, **SHAPES[name])

@@ -154,6 +154,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("name", "shard"), CASES)
+@pytest.mark.nightly
 def test_two_processes_train_as_one_does(name: str, shard: bool, place: Path) -> None:
     one, two = train_and_resume(name, place), torch.load(place / f"{name}-{shard}.pt", weights_only=True)
     limit = PRECISIONS[name][1]
@@ -169,6 +170,7 @@ def test_two_processes_train_as_one_does(name: str, shard: bool, place: Path) ->
 
 
 @pytest.mark.parametrize(("name", "shard"), CASES)
+@pytest.mark.nightly
 def test_two_processes_resume_exactly(name: str, shard: bool, place: Path) -> None:
     found = torch.load(place / f"{name}-{shard}.pt", weights_only=True)
     assert found["again"] == found["losses"][2]
@@ -176,6 +178,7 @@ def test_two_processes_resume_exactly(name: str, shard: bool, place: Path) -> No
         assert all(torch.equal(value, found["other"][part][key]) for key, value in found["end"][part].items())
 
 
+@pytest.mark.nightly
 def test_a_loss_that_is_not_finite_in_one_process_stops_both_and_names_the_clip(place: Path) -> None:
     trainer = make_trainer("ltx-action", place / "data", place / "stock" / "ltx", **CHANGES)
     clip = trainer.clips.describe(int(trainer.order.select(0)[1]))
@@ -184,6 +187,7 @@ def test_a_loss_that_is_not_finite_in_one_process_stops_both_and_names_the_clip(
         assert said.startswith(f"step 1: the loss is not finite on a batch of {clip}. The state before")
 
 
+@pytest.mark.nightly
 def test_a_checkpoint_of_sharded_weights_is_that_of_one_process_and_runs(place: Path) -> None:
     recipe, options = validated_recipe(), post_options(place)
     card = post_train("ltx-action", place / "data", place / "whole", recipe=recipe, **options)
@@ -204,6 +208,7 @@ def test_a_checkpoint_of_sharded_weights_is_that_of_one_process_and_runs(place: 
     assert model.rollout(Conditioning(image), [control], np.zeros(1, np.uint64)).shape[1] == recipe.frames
 
 
+@pytest.mark.nightly
 def test_a_killed_sharded_training_goes_on_in_one_process(place: Path) -> None:
     recipe, options = tiny_recipe("ltx-action", rows=1, epochs=EPOCHS), post_options(place)
     steps: list[int] = []
@@ -224,6 +229,7 @@ def test_a_killed_sharded_training_goes_on_in_one_process(place: Path) -> None:
     assert all(float((value - found[key]).abs().max()) < 2e-5 * EPOCHS for key, value in wanted.items())
 
 
+@pytest.mark.nightly
 def test_a_signal_to_one_process_stops_both_after_the_same_step(place: Path) -> None:
     state = torch.load(place / "stopped.checkpoint", weights_only=True)
     assert state["step"] == len((place / "stopped.log" / "metrics.jsonl").read_text().splitlines()) == STOPPED

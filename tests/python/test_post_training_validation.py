@@ -27,7 +27,7 @@ pytest.importorskip("pyarrow", reason="no pyarrow: pip install 'wiw[export]'")
 
 import torch
 from folders import contents
-from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe
+from post_training_parts import make_trainer, save_dataset, save_stock, tiny_recipe, with_nightly
 
 from wiw.training.held_out_clips import imagine_with
 from wiw.training.post_training import validation
@@ -67,7 +67,7 @@ def read_log(out: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (out.with_name(f"{out.name}.log") / "metrics.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", with_nightly(NAMES, ("ltx-action", "wan2.2-a14b-action")))
 def test_training_does_not_notice_that_it_is_sampled(name: str, data: Path, weights: Any) -> None:
     """The same weights to the last bit, and the same random state."""
     changes = {"epochs": 4, "rows": 4}

