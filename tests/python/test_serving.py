@@ -37,7 +37,7 @@ from wiw.serving.background import serve_in_background
 from wiw.serving.queue import ANNOUNCED, Job, Queue
 from wiw.serving.server import Server, Settings
 from wiw.types import Conditioning, Control, History
-from wiw.wire.address_book import ServerAddress, announced, read_addresses
+from wiw.wire.address_book import ServerAddress, announce_server, read_addresses
 from wiw.wire.messages import MOST_BYTES, Answer, Ask, Hello, Refusal, Wait, Welcome, decode, encode
 from wiw.wire.rows import Row, pack_row, row_id
 from wiw.world_models.base import answer_deadline
@@ -438,7 +438,7 @@ def test_addresses_that_are_none(address):
 
 
 def test_servers_are_found_where_they_announce_themselves_and_the_next_when_one_is_gone(tmp_path, monkeypatch):
-    """Of two that are announced one was killed; the other one ends in the midst, and a third comes in its place."""
+    """One of two that are announced was killed; the other one ends in the midst, and a third comes in its place."""
     folder = tmp_path / "servers"
     folder.mkdir()
     with pytest.raises(RemoteError, match=f"no server is announced in {folder} yet"):
@@ -446,14 +446,14 @@ def test_servers_are_found_where_they_announce_themselves_and_the_next_when_one_
     (folder / "0.json").write_text('{"address": "ws://127.0.0.1:9", "token": "killed"}')
     (folder / "broken.json").write_text("{")
     with serve_in_background(Plain(), token="first") as server:
-        with announced(ServerAddress(server.address, "first"), folder / "1.json"):
+        with announce_server(ServerAddress(server.address, "first"), folder / "1.json"):
             assert len(read_addresses(folder)) == 2 and read_addresses(folder / "1.json")[0].token == "first"
             model = wiw.world_model(f"remote:{folder}")
             expected = ask(model)
         assert not (folder / "1.json").exists()
     with (
         serve_in_background(Plain(), token="third") as server,
-        announced(ServerAddress(server.address, "third"), folder / "2.json"),
+        announce_server(ServerAddress(server.address, "third"), folder / "2.json"),
     ):
         assert np.array_equal(ask(model), expected)
         assert pickle.loads(pickle.dumps(model)).accepts == model.accepts

@@ -96,7 +96,7 @@ class Relay:
             while data := source.recv(1 << 16):
                 sink.sendall(data)
 
-    def cut(self) -> None:
+    def cut_connections(self) -> None:
         for each in self._open:
             with contextlib.suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
@@ -114,7 +114,7 @@ def test_a_server_that_dies_at_its_work_loses_nothing(monkeypatch: pytest.Monkey
         asking = threading.Thread(target=lambda: found.append(client.rollout(*given)))
         asking.start()
         assert dying.begun.wait(10)
-        relay.cut()
+        relay.cut_connections()
         asking.join(20)
         np.testing.assert_array_equal(found[0], Counting().rollout(*given))
         assert staying.rows == 12 and dying.rows == 0, "its rows went to the other"

@@ -50,7 +50,7 @@ def wait_for(condition, seconds=60):
         time.sleep(0.05)
 
 
-def ended(out):
+def have_jobs_ended(out):
     return lambda: all(job.state not in ("RUNNING", "PENDING") for job in find_states(out))
 
 
@@ -91,7 +91,7 @@ def test_each_job_is_a_command_for_a_person(tmp_path, capsys):
 def test_jobs_run_are_shown_and_merged(tmp_path, capsys):
     out = tmp_path / "run"
     assert submit(out) == 0
-    wait_for(ended(out))
+    wait_for(have_jobs_ended(out))
     assert wiw.status(out).ended == 6, logs(out)
     assert main(["status", str(out)]) == 0
     shown = capsys.readouterr().out
@@ -125,7 +125,7 @@ def test_a_job_that_is_interrupted_is_requeued_and_goes_on(tmp_path):
         for process in [*(find_children(task) if whole_job else []), task]:
             os.kill(process, signal.SIGUSR2)
         wait_for(lambda task=task: find_children(int(job.id)) not in ([task], []))
-    wait_for(ended(out))
+    wait_for(have_jobs_ended(out))
     log = load_run(out / "shard-1-of-1")
     assert log.complete and len(log.episodes) == 8, logs(out)
     assert logs(out).count("Requeued job") == 2 and "Traceback" not in logs(out)
@@ -149,7 +149,7 @@ def test_cancelled_jobs_end_and_keep_what_is_recorded(tmp_path, capsys):
         submit_again = ["--live", 1, "--debug"]
         submit(out, *submit_again, scenes="slow", shards=1, episodes=40)
     assert main(["cancel", str(out)]) == 0 and "told 1 jobs" in capsys.readouterr().out
-    wait_for(ended(out))
+    wait_for(have_jobs_ended(out))
     found = wiw.status(out)
     assert 2 <= found.ended < 40 and found.stores[0].state == "stopped"
     assert cancel(out) == []  # nobody is there
@@ -198,7 +198,7 @@ def test_servers_are_jobs_that_all_shards_ask(tmp_path, two_rooms, capsys):
     assert [row["scores"] for row in one.decisions] == [row["scores"] for row in other.decisions]
     assert main(["submit", *map(str, [*asked, *jobs])]) == 0  # nothing is left, though a server is there
     assert len(cancel(out)) == 1
-    wait_for(ended(out))
+    wait_for(have_jobs_ended(out))
     assert not file.exists()
     with pytest.raises(ArgumentError, match="--servers serve --world-model"):
         submit(tmp_path / "other", "--servers", 1, "--debug")

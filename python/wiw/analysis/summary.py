@@ -98,7 +98,7 @@ TRACKED = {
     "frames": "their pixels",
     "poses": "the poses that were asked for, whatever the frames show",
 }
-"""What a tracker follows, in words."""
+"""Words for each thing that a tracker follows."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ class Summary:
     unbalanced: int = field(default=0, kw_only=True)
     """Episodes whose question is asked in one scene only, so that its text may give the answer away."""
     trackers: Mapping[str, str] = field(default_factory=dict, kw_only=True)
-    """What located targets in imagined frames, by name, and what it followed: "frames" or "poses"."""
+    """Trackers of targets in imagined frames by name, each with "frames" or "poses", whichever it followed."""
     departures: tuple[Departure, ...] = field(default=(), kw_only=True)
     """Where the run departs from the paper's protocol."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a preset sets and where it departs from the paper, as lines of text."""
+"""The settings of a preset, and where it departs from the paper, as lines of text."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from tyro.conf import Positional, arg
 
 from wiw.cli.options import Options, model_options
-from wiw.wire.address_book import ServerAddress, announced
+from wiw.wire.address_book import ServerAddress, announce_server
 
 SHOWN, LOGGED = 1.0, 10.0
 """Seconds between status lines, on a terminal and elsewhere."""
@@ -89,7 +89,7 @@ async def _live(server: Any, name: str, announce: Path | None, idle: float | Non
 
     def begin() -> None:
         if announce is not None:
-            announcing.enter_context(announced(_find_address(server), announce))
+            announcing.enter_context(announce_server(_find_address(server), announce))
         ready.set()
 
     serving = asyncio.ensure_future(server.run(begin))

@@ -108,7 +108,7 @@ def _launch(
     if dry_run:
         print(write_command(arguments, layout))
         return 0
-    if not layout.submitted:
+    if not layout.is_job:
         return run_processes(arguments, layout)
     jobs = out.with_name(f"{out.name}.jobs")
     print(f"job {submit_job(arguments, layout, jobs)}, output in {jobs}; repeat the command if it fails")

@@ -24,7 +24,7 @@ class Outline:
 
     task: str
     seed: int
-    """Of the table."""
+    """Seed of the table."""
     ended: NDArray[np.bool_]
     """bool [T]: whether an action ends in this frame."""
 

@@ -15,13 +15,13 @@ from wiw.scenes.scans import compare_tables
 
 @dataclass
 class ScanCheck:
-    """What was found of one scan."""
+    """Findings about one scan."""
 
     file: Path
     problems: list[str] = field(default_factory=list)
-    """What is wrong, one sentence each; a scan with none can be used."""
+    """Faults, one sentence each; a scan with none can be used."""
     remarks: list[str] = field(default_factory=list)
-    """What was left out or is uncertain."""
+    """Sentences on things left out or uncertain."""
     triangles: int = 0
     textures: int = 0
     missing: float = 0.0

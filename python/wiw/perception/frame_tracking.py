@@ -84,14 +84,14 @@ class FrameTracker(Tracker):
         plan = _get_plan(observation.panorama.shape[:2], frames.shape[1:3])
         mask = get_target(observation).mask.astype(np.uint8)
 
-        def cut(yaw: float) -> NDArray[np.bool_]:
+        def cut_mask(yaw: float) -> NDArray[np.bool_]:
             return np.asarray(plan(mask, yaw, interpolation="nearest")) > 0
 
-        known, imagined = np.stack([cut(yaw) for yaw in yaws]), frames[len(yaws) - 1 :]
+        known, imagined = np.stack([cut_mask(yaw) for yaw in yaws]), frames[len(yaws) - 1 :]
         if not len(imagined):
             return known[1:]
         lead = [yaws[-1]] if known[-1].any() else _turn_from(_find_yaw(mask > 0), yaws[-1])
-        masks = np.stack([cut(yaw) for yaw in lead])
+        masks = np.stack([cut_mask(yaw) for yaw in lead])
         if not masks[0].any():  # too high, too low or too small for any front view
             return np.concatenate([known[1:], np.zeros(imagined.shape[:3], bool)])
         views = np.stack([plan(observation.panorama, yaw) for yaw in lead])

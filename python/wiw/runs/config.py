@@ -18,7 +18,7 @@ from wiw.types import check_seed
 
 @dataclass(frozen=True, kw_only=True)
 class EngineConfig:
-    """What runs the episodes, and where."""
+    """The engine that runs the episodes, and its place."""
 
     engine: Literal["processes", "ray"] = "processes"
     """processes of this machine, or ray: actors of a Ray cluster, of which --workers is the number."""
@@ -79,7 +79,7 @@ class RunConfig(Limits, EngineConfig):
 
     @property
     def place(self) -> EngineConfig:
-        """What runs the episodes, and where."""
+        """The engine that runs the episodes, and its place."""
         return EngineConfig(**{field.name: getattr(self, field.name) for field in fields(EngineConfig)})
 
     def count_pictured(self, episodes: int) -> int:

@@ -91,7 +91,7 @@ class AgentRecipe(AgentConfig):
     tracker: Any = None
     """Finds the target in imagined frames, for the policy that revises; None: that policy's own."""
     tracker_options: Mapping[str, Any] = field(default_factory=dict)
-    """What the tracker is made with."""
+    """Options of the tracker."""
     observers: Sequence[Observer] = ()
     """Measure decisions; objects in memory."""
 

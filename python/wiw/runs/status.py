@@ -29,7 +29,7 @@ class StoreStatus:
     """Episodes of all arms that this store is for."""
     ended: int
     errors: int
-    """Those of them that ended with an infrastructure error."""
+    """Episodes that ended with an infrastructure error."""
     state: State
     """Whether all have ended, a process of this machine runs them, or one of another machine did at the last write."""
     host: str
@@ -54,7 +54,7 @@ class RunStatus:
 
     @property
     def errors(self) -> int:
-        """Those of them that ended with an infrastructure error."""
+        """Episodes that ended with an infrastructure error."""
         return sum(store.errors for store in self.stores)
 
     @property

@@ -48,7 +48,7 @@ FINISHED = (0, 1)
 
 @dataclass(frozen=True, kw_only=True)
 class ClusterConfig:
-    """What jobs ask of the cluster. Memory, accounts and so on are the cluster's own defaults if not given.
+    """Requests of jobs to the cluster. Memory, accounts and so on are the cluster's own defaults if not given.
 
     Raises:
         ArgumentError: a number out of range.
@@ -168,7 +168,7 @@ class SubmittedJob:
     cluster: str
     id: str
     arguments: tuple[str, ...]
-    """Of `wiw`."""
+    """Arguments of `wiw`."""
     state: str = ""
     """As the cluster says; empty where it was not asked."""
 

@@ -23,7 +23,7 @@ from tyro.conf import arg
 from wiw.errors import ArgumentError, DependencyError, InfrastructureError
 
 PORT = 29500
-"""Of the first machine, where torchrun's agents meet."""
+"""Port of the first machine, where torchrun's agents meet."""
 STOP_SECONDS = 600
 """Time that a stopped training has to end its step and to write its state: before torchrun ends its processes, and
 between SLURM's signal and the time limit."""
@@ -65,7 +65,7 @@ class ProcessLayout:
                 raise ArgumentError(f"expected --{name} of at least {least}, got {value}")
         of_jobs = (each for each in fields(self) if each.name not in ("gpus", "nodes", "partition"))
         given = [f"--{each.name}" for each in of_jobs if getattr(self, each.name) != each.default]
-        if given and not self.submitted:
+        if given and not self.is_job:
             raise ArgumentError(
                 f"{', '.join(given)}: of a SLURM job; name its --partition, or leave this out to train on this machine"
             )
@@ -76,7 +76,7 @@ class ProcessLayout:
         return self.gpus * self.nodes
 
     @property
-    def submitted(self) -> bool:
+    def is_job(self) -> bool:
         """Whether the training is a SLURM job."""
         return self.nodes > 1 or self.partition is not None
 

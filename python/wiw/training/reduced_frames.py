@@ -21,10 +21,11 @@ from wiw.datasets.navigation_segment import DEPTH_UNITS, NavigationSegment
 from wiw.errors import ArgumentError
 from wiw.files import atomic_folder
 from wiw.training.jobs import count_threads
+from wiw.world_models.warpnet.model import shrink_panorama
 from wiw.world_models.warpnet.network import FARTHEST, NEAREST
 
 VERSION = 1
-"""Of what is kept; raised when it changes."""
+"""Version of the kept arrays; raised when they change."""
 Bar = Callable[[Iterable[Any], str, int], Iterable[Any]]
 """Wraps an iterable of a given number of items in a progress bar: (items, text, total)."""
 
@@ -105,11 +106,6 @@ def _reduce_segment(segment: NavigationSegment, size: tuple[int, int], pool: Exe
     }
 
 
-def reduce_image(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return a panorama in a size (height, width), by means over areas."""
-    return np.asarray(cv2.resize(image, size[::-1], interpolation=cv2.INTER_AREA))
-
-
 def reduce_depth(depth: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float16]:
     """Return log-distances [h, w] of metres [H, W], at pixels' middles; `FARTHEST` where nothing is hit (0)."""
     return compute_log_distances(cv2.resize(depth, size[::-1], interpolation=cv2.INTER_NEAREST)).astype(np.float16)
@@ -127,8 +123,8 @@ def _decode_small(
     """Return a frame's picture, and its log-distances, empty where no depth was collected."""
     color, depth = segment.decode(frame)
     if depth is None:
-        return reduce_image(color, size), np.zeros((0, 0), np.float16)
-    return reduce_image(color, size), reduce_depth(depth.astype(np.float32) / np.float32(DEPTH_UNITS), size)
+        return shrink_panorama(color, size), np.zeros((0, 0), np.float16)
+    return shrink_panorama(color, size), reduce_depth(depth.astype(np.float32) / np.float32(DEPTH_UNITS), size)
 
 
 def _require_whole_columns(segment: NavigationSegment, turns: NDArray[np.float64], width: int) -> None:

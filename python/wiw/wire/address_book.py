@@ -26,7 +26,7 @@ class ServerAddress:
 
 
 @contextmanager
-def announced(server: ServerAddress, file: Path) -> Iterator[None]:
+def announce_server(server: ServerAddress, file: Path) -> Iterator[None]:
     """Announce a server in a file as long as the context lasts.
 
     Raises:

@@ -23,7 +23,7 @@ _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 MOST_NODES = 1_000_000
 UNREADABLE = (LookupError, TypeError, ValueError, AttributeError, struct.error, RecursionError)
-"""What a document of another shape raises."""
+"""Errors that a document of another shape raises."""
 
 
 @dataclass

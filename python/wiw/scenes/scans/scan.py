@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What readers of scans share: the files they read, tables of objects, and which way is up."""
+"""Parts that readers of scans share: the files they read, tables of objects, and which way is up."""
 
 from __future__ import annotations
 
@@ -53,13 +53,13 @@ class InstanceTable:
     """Instance ids by the dataset's."""
 
     @property
-    def unlabelled(self) -> int:
+    def unlabelled_id(self) -> int:
         """Id of the instance of all surface that no object has."""
         return len(self.instances)
 
     def number(self, labels: NDArray[np.int64]) -> NDArray[np.uint32]:
         """Return instance ids uint32 of the dataset's ids, of any shape; unlabelled where there is no such object."""
-        table = np.full(max(self.ids, default=0) + 2, self.unlabelled, np.uint32)
+        table = np.full(max(self.ids, default=0) + 2, self.unlabelled_id, np.uint32)
         for source, instance in self.ids.items():
             table[source] = instance
         known = (labels >= 0) & (labels < len(table) - 1)

@@ -47,7 +47,7 @@ class Template:
     file: Path
     """Its configuration, or the mesh or URDF itself."""
     attributes: Mapping[str, Any]
-    """Of its configuration, over the dataset's defaults."""
+    """Values of its configuration, over the dataset's defaults."""
 
     def asset(self, *names: str) -> Path:
         """Return the file that one of these attributes names; the template's own where none does."""
@@ -233,7 +233,7 @@ def _frame(attributes: Mapping[str, Any]) -> NDArray[np.float64]:
 
 
 class _Assembly:
-    """What a scene is made of, gathered before anything is put together, so that all that is missing can be named."""
+    """Parts of a scene, gathered before anything is put together, so that all that is missing can be named."""
 
     def __init__(self, dataset: Dataset, options: Mapping[str, Any]) -> None:
         self.dataset, self.options = dataset, options

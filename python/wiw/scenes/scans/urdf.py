@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a URDF file shows: the meshes of its links, placed by its joints."""
+"""Meshes of the links of a URDF file, placed by its joints."""
 
 from __future__ import annotations
 

@@ -22,11 +22,11 @@ from wiw.datasets.worlds import World, world
 from wiw.errors import ArgumentError
 from wiw.training.navigation_rules import NavigationRules
 from wiw.training.pocket.batches import compute_displacements
-from wiw.training.reduced_frames import Bar, reduce_image
+from wiw.training.reduced_frames import Bar
 from wiw.training.traversal import STEP_M, TURN_RAD, plan_scene
 from wiw.training.walks import StraightPath, find_straight_paths
 from wiw.world_models.pocket.model import Pocket
-from wiw.world_models.warpnet.model import STILL, to_network, turn_panorama
+from wiw.world_models.warpnet.model import STILL, shrink_panorama, to_network, turn_panorama
 from wiw.world_models.warpnet.network import plain_room, warp
 
 STEPS = (1, 3, 5, 8)
@@ -51,7 +51,7 @@ class Window:
     trajectory: NDArray[np.float64]
     """float64 [LENGTH - 1, 3]: forward and left in metres, azimuth in radians, after each action."""
     truth: Mapping[int, NDArray[np.uint8]]
-    """Of the frames in `STEPS` that are seen from elsewhere than frame 0, which others show without imagining."""
+    """True panoramas of the frames in `STEPS` that are seen from elsewhere than frame 0; others need no imagining."""
 
 
 def draw_windows(scene: str, count: int, seed: int) -> list[Window]:
@@ -131,7 +131,9 @@ def measure(
                         "step": step,
                         "psnr": float(metrics.psnr(made, truth, weights="latitude")),
                         "psnr_small": float(
-                            metrics.psnr(reduce_image(made, small), reduce_image(truth, small), weights="latitude")
+                            metrics.psnr(
+                                shrink_panorama(made, small), shrink_panorama(truth, small), weights="latitude"
+                            )
                         ),
                     }
 

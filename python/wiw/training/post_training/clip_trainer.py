@@ -46,7 +46,7 @@ class ClipTrainer(ResumableTrainer, ABC):
     """
 
     trained: dict[str, nn.Parameter]
-    """What is trained, by name."""
+    """Trained parameters by name."""
     averages: dict[str, Tensor]
     """Averages of what is trained, where the recipe asks for them."""
     optimizer: torch.optim.Optimizer

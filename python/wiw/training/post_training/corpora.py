@@ -26,7 +26,7 @@ from wiw.types import GRIPPER_POSES, PRIMITIVES, View
 
 CorpusPart = Literal["train", "all"]
 HFOV_DEG = 90.0
-"""Of an agent's front view."""
+"""Field of view of an agent's front view."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class Corpus(ABC):
     """A folder of frames and actions."""
 
     space: ClassVar[str]
-    """What its actions are, a name of `wiw.loop.plan_space`."""
+    """Plan space of its actions, a name of `wiw.loop.plan_space`."""
     view: View
-    """What its frames show."""
+    """View that its frames show."""
 
     @abstractmethod
     def clips(self, frames: int) -> CorpusClips:

@@ -60,22 +60,22 @@ def _find_local_rank() -> int:
 
 def count_processes() -> int:
     """Return the number of processes of this training."""
-    return distributed.get_world_size() if _joined() else 1
+    return distributed.get_world_size() if _is_in_group() else 1
 
 
 def is_main() -> bool:
     """Return whether this is the first process, which writes and reports."""
-    return not _joined() or distributed.get_rank() == 0
+    return not _is_in_group() or distributed.get_rank() == 0
 
 
 def select_share(items: Sequence[T]) -> Sequence[T]:
     """Return this process's share of items."""
-    return items[distributed.get_rank() :: distributed.get_world_size()] if _joined() else items
+    return items[distributed.get_rank() :: distributed.get_world_size()] if _is_in_group() else items
 
 
 def call_on_main(function: Callable[[], T]) -> T:
     """Return what a call in the first process returns, in all of them; an error there is raised in all of them."""
-    if not _joined():
+    if not _is_in_group():
         return function()
     outcome: list[Any] = [None, None]
     if is_main():
@@ -91,7 +91,7 @@ def call_on_main(function: Callable[[], T]) -> T:
 
 def collect(item: T) -> list[T]:
     """Return the item of each process, in their order."""
-    if not _joined():
+    if not _is_in_group():
         return [item]
     found: list[Any] = [None] * count_processes()
     distributed.all_gather_object(found, item)
@@ -100,7 +100,7 @@ def collect(item: T) -> list[T]:
 
 def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
     """Add up the gradients of all processes; those of sharded parameters are added up as they are computed."""
-    if not _joined():
+    if not _is_in_group():
         return
     whole = [value.grad for value in parameters if value.grad is not None and not _is_sharded(value)]
     for work in [distributed.all_reduce(each, async_op=True) for each in whole]:
@@ -109,7 +109,7 @@ def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
 
 def shard_modules(modules: Sequence[nn.Module], device: torch.device) -> None:
     """Spread the parameters of modules over all processes, parts before the whole, each module's as one group."""
-    if not _joined():
+    if not _is_in_group():
         return
     from torch.distributed.device_mesh import init_device_mesh
     from torch.distributed.fsdp import fully_shard
@@ -174,12 +174,12 @@ def join_tensor(value: Tensor) -> Tensor:
     return value.full_tensor() if _is_sharded(value) else value  # type: ignore[attr-defined]
 
 
-def _joined() -> bool:
+def _is_in_group() -> bool:
     return distributed.is_available() and distributed.is_initialized()
 
 
 def _is_sharded(value: Tensor) -> bool:
-    if not _joined():
+    if not _is_in_group():
         return False
     from torch.distributed.tensor import DTensor
 

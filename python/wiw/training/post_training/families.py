@@ -41,7 +41,7 @@ class PretrainedWeights:
     """A folder or a name on the hub; the model's usual ones if None."""
     revision: str | None = None
     variant: str | None = None
-    """Of the weight files, such as "fp16"."""
+    """Variant of the weight files, such as "fp16"."""
     device: str | None = None
 
     def resolve_folder(self) -> str | None:
@@ -60,7 +60,7 @@ class Loaded:
     recipe: PostTrainingRecipe
     """With frames and size as the model takes them."""
     identity: dict[str, str]
-    """What identifies its first weights."""
+    """Identity of its first weights."""
 
 
 class Family(ABC):
@@ -170,7 +170,7 @@ FAMILIES: Mapping[str, Family] = {
     "cosmos-predict2-action": VideoFamily("cosmos-predict2-action", variants.CosmosPredict2Action, CosmosObjective),
     "nwm-action": NWMFamily(),
 }
-"""What is trained here, by its name on the command line."""
+"""Models that are trained here, by their names on the command line."""
 
 
 def find_family(name: str) -> Family:

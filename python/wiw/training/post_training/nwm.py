@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What Navigation World Models is trained on: the noise in a future frame, given past frames and the motion to it."""
+"""The objective of Navigation World Models: the noise in a future frame, given past frames and the motion to it."""
 
 from __future__ import annotations
 
@@ -157,9 +157,9 @@ class VariationalDiffusion:
         predicted, shares = predict(noisy, times.to(latents.device)).float().chunk(2, dim=1)
         error = mse_loss(predicted, noise, reduction="none").mean(dim=(1, 2, 3))
         clean = (noisy - (1 - kept).sqrt() * predicted.detach()) / kept.sqrt()
-        return error + self._bound(latents, noisy, clean, shares, times)
+        return error + self._compute_bound(latents, noisy, clean, shares, times)
 
-    def _bound(self, latents: Tensor, noisy: Tensor, clean: Tensor, shares: Tensor, times: Tensor) -> Tensor:
+    def _compute_bound(self, latents: Tensor, noisy: Tensor, clean: Tensor, shares: Tensor, times: Tensor) -> Tensor:
         """Return the term of the variational bound at these times, bits a dimension, [B]."""
         least, most = (self._read(each, times, latents) for each in (self._least, self._most))
         log_variance = least + (shares + 1) / 2 * (most - least)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 BUILT_IN = Path(__file__).with_name("weights.safetensors")
 STEPS = 1
-"""Of the sampler, unless the user says otherwise."""
+"""Steps of the sampler, unless the user says otherwise."""
 
 
 class Pocket(Trained):

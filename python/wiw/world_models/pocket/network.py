@@ -53,7 +53,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Views:
-    """What B panoramas show from F places each, if all there is were one round room or another."""
+    """Views of B panoramas from F places each, if all there is were one round room or another."""
 
     source: Tensor
     """[B, 3, H, W]."""
@@ -173,7 +173,7 @@ class Denoiser(nn.Module):
 
 @dataclass(frozen=True)
 class Condition:
-    """What each view is told, at every scale."""
+    """Condition of each view, at every scale."""
 
     embedding: Tensor
     """[N, E]: of the noise level and the distance."""

@@ -88,7 +88,7 @@ class _Writer:
 
     lines: list[str] = field(default_factory=lambda: [""])
     closers: list[str] = field(default_factory=list)
-    """What is written where each open brace ends."""
+    """Text to write where each open brace ends."""
     lists: list[int | None] = field(default_factory=list)
     """For each list that is open: its latest number, or None where it has dashes."""
     pending: str | None = None
